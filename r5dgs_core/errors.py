@@ -1,0 +1,29 @@
+"""Errors that a user can act on; their messages name the place, what was expected, what was found and the remedy."""
+
+
+class R5dgsError(Exception):
+    """Base of everything that the command line and the add-on report without a traceback."""
+
+
+class ConfigError(R5dgsError):
+    """A configuration key or value cannot be used."""
+
+
+class DatasetError(R5dgsError):
+    """A data set is incomplete or inconsistent."""
+
+
+class CheckpointError(R5dgsError):
+    """A training run folder or checkpoint cannot be read or continued."""
+
+
+class SceneFileError(R5dgsError):
+    """A `.r5dgs` or PLY file is truncated, foreign or inconsistent."""
+
+
+class BackendError(R5dgsError):
+    """Something optional (a rasterizer, an encoder, a Blender) is asked for and not there."""
+
+
+class TrainingError(R5dgsError):
+    """Training cannot go on."""

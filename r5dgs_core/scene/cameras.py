@@ -1,0 +1,119 @@
+"""Pinhole cameras and the axes they are written in.
+
+Inside the core a camera is OpenCV: x right, y down, z forward; ``T_cam_world`` takes world points into it; pixel
+centres lie at +0.5. Blender and the D-NeRF files use OpenGL axes (y up, looking along -z): this module converts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with OpenCV axes.
+
+    Attributes:
+        width: Image width in pixels.
+        height: Image height in pixels.
+        intrinsics: Camera matrix in pixels, float64. [3, 3]
+        T_cam_world: World to camera, rigid, float64. [4, 4]
+        name: Name of the view, unique within a data set's cameras where given.
+    """
+
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    T_cam_world: np.ndarray
+    name: str = ""
+
+    @property
+    def center(self) -> np.ndarray:
+        """Position in the world. [3]"""
+        return -self.T_cam_world[:3, :3].T @ self.T_cam_world[:3, 3]
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Viewing direction in the world, unit. [3]"""
+        return self.T_cam_world[2, :3].copy()
+
+
+def from_field_of_view(
+    matrix_world: np.ndarray,  # [4, 4]
+    angle_x_rad: float,
+    width: int,
+    height: int,
+    name: str = "",
+) -> Camera:
+    """Make a camera from a camera-to-world matrix with OpenGL axes (Blender, D-NeRF) and a horizontal field of view.
+
+    Args:
+        matrix_world: Camera to world, OpenGL camera axes; a uniform scale is removed. [4, 4]
+        angle_x_rad: Horizontal field of view.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        name: Name of the view.
+
+    Returns:
+        The camera, with square pixels and its principal point in the middle.
+    """
+    focal = 0.5 * width / np.tan(0.5 * angle_x_rad)
+    intrinsics = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return Camera(width, height, intrinsics, opengl_to_cam_world(matrix_world), name)
+
+
+def opengl_to_cam_world(matrix_world: np.ndarray) -> np.ndarray:
+    """Turn a camera-to-world matrix with OpenGL axes into ``T_cam_world`` with OpenCV axes. [4, 4] -> [4, 4]"""
+    T_world_cam = np.asarray(matrix_world, np.float64) @ OPENGL_TO_OPENCV
+    rotation = T_world_cam[:3, :3] / np.linalg.norm(T_world_cam[:3, :3], axis=0)
+    T_cam_world = np.eye(4)
+    T_cam_world[:3, :3] = rotation.T
+    T_cam_world[:3, 3] = -rotation.T @ T_world_cam[:3, 3]
+    return T_cam_world
+
+
+def cam_world_to_opengl(T_cam_world: np.ndarray) -> np.ndarray:
+    """Inverse of `opengl_to_cam_world`: camera to world with OpenGL camera axes. [4, 4] -> [4, 4]"""
+    T_world_cam = np.linalg.inv(np.asarray(T_cam_world, np.float64))
+    return T_world_cam @ OPENGL_TO_OPENCV
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project world points.
+
+    Args:
+        camera: The camera.
+        points: World points. [..., 3]
+
+    Returns:
+        Pixel coordinates (NaN behind the camera) [..., 2] and depth z in the camera frame [...].
+    """
+    p_cam = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
+    z = p_cam[..., 2]
+    safe = np.where(z > 1e-9, z, np.nan)
+    uv = p_cam[..., :2] / safe[..., None]
+    k = camera.intrinsics
+    pixels = np.stack([k[0, 0] * uv[..., 0] + k[0, 1] * uv[..., 1] + k[0, 2], k[1, 1] * uv[..., 1] + k[1, 2]], axis=-1)
+    return pixels, z
+
+
+def pixel_rays(camera: Camera) -> np.ndarray:
+    """Unit directions through all pixel centres, in the world. [H, W, 3]"""
+    k = camera.intrinsics
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    v = (y - k[1, 2]) / k[1, 1]
+    u = (x - k[0, 2] - k[0, 1] * v) / k[0, 0]
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ camera.T_cam_world[:3, :3]
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+# Rotation that takes a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
+WORLD_TO_BLENDER = {
+    "blender": np.eye(3),
+    "colmap": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "opengl": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}

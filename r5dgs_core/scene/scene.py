@@ -1,0 +1,145 @@
+"""What a `.r5dgs` file holds: Gaussians in their bind state at t_max, objects, motion groups and their tracks.
+
+Notation: N Gaussians, M objects, G motion groups, S knots, K SH bases. A motion group g moves its members rigidly,
+x(t) = p_g + R_g(t) (x(t_max) - p_g) + d_g(t), with pivot p_g, R_g(t_max) = I and d_g(t_max) = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..motion.models import MotionModel
+from .cameras import Camera
+
+ROLES = ("pinned", "body", "shadow")
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One object of the table; its Gaussians are the rows ``start : start + count``.
+
+    Attributes:
+        id: Object id; 0 is the background, -1 the unassigned Gaussians.
+        name: Name that the user sees, unique in the scene.
+        aliases: Other words that find it.
+        caption: A sentence about it, or "".
+        color: Display colour, sRGB in [0, 1].
+        start: First row.
+        count: Number of rows.
+    """
+
+    id: int
+    name: str
+    aliases: tuple[str, ...]
+    caption: str
+    color: tuple[float, float, float]
+    start: int
+    count: int
+
+
+@dataclass(frozen=True)
+class MotionGroup:
+    """One rigid motion; group 0 is pinned.
+
+    Attributes:
+        id: Motion group id, its row in ``track_poses``.
+        object_id: Object that the group belongs to in meaning (the caster's, for a shadow).
+        role: "pinned", "body" or "shadow".
+        anchor_index: Row of the representative Gaussian, -1 without members.
+        pivot: Point that ``track_poses`` turns about, at t_max, world. [3]
+        model: Motion past t_max, about ``pivot``.
+        follows: Group whose displacement this one takes through ``follow_matrix`` (no rotation), or None.
+        follow_matrix: Linear map from that group's displacement to this one's. [3, 3]
+        rigid_rms: Root mean square of the distance that members keep from this rigid motion in the observed time, world.
+        rigid_max: The same, largest.
+    """
+
+    id: int
+    object_id: int
+    role: str
+    anchor_index: int
+    pivot: np.ndarray
+    model: MotionModel
+    follows: int | None = None
+    follow_matrix: np.ndarray | None = None
+    rigid_rms: float = 0.0
+    rigid_max: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A baked scene: everything that playback, Blender and export need.
+
+    Gaussians are in their state at t_max, sorted by object id and, within an object, by motion group.
+
+    Attributes:
+        name: Name of the scene.
+        means: Centres, world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: Natural logarithm of the standard deviations. [N, 3] float32
+        opacity_logits: Before the sigmoid. [N] float32
+        sh: Spherical harmonics coefficients, 3DGS convention, display-referred sRGB. [N, K, 3] float32
+        object_ids: Object of each Gaussian. [N] int32
+        motion_ids: Motion group of each Gaussian. [N] int32
+        track_times: Observed times, increasing, last = t_max. [S] float64
+        track_poses: Rotation wxyz and displacement of the pivot relative to the bind state. [G, S, 7] float64
+        objects: The table, ordered by id.
+        groups: The motion groups, ordered by id.
+        t_max: Last observed time.
+        frames_per_unit: Blender frames per unit of scene time.
+        world_convention: Key of ``cameras.WORLD_TO_BLENDER``.
+        cameras: The data set's distinct cameras.
+        background_sh: Spherical harmonics of the sky over the world's viewing direction, 3DGS basis. [Kb, 3]
+        identities: Identity encodings. [N, 16] float16 or None
+        shading: How the colour changes as the group turns: factor 1 + (R^T l - l) . g. [N, 3] float32 or None
+        light_direction: l above, unit, world. [3]
+        embeddings: One row per object of ``objects``, unit. [M, D] or None
+        vocabulary: Words with stored embeddings.
+        vocabulary_embeddings: One row per word, unit. [V, D] or None
+        provenance: Configuration, data hash, versions.
+        needs: The needs table: rows of ``name, value, threshold, decision, reason``.
+    """
+
+    name: str
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    object_ids: np.ndarray
+    motion_ids: np.ndarray
+    track_times: np.ndarray
+    track_poses: np.ndarray
+    objects: tuple[SceneObject, ...]
+    groups: tuple[MotionGroup, ...]
+    t_max: float
+    frames_per_unit: float
+    world_convention: str
+    cameras: tuple[Camera, ...]
+    background_sh: np.ndarray
+    identities: np.ndarray | None = None
+    shading: np.ndarray | None = None
+    light_direction: np.ndarray | None = None
+    embeddings: np.ndarray | None = None
+    vocabulary: tuple[str, ...] = ()
+    vocabulary_embeddings: np.ndarray | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+    needs: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the box that holds the middle 98 % of the centres on each axis: the scene's size."""
+        if len(self.means) == 0:
+            return 1.0
+        low, high = np.quantile(self.means.astype(np.float64), [0.01, 0.99], axis=0)
+        return float(max(np.linalg.norm(high - low), 1e-12))
+
+    def object(self, object_id: int) -> SceneObject:
+        """The object with this id. Raises KeyError where there is none."""
+        for candidate in self.objects:
+            if candidate.id == object_id:
+                return candidate
+        raise KeyError(object_id)
