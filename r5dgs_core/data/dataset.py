@@ -1,0 +1,332 @@
+"""A data set on disk: views with camera, time and mask, object names, and poses where they are known.
+
+Layout: ``transforms_{train,val,test}.json`` (`transforms`), images beside them, ``object_mask/<view name>.png``
+(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+from ..scene import cameras
+from . import images, masks, transforms
+from .annotations import GroundTruth, read_ground_truth, read_objects
+
+SPLITS = ("train", "val", "test")
+FRAMES_PER_UNIT = 60.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class View:
+    """One image of a data set.
+
+    Attributes:
+        name: Path of the image in the data set without suffix, "train/r_0000".
+        camera: Its camera, OpenCV axes; ``camera.name`` is shared by the views of one camera.
+        t: Scene time.
+        split: "train", "val" or "test".
+        image_path: The image file.
+        mask_path: The object id image, None where there is none.
+        mask_colors: Object id of each packed colour where masks are coded by colour.
+    """
+
+    name: str
+    camera: cameras.Camera
+    t: float
+    split: str
+    image_path: Path
+    mask_path: Path | None
+    mask_colors: dict[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What `read` found.
+
+    Attributes:
+        root: Folder of the data set.
+        name: Name of that folder.
+        train: Views to learn from.
+        val: Held-out views within the observed time.
+        test: Views of later times.
+        object_names: Name of each object id that has one.
+        object_aliases: Other words for it.
+        ground_truth: True poses, where the data set has them.
+        world_convention: Key of ``cameras.WORLD_TO_BLENDER``.
+        frames_per_unit: Blender frames per unit of scene time.
+        has_alpha: Whether images have pixels that are not opaque (looked for in three training images).
+        digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
+    """
+
+    root: Path
+    name: str
+    train: tuple[View, ...]
+    val: tuple[View, ...]
+    test: tuple[View, ...]
+    object_names: dict[int, str]
+    object_aliases: dict[int, tuple[str, ...]]
+    ground_truth: GroundTruth | None
+    world_convention: str
+    frames_per_unit: float
+    has_alpha: bool
+    digest: str
+
+    def views(self, split: str) -> tuple[View, ...]:
+        """The views of "train", "val" or "test"."""
+        if split not in SPLITS:
+            raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
+        return getattr(self, split)
+
+    @property
+    def cameras(self) -> tuple[cameras.Camera, ...]:
+        """The distinct cameras of all splits, by first appearance."""
+        found: dict[str, cameras.Camera] = {}
+        for split in SPLITS:
+            for view in self.views(split):
+                found.setdefault(view.camera.name, view.camera)
+        return tuple(found.values())
+
+    @property
+    def times(self) -> np.ndarray:
+        """Distinct times of the training views, increasing. [S]"""
+        return np.unique([view.t for view in self.train])
+
+    @property
+    def t_max(self) -> float:
+        """Last observed time: that of the latest training view."""
+        return float(self.times[-1])
+
+
+def read(root: Path) -> Dataset:
+    """Read and check a data set; images and masks are looked at, not loaded.
+
+    Args:
+        root: Folder with ``transforms_train.json``.
+
+    Returns:
+        The data set. A split without camera file is empty.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise errors.DatasetError(
+            f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}"
+        )
+    path = root / "transforms_train.json"
+    if not path.exists():
+        lone = (root / "transforms.json").exists()
+        remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
+        raise errors.DatasetError(f"{path}: the file is missing; {remedy}")
+    entries: dict[str, list[transforms.Entry]] = {}
+    header: dict[str, Any] = {}
+    hasher = hashlib.sha256()
+    for split in SPLITS:
+        path = root / f"transforms_{split}.json"
+        entries[split] = []
+        if path.exists():
+            entries[split], top = transforms.read(path)
+            header = {**top, **header}
+            hasher.update(path.read_bytes())
+    if not entries["train"]:
+        raise errors.DatasetError(f"{root / 'transforms_train.json'}: expected at least one frame, found none")
+
+    camera_names = _CameraNames()
+    views = {split: _make_views(root, split, entries[split], camera_names) for split in SPLITS}
+    views = _attach_mask_colors(views)
+    every = [view for split in SPLITS for view in views[split]]
+    for view in every:
+        for file in (view.image_path, view.mask_path):
+            if file is not None:
+                hasher.update(_fingerprint(root, file))
+    names, aliases = read_objects(root)
+    convention = header.get("world_convention", "blender")
+    if convention not in cameras.WORLD_TO_BLENDER:
+        raise errors.DatasetError(
+            f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
+            f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}"
+        )
+    ground_truth = read_ground_truth(root)
+    if ground_truth is not None:
+        for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
+            names.setdefault(object_id, name)
+    return Dataset(
+        root=root,
+        name=root.resolve().name,
+        train=views["train"],
+        val=views["val"],
+        test=views["test"],
+        object_names=names,
+        object_aliases=aliases,
+        ground_truth=ground_truth,
+        world_convention=convention,
+        frames_per_unit=_frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]]),
+        has_alpha=_has_alpha(views["train"]),
+        digest=hasher.hexdigest(),
+    )
+
+
+def load_rgba(view: View) -> np.ndarray:
+    """Load the image of a view, straight alpha, 1 where the file has none. [H, W, 4] float32"""
+    pixels = images.to_rgba(images.read(view.image_path))
+    if pixels.shape[:2] != (view.camera.height, view.camera.width):
+        raise errors.DatasetError(
+            f"{view.image_path}: the image changed: {pixels.shape[1]}x{pixels.shape[0]} now, "
+            f"{view.camera.width}x{view.camera.height} when the data set was read"
+        )
+    return pixels
+
+
+def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
+    """Load the image of a view composited on a background colour (sRGB [3], white where None). [H, W, 3] float32"""
+    return images.composite(load_rgba(view), background)
+
+
+def load_mask(view: View) -> np.ndarray | None:
+    """Load the object ids of a view, in the size of its image; None where it has no mask. [H, W] int32"""
+    if view.mask_path is None:
+        return None
+    ids = masks.read(view.mask_path, view.mask_colors)
+    return masks.resize(ids, view.camera.width, view.camera.height, str(view.mask_path))
+
+
+def load_split(
+    dataset: Dataset,
+    split: str,
+    background: np.ndarray | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Load all images and masks of a split whose views have one size.
+
+    Args:
+        dataset: The data set.
+        split: "train", "val" or "test".
+        background: Colour behind transparent pixels, sRGB, white where None. [3]
+        progress: Called with images loaded and their number.
+
+    Returns:
+        Images, 8 bits, rounded [V, H, W, 3] uint8; object ids, -1 in views without mask [V, H, W] int32.
+    """
+    views = dataset.views(split)
+    if not views:
+        return np.zeros((0, 0, 0, 3), np.uint8), np.zeros((0, 0, 0), np.int32)
+    width, height = views[0].camera.width, views[0].camera.height
+    for view in views:
+        if (view.camera.width, view.camera.height) != (width, height):
+            raise errors.DatasetError(
+                f"{view.image_path}: {view.camera.width}x{view.camera.height}, but {views[0].image_path.name} is "
+                f"{width}x{height}; bring the images of a split to one size"
+            )
+    colors = np.empty((len(views), height, width, 3), np.uint8)
+    ids = np.full((len(views), height, width), -1, np.int32)
+    for i, view in enumerate(views):
+        colors[i] = images.to_uint8(load_image(view, background))
+        mask = load_mask(view)
+        if mask is not None:
+            ids[i] = mask
+        if progress is not None:
+            progress(i + 1, len(views))
+    return colors, ids
+
+
+class _CameraNames:
+    """Gives views of equal camera one name: the file's, or cam0, cam1, ...; a camera that moves gets @1, @2, ..."""
+
+    def __init__(self) -> None:
+        self.by_key: dict[tuple, str] = {}
+        self.uses: dict[str, int] = {}
+
+    def name(self, given: str, camera: cameras.Camera) -> str:
+        numbers = np.concatenate([camera.intrinsics.ravel(), camera.T_cam_world.ravel()])
+        key = (given, camera.width, camera.height, np.round(numbers, 6).tobytes())
+        if key not in self.by_key:
+            count = self.uses.get(given, 0)
+            self.uses[given] = count + 1
+            self.by_key[key] = (f"{given}@{count}" if count else given) if given else f"cam{count}"
+        return self.by_key[key]
+
+
+def _make_views(root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames) -> tuple[View, ...]:
+    views: dict[str, View] = {}
+    for entry in entries:
+        name = transforms.view_name(entry.file_path)
+        if name in views:
+            raise errors.DatasetError(f"{entry.place}: the image is listed twice; each frame needs its own")
+        image_path = _find_image(root, entry)
+        width, height, _ = images.size(image_path)
+        matrix = cameras.opengl_to_cam_world(entry.matrix)
+        camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
+        camera = replace(camera, name=names.name(entry.camera, camera))
+        mask_path = root / "object_mask" / f"{name}.png"
+        views[name] = View(name, camera, entry.t, split, image_path, mask_path if mask_path.is_file() else None)
+    return tuple(views.values())
+
+
+def _find_image(root: Path, entry: transforms.Entry) -> Path:
+    path = root / entry.file_path.replace("\\", "/")
+    candidates = [path] if path.suffix.lower() in images.SUFFIXES else []
+    candidates += [path.with_name(path.name + suffix) for suffix in images.SUFFIXES]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise errors.DatasetError(f"{entry.place}: the image is missing, expected {candidates[0]}")
+
+
+def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
+    """Number the colours once over all splits, if masks are coded by colour."""
+    paths = [view.mask_path for split in SPLITS for view in views[split] if view.mask_path is not None]
+    colors = masks.color_table(paths)
+    if not colors:
+        return views
+    _log.info("masks are coded by colour: %d colours numbered by value, black is 0", len(colors) - 1)
+    return {split: tuple(replace(view, mask_colors=colors) for view in views[split]) for split in SPLITS}
+
+
+def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:
+    """Blender frames per unit of time: as the file says, from frame numbers, from duration and rate, or 60."""
+    hints = {}
+    for key in ("frames_per_unit", "fps", "duration"):
+        if header.get(key) is not None:
+            value = header[key]
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+                raise errors.DatasetError(f"{root}: '{key}' must be a positive number, found {value!r}")
+            hints[key] = float(value)
+    if "frames_per_unit" in hints:
+        return hints["frames_per_unit"]
+    numbered = [(entry.t, entry.frame) for entry in entries if entry.frame is not None]
+    if len(numbered) == len(entries):
+        t, frame = np.array(numbered).T
+        if np.ptp(t) > 0 and np.ptp(frame) > 0:
+            slope = float(np.polyfit(t, frame, 1)[0])
+            if slope > 0:
+                return slope
+    if "fps" in hints and "duration" in hints:
+        return hints["fps"] * hints["duration"]
+    if "fps" in hints and max(entry.t for entry in entries) > 1.0:
+        return hints["fps"]  # times are in seconds
+    return FRAMES_PER_UNIT
+
+
+def _has_alpha(views: tuple[View, ...]) -> bool:
+    for view in {views[0].name: views[0], "middle": views[len(views) // 2], "last": views[-1]}.values():
+        if images.size(view.image_path)[2] in (2, 4) and float(images.read(view.image_path)[..., -1].min()) < 1.0:
+            return True
+    return False
+
+
+def _fingerprint(root: Path, path: Path) -> bytes:
+    """Relative name, size, first and last 4 KB of a file."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(4096)
+        file.seek(max(size - 4096, 0))
+        tail = file.read(4096)
+    name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+    return b"\0".join([name.encode(), str(size).encode(), head, tail])

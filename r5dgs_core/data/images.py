@@ -1,0 +1,162 @@
+"""Reading and writing image files through OpenImageIO.
+
+In memory a colour is display-referred sRGB, float32 in [0, 1], alpha is straight. Files of floats (EXR) are linear by
+convention and go through the sRGB curve on reading.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from .. import errors
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
+COMPRESSION_LEVEL = 6
+
+
+def size(path: Path) -> tuple[int, int, int]:
+    """Width, height and number of channels of an image file, from its header alone."""
+    source = _open(path)
+    spec = source.spec()
+    width, height, channels = spec.width, spec.height, spec.nchannels
+    source.close()
+    return width, height, channels
+
+
+def read(path: Path) -> np.ndarray:
+    """Read an image as display-referred colour.
+
+    Args:
+        path: An 8- or 16-bit file (taken as sRGB) or a float file (taken as linear and brought to sRGB).
+
+    Returns:
+        Straight-alpha pixels, float32, 8-bit value v as v / 255. Channels as in the file. [H, W, C]
+    """
+    pixels = read_raw(path)
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.float32) / np.float32(255.0)
+    if pixels.dtype == np.uint16:
+        return pixels.astype(np.float32) / np.float32(65535.0)
+    colors = 3 if pixels.shape[2] >= 3 else 1
+    pixels = pixels.astype(np.float32)
+    if not np.isfinite(pixels).all():
+        raise errors.DatasetError(f"{path}: expected finite pixels, found NaN or infinity; render it again")
+    if pixels.shape[2] in (2, 4):  # the alpha of linear float files is premultiplied
+        alpha = pixels[..., -1:]
+        pixels[..., :-1] = np.where(alpha > 0, pixels[..., :-1] / np.maximum(alpha, 1e-8), 0.0)
+    pixels[..., :colors] = linear_to_srgb(pixels[..., :colors])
+    return np.clip(pixels, 0.0, 1.0)
+
+
+def read_raw(path: Path) -> np.ndarray:
+    """Read the stored numbers: uint8, uint16 or float32, alpha not multiplied in. [H, W, C]"""
+    source = _open(path)
+    spec = source.spec()
+    name = str(spec.format)
+    kind = oiio.UINT8 if name == "uint8" else oiio.UINT16 if name == "uint16" else oiio.FLOAT
+    pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
+    problem = source.geterror()
+    source.close()
+    if pixels is None or problem:
+        raise errors.DatasetError(f"{path}: the image cannot be decoded ({problem or 'no pixels'}); is it truncated?")
+    return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """Read a PNG's stored integers, uint8 or uint16. [H, W, C]"""
+    pixels = read_raw(path)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise errors.DatasetError(f"{path}: expected 8 or 16 bits per channel, found {pixels.dtype}")
+    return pixels
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write a PNG by a temporary name and a rename, so that the file is whole or absent.
+
+    Args:
+        path: File to write; its folder is made where missing.
+        pixels: uint8 or uint16 as they are; floats are sRGB in [0, 1] and become 8 bit, rounded. Gray, gray with
+            alpha, RGB or RGBA, straight alpha. [H, W] or [H, W, C]
+    """
+    pixels = np.asarray(pixels)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or pixels.shape[2] not in (1, 2, 3, 4) or 0 in pixels.shape:
+        raise ValueError(f"{path}: expected pixels [H, W] or [H, W, 1 to 4], got {pixels.shape}")
+    if pixels.dtype.kind == "f":
+        pixels = to_uint8(pixels)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: expected uint8, uint16 or floats, got {pixels.dtype}")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    height, width, channels = pixels.shape
+    kind = oiio.UINT8 if pixels.dtype == np.uint8 else oiio.UINT16
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("png:compressionLevel", COMPRESSION_LEVEL)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.png")
+    try:
+        target = oiio.ImageOutput.create(str(temporary))
+        if (
+            target is None
+            or not target.open(str(temporary), spec)
+            or not target.write_image(np.ascontiguousarray(pixels))
+        ):
+            problem = oiio.geterror() if target is None else target.geterror()
+            raise errors.DatasetError(f"{path}: cannot write the image ({problem})")
+        target.close()
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def to_uint8(pixels: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] to 8 bits: clipped, rounded to the nearest."""
+    return np.rint(np.clip(np.nan_to_num(pixels), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """The sRGB transfer curve (IEC 61966-2-1), negative values clipped to 0."""
+    linear = np.maximum(linear, 0.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1.0 / 2.4) - 0.055)
+
+
+def to_rgba(pixels: np.ndarray) -> np.ndarray:
+    """Gray, gray with alpha, RGB or RGBA to RGBA, float32. [H, W, C] -> [H, W, 4]"""
+    channels = pixels.shape[2]
+    alpha = pixels[..., -1:] if channels in (2, 4) else np.ones_like(pixels[..., :1])
+    color = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    return np.concatenate([color, alpha], axis=2).astype(np.float32)
+
+
+def composite(rgba: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
+    """Put straight-alpha colours on a background.
+
+    Args:
+        rgba: Pixels. [H, W, 4]
+        background: Colour behind them, sRGB; white where None. [3]
+
+    Returns:
+        Pixels, float32. [H, W, 3]
+    """
+    behind = np.ones(3, np.float32) if background is None else np.asarray(background, np.float32)
+    alpha = rgba[..., 3:4].astype(np.float32)
+    return rgba[..., :3].astype(np.float32) * alpha + behind * (1.0 - alpha)
+
+
+def _open(path: Path):
+    path = Path(path)
+    if not path.is_file():
+        raise errors.DatasetError(f"{path}: the image is missing")
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)  # else the reader multiplies the colours by alpha
+    source = oiio.ImageInput.open(str(path), hints)
+    if source is None:
+        raise errors.DatasetError(
+            f"{path}: not an image that can be read ({oiio.geterror().strip() or 'unknown format'})"
+        )
+    return source

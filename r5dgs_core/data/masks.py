@@ -1,0 +1,197 @@
+"""Object id images: 8 or 16 bit, palette, or one colour per object."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from .. import errors
+from . import images
+
+MAX_COLORS = 4096
+_GRAY, _PALETTE = 0, 3
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def read(path: Path, colors: Mapping[int, int] | None = None) -> np.ndarray:
+    """Read an object id image.
+
+    One channel holds ids as they are, a palette image holds ids as palette indices, equal R, G and B are one channel.
+    Other RGB images hold one colour per object and need ``colors``. Pixels with alpha 0 are background.
+
+    Args:
+        path: A PNG file.
+        colors: Object id of each packed colour (R << 16 | G << 8 | B); black is 0.
+
+    Returns:
+        Object ids, 0 = background. [H, W] int32
+    """
+    path = Path(path)
+    header = _png_header(path)
+    if header is not None and (header[3] == _PALETTE or (header[3] == _GRAY and header[2] < 8)):
+        return _read_indices(path)
+    pixels = images.read_png(path)
+    channels = pixels.shape[2]
+    if channels < 3 or _is_gray(pixels):
+        ids = pixels[..., 0].astype(np.int32)
+    else:
+        ids = _colors_to_ids(path, pixels, colors)
+    if channels in (2, 4):
+        ids[pixels[..., -1] == 0] = 0
+    return ids
+
+
+def color_table(paths: Iterable[Path]) -> dict[int, int]:
+    """Number the colours of RGB-coded masks: black is 0, the others 1, 2, ... by packed value.
+
+    Returns:
+        Object id of each packed colour; empty where no mask of ``paths`` is coded by colour.
+    """
+    found: set[int] = set()
+    for path in paths:
+        header = _png_header(Path(path))
+        if header is not None and header[3] in (_GRAY, _PALETTE, 4):
+            continue
+        pixels = images.read_png(Path(path))
+        if pixels.shape[2] < 3 or _is_gray(pixels):
+            continue
+        found.update(np.unique(_pack(path, pixels)).tolist())
+        if len(found) > MAX_COLORS:
+            raise errors.DatasetError(
+                f"{path}: expected one flat colour per object, found over {MAX_COLORS} colours in the masks; "
+                "write them without anti-aliasing and without lossy compression"
+            )
+    return {color: i + 1 for i, color in enumerate(sorted(found - {0}))} | ({0: 0} if found else {})
+
+
+def resize(ids: np.ndarray, width: int, height: int, where: str) -> np.ndarray:
+    """Bring an id image to another size of the same shape by its nearest pixels.
+
+    Args:
+        ids: Object ids. [h, w]
+        width: Wanted width in pixels.
+        height: Wanted height in pixels.
+        where: Name for the error.
+
+    Returns:
+        Object ids. [height, width]
+    """
+    h, w = ids.shape
+    if (h, w) == (height, width):
+        return ids
+    if abs(w * height - h * width) > max(w, width):  # more than a pixel off the same aspect ratio
+        raise errors.DatasetError(
+            f"{where}: the mask is {w}x{h}, its image {width}x{height}: not the same shape; "
+            "write masks in the size of the images"
+        )
+    rows = np.minimum((np.arange(height) + 0.5) * h / height, h - 1).astype(np.intp)
+    columns = np.minimum((np.arange(width) + 0.5) * w / width, w - 1).astype(np.intp)
+    return np.ascontiguousarray(ids[rows[:, None], columns[None, :]])
+
+
+def _is_gray(pixels: np.ndarray) -> bool:
+    return bool((pixels[..., 0] == pixels[..., 1]).all() and (pixels[..., 1] == pixels[..., 2]).all())
+
+
+def _pack(path: Path, pixels: np.ndarray) -> np.ndarray:
+    if pixels.dtype != np.uint8:
+        raise errors.DatasetError(f"{path}: a mask coded by colour must have 8 bits per channel, found {pixels.dtype}")
+    rgb = pixels[..., :3].astype(np.int64)
+    return rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
+
+
+def _colors_to_ids(path: Path, pixels: np.ndarray, colors: Mapping[int, int] | None) -> np.ndarray:
+    if not colors:
+        raise errors.DatasetError(
+            f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette"
+        )
+    packed = _pack(path, pixels)
+    keys = np.array(sorted(colors), np.int64)
+    values = np.array([colors[int(k)] for k in keys], np.int32)
+    at = np.minimum(np.searchsorted(keys, packed), len(keys) - 1)
+    unknown = keys[at] != packed
+    if unknown.any():
+        y, x = np.argwhere(unknown)[0]
+        r, g, b = (int(v) for v in pixels[y, x, :3])
+        raise errors.DatasetError(
+            f"{path}: the colour ({r}, {g}, {b}) at pixel ({x}, {y}) belongs to no object; add it to objects.json"
+        )
+    return values[at]
+
+
+def _png_header(path: Path) -> tuple[int, int, int, int, int] | None:
+    """Width, height, bit depth, colour type, interlace of a PNG; None for another format."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(33)
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: the mask cannot be read ({error.strerror})") from error
+    if len(head) < 33 or head[:8] != _PNG_SIGNATURE or head[12:16] != b"IHDR":
+        return None
+    width, height, depth, kind, _, _, interlace = struct.unpack(">IIBBBBB", head[16:29])
+    return width, height, depth, kind, interlace
+
+
+def _read_indices(path: Path) -> np.ndarray:
+    """Decode palette and low-bit gray PNGs to their stored numbers, which image libraries expand to colours.
+
+    Source: PNG specification (ISO/IEC 15948), sections 7.2 (packing) and 9.2 (filters), one byte per filter unit.
+    """
+    data = path.read_bytes()
+    header = _png_header(path)
+    assert header is not None
+    width, height, depth, _, interlace = header
+    if interlace:
+        raise errors.DatasetError(f"{path}: interlaced palette masks are not read; save it without interlacing")
+    packed, at = bytearray(), 8
+    while at + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[at : at + 4])
+        if data[at + 4 : at + 8] == b"IDAT":
+            packed += data[at + 8 : at + 8 + length]
+        at += 12 + length
+    stride = (width * depth + 7) // 8
+    try:
+        raw = np.frombuffer(zlib.decompress(bytes(packed)), np.uint8)
+    except zlib.error as error:
+        raise errors.DatasetError(f"{path}: the mask cannot be decoded ({error}); is it truncated?") from error
+    if raw.size != height * (stride + 1):
+        raise errors.DatasetError(f"{path}: expected {height * (stride + 1)} bytes of pixels, found {raw.size}")
+    lines = raw.reshape(height, stride + 1)
+    rows = np.zeros((height, stride), np.uint8)
+    above = np.zeros(stride, np.uint8)
+    for y in range(height):
+        above = rows[y] = _unfilter(int(lines[y, 0]), lines[y, 1:], above)
+    if depth < 8:
+        bits = np.unpackbits(rows, axis=1)[:, : width * depth].reshape(height, width, depth)
+        return (bits @ (1 << np.arange(depth - 1, -1, -1))).astype(np.int32)
+    return rows[:, :width].astype(np.int32)
+
+
+def _unfilter(kind: int, line: np.ndarray, above: np.ndarray) -> np.ndarray:
+    if kind == 0:
+        return line.copy()
+    if kind == 1:
+        return np.cumsum(line, dtype=np.uint8)
+    if kind == 2:
+        return line + above
+    out = np.zeros_like(line)
+    left = corner = 0
+    for x, value in enumerate(line.tolist()):
+        up = int(above[x])
+        if kind == 3:
+            guess = (left + up) // 2
+        else:
+            p = left + up - corner
+            distance_left, distance_up, distance_corner = abs(p - left), abs(p - up), abs(p - corner)
+            if distance_left <= distance_up and distance_left <= distance_corner:
+                guess = left
+            else:
+                guess = up if distance_up <= distance_corner else corner
+        left = (value + guess) & 255
+        corner = up
+        out[x] = left
+    return out

@@ -1,0 +1,212 @@
+"""The camera files `transforms_{train,val,test}.json`, in D-NeRF's flat layout and NVFi's nested one.
+
+Flat: ``camera_angle_x`` and ``frames`` of ``file_path``, ``time``, ``transform_matrix``. Nested: ``data`` maps a camera
+to one ``transform_matrix`` and its ``frames`` of ``file_path`` and ``time``. Matrices are camera to world with OpenGL
+axes (y up, looking along -z). Where no time is given a frame has index / (n - 1).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+
+RIGID_TOLERANCE = 1e-3
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One frame of a camera file.
+
+    Attributes:
+        place: File and frame, for errors.
+        file_path: Path of the image relative to the data set, "/" between folders, as written.
+        t: Scene time.
+        matrix: Camera to world, OpenGL axes. [4, 4]
+        camera: Name of the camera, "" where the file gives none.
+        lens: The keys about intrinsics that hold for this frame.
+        frame: Frame number where the file gives one.
+    """
+
+    place: str
+    file_path: str
+    t: float
+    matrix: np.ndarray
+    camera: str
+    lens: dict[str, float]
+    frame: float | None
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; the error names the line."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise errors.DatasetError(f"{path}: the file is missing") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise errors.DatasetError(f"{path}: cannot be read ({error})") from error
+    except json.JSONDecodeError as error:
+        raise errors.DatasetError(
+            f"{path}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}; is it truncated?"
+        ) from error
+
+
+def read(path: Path) -> tuple[list[Entry], dict[str, Any]]:
+    """Read one camera file.
+
+    Returns:
+        The frames in the file's order, and the file's top-level keys other than the frames.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}")
+    if isinstance(content.get("frames"), list):
+        entries = _read_frames(str(path), content["frames"], content, None, "")
+    elif isinstance(content.get("data"), dict):
+        entries = []
+        for camera, part in content["data"].items():
+            place = f"{path}: data[{camera!r}]"
+            if not isinstance(part, dict) or not isinstance(part.get("frames"), list):
+                raise errors.DatasetError(f"{place}: expected 'transform_matrix' and 'frames'")
+            entries += _read_frames(place, part["frames"], {**content, **part}, part.get("transform_matrix"), camera)
+    else:
+        keys = ", ".join(sorted(content)) or "nothing"
+        raise errors.DatasetError(f"{path}: expected 'frames' (D-NeRF) or 'data' (NVFi), found {keys}")
+    return entries, {key: value for key, value in content.items() if key not in ("frames", "data")}
+
+
+def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
+    """Camera matrix of a frame for the size that its image has.
+
+    Honours ``fl_x fl_y cx cy`` (pixels of an image of ``w`` x ``h``, where given), else ``camera_angle_x`` and
+    ``camera_angle_y`` (radians); square pixels and a centred principal point where the file is silent.
+
+    Args:
+        entry: The frame.
+        width: Width of its image in pixels.
+        height: Height of its image in pixels.
+
+    Returns:
+        Camera matrix in pixels. [3, 3]
+    """
+    lens = entry.lens
+    declared = lens.get("w", width), lens.get("h", height)
+    scale = np.array([width / declared[0], height / declared[1]])
+    if abs(scale[0] - scale[1]) * max(declared) > 1.5:
+        raise errors.DatasetError(
+            f"{entry.place}: the image is {width}x{height}, 'w' and 'h' say {declared[0]:g}x{declared[1]:g}"
+        )
+    distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
+    if distorted:
+        raise errors.DatasetError(
+            f"{entry.place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first"
+        )
+    if "fl_x" in lens or "fl_y" in lens:
+        focal_x = lens.get("fl_x", lens.get("fl_y", 0.0)) * scale[0]
+        focal_y = lens.get("fl_y", lens.get("fl_x", 0.0)) * scale[1]
+    elif "camera_angle_x" in lens or "camera_angle_y" in lens:
+        for key in ("camera_angle_x", "camera_angle_y"):
+            if key in lens and not 0.0 < lens[key] < math.pi:
+                raise errors.DatasetError(f"{entry.place}: '{key}' is {lens[key]:g}, expected radians in (0, pi)")
+        focal_x = 0.5 * width / math.tan(0.5 * lens["camera_angle_x"]) if "camera_angle_x" in lens else 0.0
+        focal_y = 0.5 * height / math.tan(0.5 * lens["camera_angle_y"]) if "camera_angle_y" in lens else focal_x
+        focal_x = focal_x or focal_y
+    else:
+        raise errors.DatasetError(f"{entry.place}: expected 'camera_angle_x' or 'fl_x', found neither")
+    if not (focal_x > 0 and focal_y > 0):
+        raise errors.DatasetError(f"{entry.place}: the focal length must be positive, found {focal_x:g}, {focal_y:g}")
+    cx = lens["cx"] * scale[0] if "cx" in lens else 0.5 * width
+    cy = lens["cy"] * scale[1] if "cy" in lens else 0.5 * height
+    return np.array([[focal_x, 0.0, cx], [0.0, focal_y, cy], [0.0, 0.0, 1.0]])
+
+
+def view_name(file_path: str) -> str:
+    """Name of a view from its path: without "./", drive, "..", and image suffix."""
+    parts = [part for part in PurePosixPath(file_path.replace("\\", "/")).parts if part not in (".", "..", "/")]
+    name = "/".join(parts)
+    head, _, suffix = name.rpartition(".")
+    return head if head and suffix.lower() in ("png", "jpg", "jpeg", "exr", "webp", "tif", "tiff") else name
+
+
+def _read_frames(place: str, frames: list, common: dict, shared_matrix: Any, camera: str) -> list[Entry]:
+    given = ["time" in frame for frame in frames if isinstance(frame, dict)]
+    if any(given) and not all(given):
+        raise errors.DatasetError(f"{place}: frame {given.index(False)} has no 'time', others have; give all or none")
+    entries = []
+    for i, frame in enumerate(frames):
+        at = f"{place}: frame {i}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise errors.DatasetError(f"{at}: expected an object with a 'file_path'")
+        at = f"{at} ({frame['file_path']})"
+        t = _number(at, "time", frame["time"]) if "time" in frame else i / max(len(frames) - 1, 1)
+        lens = {
+            key: _number(at, key, value)
+            for source in (common, frame)
+            for key, value in _lens_keys(source).items()
+            if value is not None
+        }
+        for key in ("w", "h"):
+            if key in lens and lens[key] <= 0:
+                raise errors.DatasetError(f"{at}: '{key}' must be positive, found {lens[key]:g}")
+        raw_matrix = frame.get("transform_matrix", shared_matrix)
+        number = frame.get("frame")
+        entries.append(
+            Entry(
+                place=at,
+                file_path=frame["file_path"],
+                t=t,
+                matrix=rigid_matrix(at, raw_matrix),
+                camera=str(frame.get("view", frame.get("camera", camera))),
+                lens=lens,
+                frame=float(number) if isinstance(number, (int, float)) and not isinstance(number, bool) else None,
+            )
+        )
+    return entries
+
+
+def rigid_matrix(place: str, value: Any) -> np.ndarray:
+    """Check a camera-to-world matrix: finite, and a rotation, an optional uniform scale and a translation. [4, 4]"""
+    if value is None:
+        raise errors.DatasetError(f"{place}: 'transform_matrix' is missing")
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise errors.DatasetError(f"{place}: expected a 'transform_matrix' of 4x4 numbers")
+    if not np.isfinite(matrix).all():
+        raise errors.DatasetError(f"{place}: 'transform_matrix' holds NaN or infinity")
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if lengths.min() < 1e-9 or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
+        raise errors.DatasetError(f"{place}: 'transform_matrix' is not a rigid camera-to-world matrix")
+    unit = matrix[:3, :3] / lengths
+    off = max(float(np.abs(unit.T @ unit - np.eye(3)).max()), float(np.ptp(lengths) / lengths.mean()))
+    if off > RIGID_TOLERANCE:
+        raise errors.DatasetError(
+            f"{place}: 'transform_matrix' is not rigid (axes off by {off:.2g}, allowed {RIGID_TOLERANCE:g}); "
+            "remove shear and uneven scale"
+        )
+    if np.linalg.det(unit) < 0:
+        raise errors.DatasetError(f"{place}: 'transform_matrix' mirrors the scene (determinant -1)")
+    return matrix
+
+
+def _lens_keys(source: dict) -> dict[str, Any]:
+    names = {"img_w": "w", "img_h": "h"}
+    keys = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", "img_w", "img_h", *_DISTORTION)
+    return {names.get(key, key): source[key] for key in keys if key in source}
+
+
+def _number(place: str, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise errors.DatasetError(f"{place}: '{key}' must be a finite number, found {value!r}")
+    return float(value)
