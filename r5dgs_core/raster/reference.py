@@ -1,0 +1,214 @@
+"""Rasterizer in plain torch: every pixel looks at every Gaussian near it. Slow, any dtype: the oracle of the tests.
+
+Notation: z depth, u = x / z and v = y / z slopes, C the projected covariance in px^2, T transmittance.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from ..scene.cameras import Camera
+from .settings import RasterSettings, RasterStats, SplatImage
+
+TILE = 32  # pixels; only bounds memory, results do not depend on it
+
+
+def rasterize_splats(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    channels: torch.Tensor,
+    camera: Camera,
+    background: torch.Tensor | None,
+    labels: torch.Tensor | None,
+    settings: RasterSettings,
+    stats: RasterStats | None,
+) -> SplatImage:
+    """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
+    height, width = camera.height, camera.width
+    means2d, cov, z = project(means, quats, scales, camera, settings)
+    with torch.no_grad():
+        order, extent = _visible(means2d, cov, z, opacities, camera, settings)
+    if stats is not None:
+        _fill_stats(stats, means2d, cov, order)
+    means2d_kept, cov, z = means2d[order], cov[order], z[order]
+    values = torch.cat([channels[order], z[:, None]], 1)
+    opacities, extent = opacities[order], extent[order]
+    kept_labels = None if labels is None else labels[order]
+
+    rows = []
+    for y0 in range(0, height, TILE):
+        row = []
+        for x0 in range(0, width, TILE):
+            box = (x0, y0, min(x0 + TILE, width), min(y0 + TILE, height))
+            near = _overlapping(means2d_kept.detach(), extent, box)
+            row.append(
+                _blend(
+                    means2d_kept[near],
+                    cov[near],
+                    opacities[near],
+                    values[near],
+                    None if kept_labels is None else kept_labels[near],
+                    box,
+                    settings,
+                )
+            )
+        rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
+    blended, transmittance, ids = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+    alpha = 1 - transmittance
+    covered = alpha > 0
+    depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
+    image = blended[..., :-1]
+    if background is not None:
+        image = image + transmittance[..., None] * background
+    return SplatImage(image, alpha, depth, None if labels is None else ids)
+
+
+def project(
+    means: torch.Tensor,  # [N, 3]
+    quats: torch.Tensor,  # [N, 4]
+    scales: torch.Tensor,  # [N, 3]
+    camera: Camera,
+    settings: RasterSettings,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Project Gaussians to the image.
+
+    Args:
+        means: Centres, world. [N, 3]
+        quats: Rotations wxyz, any length; length zero counts as no rotation. [N, 4]
+        scales: Standard deviations, world units. [N, 3]
+        camera: The view.
+        settings: For near plane, frustum clamp and dilation.
+
+    Returns:
+        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], depths [N]. Rows before the near plane are finite
+        and meaningless.
+
+    Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
+    """
+    T = torch.as_tensor(camera.T_cam_world, dtype=means.dtype, device=means.device)
+    k = camera.intrinsics
+    fx, skew, cx, fy, cy = float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])
+    p_cam = means @ T[:3, :3].T + T[:3, 3]
+    z = p_cam[:, 2]
+    safe_z = torch.where(z > settings.near_plane, z, 1)
+    u, v = p_cam[:, 0] / safe_z, p_cam[:, 1] / safe_z
+    means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
+
+    u_low, u_high, v_low, v_high = frustum_slopes(camera, settings)
+    u, v = u.clamp(u_low, u_high), v.clamp(v_low, v_high)
+    zero = torch.zeros_like(u)
+    jacobian = torch.stack(
+        [
+            torch.stack([fx / safe_z, skew / safe_z, -(fx * u + skew * v) / safe_z], 1),
+            torch.stack([zero, fy / safe_z, -fy * v / safe_z], 1),
+        ],
+        1,
+    )
+    axes = jacobian @ T[:3, :3] @ rotmats(quats) * scales[:, None, :]
+    dilation = settings.dilation * torch.eye(2, dtype=means.dtype, device=means.device)
+    return means2d, axes @ axes.transpose(1, 2) + dilation, z
+
+
+def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
+    """Bounds of x/z (low, high) and y/z (low, high) between which the projection is linearised."""
+    k = camera.intrinsics
+    slack_u = settings.frustum_slack * 0.5 * camera.width / k[0, 0]
+    slack_v = settings.frustum_slack * 0.5 * camera.height / k[1, 1]
+    return (
+        float(-k[0, 2] / k[0, 0] - slack_u),
+        float((camera.width - k[0, 2]) / k[0, 0] + slack_u),
+        float(-k[1, 2] / k[1, 1] - slack_v),
+        float((camera.height - k[1, 2]) / k[1, 1] + slack_v),
+    )
+
+
+def rotmats(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices of quaternions wxyz of any length; zero gives the identity. [N, 4] -> [N, 3, 3]"""
+    square = (quats * quats).sum(1, keepdim=True)
+    proper = square > 0
+    length = torch.sqrt(torch.where(proper, square, 1))
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = torch.where(proper, quats / length, identity).unbind(1)
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        1,
+    )
+
+
+def _visible(means2d, cov, z, opacities, camera, settings):
+    """Rows that can touch the image, near to far [V], and the half extents of all alpha_min ellipses [N, 2]."""
+    reach = 2 * torch.log((opacities / settings.alpha_min).clamp_min(1))
+    extent = torch.sqrt(reach[:, None] * torch.diagonal(cov, dim1=1, dim2=2))
+    size = means2d.new_tensor([camera.width, camera.height])
+    inside = ((means2d + extent > 0) & (means2d - extent < size)).all(1)
+    seen = (z > settings.near_plane) & (opacities >= settings.alpha_min) & inside
+    indices = torch.nonzero(seen)[:, 0]
+    return indices[torch.argsort(z[indices], stable=True)], extent
+
+
+def _overlapping(means2d, extent, box):
+    """Which Gaussians may reach a pixel of the box (x0, y0, x1, y1). [V] bool"""
+    low, high = means2d.new_tensor(box[:2]), means2d.new_tensor(box[2:])
+    return ((means2d + extent > low) & (means2d - extent < high)).all(1)
+
+
+def _blend(means2d, cov, opacities, values, labels, box, settings):
+    """Blend depth-sorted Gaussians over the pixels of a box: values [h, w, D], transmittance [h, w], ids [h, w]."""
+    x0, y0, x1, y1 = box
+    x = torch.arange(x0, x1, dtype=means2d.dtype, device=means2d.device) + 0.5
+    y = torch.arange(y0, y1, dtype=means2d.dtype, device=means2d.device) + 0.5
+    shape = (len(y), len(x))
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
+    d = pixels - means2d
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    power = -0.5 * (c * d[..., 0] ** 2 - 2 * b * d[..., 0] * d[..., 1] + a * d[..., 1] ** 2) / (a * c - b * b)
+    alpha = (opacities * torch.exp(power)).clamp_max(settings.alpha_max)
+    alpha = torch.where(alpha >= settings.alpha_min, alpha, 0)
+
+    # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
+    log_passed = torch.cumsum(torch.log1p(-alpha), 1)
+    with torch.no_grad():  # a pixel stops at the first Gaussian that would bring T below the minimum
+        keep = log_passed >= math.log(settings.transmittance_min)
+    alpha = torch.where(keep, alpha, 0)
+    log_passed = torch.cumsum(torch.log1p(-alpha), 1)
+    log_before = torch.cat([torch.zeros_like(log_passed[:, :1]), log_passed[:, :-1]], 1)
+    weights = alpha * torch.exp(log_before)
+    transmittance = torch.exp(log_passed[:, -1]) if alpha.shape[1] else means2d.new_ones(len(pixels))
+    ids = _heaviest(weights.detach(), labels, transmittance.detach(), settings)
+    return (weights @ values).reshape(*shape, -1), transmittance.reshape(shape), ids.reshape(shape)
+
+
+def _heaviest(weights, labels, transmittance, settings):
+    """Label with the largest sum of weights, the smallest of equals, -1 where alpha is small. [P] int32"""
+    ids = torch.full((len(weights),), -1, dtype=torch.int32, device=weights.device)
+    if labels is None or not len(labels):
+        return ids
+    planes = labels.long().clamp_min(-1) + 1
+    votes = weights.new_zeros((len(weights), int(planes.max()) + 1)).index_add_(1, planes, weights)
+    enough = 1 - transmittance >= settings.id_alpha_min
+    return torch.where(enough, (votes.argmax(1) - 1).to(torch.int32), ids)
+
+
+def _fill_stats(stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor) -> None:
+    """Write visibility and radii now, and the norm of the screen-space gradient when the backward pass comes by."""
+    with torch.no_grad():
+        a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+        longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
+        stats.visible = torch.zeros(len(means2d), dtype=torch.bool, device=means2d.device)
+        stats.visible[order] = True
+        stats.radii = torch.where(stats.visible, 3 * torch.sqrt(longest), 0)
+        stats.grad_norm = torch.zeros_like(stats.radii)
+    if means2d.requires_grad:
+
+        def keep_norm(grad):
+            stats.grad_norm = grad.norm(dim=1)
+
+        means2d.register_hook(keep_norm)

@@ -1,0 +1,261 @@
+"""A posed scene to a picture: the one place where evaluation, the worker and export turn Gaussians of a `Scene` into
+pixels.
+
+Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times its shading factor, with d the viewing direction in the world and A
+the map that brought the Gaussian from its bind state. Behind everything lies the scene's sky, the spherical harmonics
+`Scene.background_sh` along each pixel's ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..model import spherical_harmonics
+from ..motion import rotations
+from ..scene import cameras, playback
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import RasterSettings, RenderOutput, rasterize
+
+SIMILARITY_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A range of a scene's Gaussians somewhere else than in its bind state.
+
+    Attributes:
+        start: First row.
+        count: Number of rows.
+        matrix: Affine map from the bind state to the world. [4, 4]
+    """
+
+    start: int
+    count: int
+    matrix: np.ndarray
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """Gaussians in the world, with what their colour needs of the bind state. P poses.
+
+    Attributes:
+        means: Centres, world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: Logarithms of the standard deviations. [N, 3] float32
+        opacity_logits: Before the sigmoid. [N] float32
+        sh: Spherical harmonics in the bind frame. [N, K, 3] float32
+        object_ids: [N] int32
+        view_maps: Linear maps that bring world directions into the bind frame, up to length. [P, 3, 3]
+        pose_ids: Pose of each Gaussian, a row of ``view_maps``. [N] int64
+        shading_factor: Factor on the colour, or None. [N] float32
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    object_ids: np.ndarray
+    view_maps: np.ndarray
+    pose_ids: np.ndarray
+    shading_factor: np.ndarray | None
+
+
+def pose_frame(scene: Scene, frame: playback.Frame) -> PosedScene:
+    """The Gaussians of a frame of `playback`."""
+    return PosedScene(
+        means=frame.means,
+        quats=frame.quats,
+        log_scales=frame.log_scales,
+        opacity_logits=frame.opacity_logits,
+        sh=frame.sh,
+        object_ids=frame.object_ids,
+        view_maps=playback.sh_rotations(frame.group_quats),
+        pose_ids=frame.motion_ids.astype(np.int64),
+        shading_factor=frame.shading_factor,
+    )
+
+
+def pose_instances(scene: Scene, instances: Sequence[Instance]) -> PosedScene:
+    """Ranges of a scene's Gaussians, each moved by a matrix of its own.
+
+    A range may appear several times, or not at all. Rotation, translation and uniform scale are exact in every respect;
+    under any other linear map the ellipsoids are still mapped exactly and the viewing direction is brought back by the
+    inverse. Shading turns with the rotation that is nearest to the map.
+
+    Args:
+        scene: The scene.
+        instances: Ranges and their maps.
+
+    Returns:
+        The Gaussians, in the order of ``instances``.
+
+    Raises:
+        ValueError: A range leaves the scene, or a matrix flattens space or is not finite.
+    """
+    n = len(scene.means)
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("means", "quats", "log_scales", "shading", "pose_ids")}
+    view_maps, rows = [np.eye(3)], [np.empty(0, np.int64)]
+    for index, instance in enumerate(instances, start=1):
+        start, stop = instance.start, instance.start + instance.count
+        if not 0 <= start <= stop <= n:
+            raise ValueError(f"instance {index - 1}: rows {start}:{stop} leave the scene's {n} Gaussians")
+        linear, offset = _affine(instance.matrix, index - 1)
+        part = slice(start, stop)
+        parts["means"].append((scene.means[part] @ linear.T + offset).astype(np.float32))
+        quats, log_scales, rotation = _map_shapes(linear, scene.quats[part], scene.log_scales[part])
+        parts["quats"].append(quats)
+        parts["log_scales"].append(log_scales)
+        parts["shading"].append(_shading(scene, part, rotation))
+        parts["pose_ids"].append(np.full(stop - start, index))
+        view_maps.append(np.linalg.inv(linear))
+        rows.append(np.arange(start, stop))
+    taken = np.concatenate(rows)
+
+    def joined(name: str, width: tuple[int, ...], dtype: type) -> np.ndarray:
+        return np.concatenate([np.empty((0, *width), dtype), *parts[name]], dtype=dtype)
+
+    shaded = scene.shading is not None and scene.light_direction is not None
+    return PosedScene(
+        means=joined("means", (3,), np.float32),
+        quats=joined("quats", (4,), np.float32),
+        log_scales=joined("log_scales", (3,), np.float32),
+        opacity_logits=scene.opacity_logits[taken],
+        sh=scene.sh[taken],
+        object_ids=scene.object_ids[taken],
+        view_maps=np.stack(view_maps),
+        pose_ids=joined("pose_ids", (), np.int64),
+        shading_factor=joined("shading", (), np.float32) if shaded else None,
+    )
+
+
+def render_frame(
+    scene: Scene,
+    pose: playback.Frame | PosedScene,
+    camera: Camera,
+    *,
+    background: str | np.ndarray | None = "scene",
+    backend: str = "auto",
+    features: np.ndarray | None = None,
+    settings: RasterSettings | None = None,
+) -> RenderOutput:
+    """Render a scene in a pose.
+
+    Args:
+        scene: The scene; its sky is the background.
+        pose: A frame of `playback`, or what `pose_frame` and `pose_instances` give.
+        camera: The camera, in the scene's world.
+        background: "scene" for the sky, None for black, or a colour [3] or image [H, W, 3].
+        backend: Rasterizer: "auto", "cpu", "cuda" or "reference".
+        features: More channels to blend beside the colour. [N, F]
+        settings: Of the rasterizer.
+
+    Returns:
+        Colour (not clamped at 1), alpha, depth, features and object ids, tensors without gradient.
+    """
+    posed = pose_frame(scene, pose) if isinstance(pose, playback.Frame) else pose
+    if isinstance(background, str):
+        if background != "scene":
+            raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")
+        background = sky(scene, camera)
+    with torch.no_grad():
+        return rasterize(
+            _Gaussians(posed, camera),
+            camera,
+            None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
+            None if background is None else torch.from_numpy(np.ascontiguousarray(background, np.float32)),
+            settings=settings,
+            backend=backend,
+        )
+
+
+def sky(scene: Scene, camera: Camera) -> np.ndarray:
+    """The scene's background as this camera sees it, display-referred sRGB. [H, W, 3] float32"""
+    sh = np.asarray(scene.background_sh, np.float64)
+    if len(sh) == 1:
+        color = np.maximum(spherical_harmonics.to_rgb(sh, np.zeros(3)), 0)
+        return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
+    rays = cameras.pixel_rays(camera)
+    return np.maximum(spherical_harmonics.to_rgb(sh, rays), 0).astype(np.float32)
+
+
+def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
+    """Display-referred colour of every Gaussian as this camera sees it, >= 0. [N, 3] float32"""
+    directions = np.zeros_like(posed.means)
+    if posed.sh.shape[1] > 1:
+        directions = posed.means - camera.center.astype(np.float32)
+        maps = posed.view_maps.astype(np.float32)
+        for pose in np.unique(posed.pose_ids):
+            rows = posed.pose_ids == pose
+            if not np.array_equal(maps[pose], np.eye(3)):
+                directions[rows] = directions[rows] @ maps[pose].T
+        directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
+    rgb = np.maximum(spherical_harmonics.to_rgb(posed.sh, directions), 0)
+    if posed.shading_factor is not None:
+        rgb = rgb * posed.shading_factor[:, None]
+    return rgb.astype(np.float32)
+
+
+def to_numpy(value: Any, dtype: type) -> np.ndarray:
+    """A tensor of a `RenderOutput` as an array on the host."""
+    return value.detach().cpu().numpy().astype(dtype, copy=False)
+
+
+class _Gaussians:
+    """What `rasterize` reads: the posed Gaussians, their final colour as harmonics of degree 0."""
+
+    def __init__(self, posed: PosedScene, camera: Camera):
+        self.means = _tensor(posed.means)
+        self.quats = _tensor(posed.quats)
+        self.log_scales = _tensor(posed.log_scales)
+        self.opacity_logits = _tensor(posed.opacity_logits)
+        self.sh = _tensor(spherical_harmonics.rgb_to_dc(colors(posed, camera))[:, None, :])
+        self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
+
+
+def _tensor(array: np.ndarray) -> torch.Tensor:
+    array = np.ascontiguousarray(array, np.float32)
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
+
+
+def _affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Linear part and translation of a [4, 4] matrix that can be undone."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"instance {index}: expected a finite matrix [4, 4], got {matrix!r}")
+    singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if singular[-1] <= 1e-9 * max(singular[0], 1e-30):
+        raise ValueError(f"instance {index}: the matrix flattens space (scale 0); hide the object instead")
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def _map_shapes(
+    linear: np.ndarray, quats: np.ndarray, log_scales: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shapes of ellipsoids under a linear map, and the rotation nearest to it: quats, log_scales, rotation [3, 3]."""
+    u, singular, vt = np.linalg.svd(linear)
+    nearest = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    uniform = singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0]
+    if uniform and np.linalg.det(linear) > 0:
+        turned = rotations.multiply(rotations.rotmats_to_quats(nearest), np.asarray(quats, np.float64))
+        return turned.astype(np.float32), (log_scales + np.log(singular.mean())).astype(np.float32), nearest
+    axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
+    u, singular, _ = np.linalg.svd(axes)
+    u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
+    turned = rotations.rotmats_to_quats(u)
+    return turned.astype(np.float32), np.log(np.maximum(singular, 1e-30)).astype(np.float32), nearest
+
+
+def _shading(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray:
+    """Shading factor of a range that has turned by a rotation. [n] float32"""
+    if scene.shading is None or scene.light_direction is None:
+        return np.ones(rows.stop - rows.start, np.float32)
+    light = np.asarray(scene.light_direction, np.float64)
+    change = (rotation.T @ light - light).astype(np.float32)
+    return np.maximum(1 + scene.shading[rows] @ change, 0)

@@ -1,0 +1,192 @@
+"""Public door of the rasterizer: checks the inputs once, picks a backend, shades Gaussians by their harmonics."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from typing import Any
+
+import torch
+
+from .. import errors
+from ..model import spherical_harmonics
+from ..scene.cameras import Camera
+from .settings import BACKENDS, RasterSettings, RasterStats, RenderOutput, SplatImage
+
+log = logging.getLogger(__name__)
+
+
+def rasterize_splats(
+    means: torch.Tensor,  # [N, 3]
+    quats: torch.Tensor,  # [N, 4]
+    scales: torch.Tensor,  # [N, 3]
+    opacities: torch.Tensor,  # [N]
+    channels: torch.Tensor,  # [N, D]
+    camera: Camera,
+    background: torch.Tensor | None = None,  # [D] or [H, W, D]
+    *,
+    labels: torch.Tensor | None = None,  # [N]
+    settings: RasterSettings | None = None,
+    backend: str = "auto",
+    stats: RasterStats | None = None,
+) -> SplatImage:
+    """Draw Gaussians with any number of channels, differentiably in every float input (not in the camera).
+
+    Args:
+        means: Centres, world. [N, 3]
+        quats: Rotations wxyz; normalised here, gradients pass through the normalisation. [N, 4]
+        scales: Standard deviations along the own axes, world units, not negative. [N, 3]
+        opacities: In [0, 1]. [N]
+        channels: Values to blend; D >= 1. [N, D]
+        camera: The view.
+        background: Shows through by 1 - alpha; zeros where None. [D] or [H, W, D]
+        labels: Integers; ``ids`` of the result is the label with the largest weight, negative ones vote for -1. [N]
+        settings: Thresholds; those of 3DGS where None.
+        backend: "cpu" (numba, float32), "reference" (plain torch, any float dtype), "cuda", or "auto": the fastest one
+            that can take these tensors.
+        stats: Filled with visibility and radii by the call, and with screen-space gradients by the backward pass.
+
+    Returns:
+        Image, alpha and depth, on the device and in the dtype of ``means``.
+
+    Raises:
+        ValueError: A shape does not fit, or an input is not finite; the message names the input and the first row.
+        BackendError: The backend is not there.
+
+    Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
+    """
+    settings = settings or RasterSettings()
+    _check(means, quats, scales, opacities, channels, camera, background, labels)
+    chosen = choose_backend(backend, means)
+    if chosen == "reference":
+        from . import reference as implementation
+    elif chosen == "cpu":
+        from . import cpu as implementation
+    else:
+        raise errors.BackendError("rasterizer 'cuda': not built yet; use backend='cpu' or move the tensors to the CPU")
+    return implementation.rasterize_splats(
+        means, quats, scales, opacities, channels, camera, background, labels, settings, stats
+    )
+
+
+def rasterize(
+    gaussians: Any,
+    camera: Camera,
+    features: torch.Tensor | None = None,  # [N, F]
+    background: torch.Tensor | None = None,  # [3] or [H, W, 3]
+    *,
+    ids: bool = True,
+    settings: RasterSettings | None = None,
+    backend: str = "auto",
+    stats: RasterStats | None = None,
+) -> RenderOutput:
+    """Draw Gaussians as a camera sees them: colour, and features in the same pass.
+
+    Args:
+        gaussians: Anything with ``means``, ``quats``, ``log_scales``, ``opacity_logits``, ``sh`` [N, K, 3] and, if it
+            has them, ``object_ids`` [N] and ``shading_factor`` [N], which multiplies the colour.
+        camera: The view.
+        features: Further values to blend, e.g. identity encodings. [N, F]
+        background: Colour behind the Gaussians; black where None. [3] or [H, W, 3]
+        ids: Whether to find the object of each pixel where ``object_ids`` exist.
+        settings: As in `rasterize_splats`, like ``backend`` and ``stats``.
+
+    Returns:
+        Colour, alpha, depth, features and ids.
+    """
+    means = gaussians.means
+    channels = shaded_colors(gaussians, camera)
+    n_features = 0 if features is None else features.shape[-1]
+    if features is not None and n_features:
+        if features.ndim != 2 or len(features) != len(means):
+            raise ValueError(f"features: expected shape ({len(means)}, F), got {tuple(features.shape)}")
+        channels = torch.cat([channels, features.to(channels.dtype)], 1)
+        if background is not None:
+            zeros = background.new_zeros((*background.shape[:-1], n_features))
+            background = torch.cat([background, zeros], -1)
+    splats = rasterize_splats(
+        means,
+        gaussians.quats,
+        torch.exp(gaussians.log_scales),
+        torch.sigmoid(gaussians.opacity_logits),
+        channels,
+        camera,
+        background,
+        labels=getattr(gaussians, "object_ids", None) if ids else None,
+        settings=settings,
+        backend=backend,
+        stats=stats,
+    )
+    return RenderOutput(
+        color=splats.image[..., :3],
+        alpha=splats.alpha,
+        depth=splats.depth,
+        features=splats.image[..., 3:] if features is not None else None,
+        ids=splats.ids,
+    )
+
+
+def shaded_colors(gaussians: Any, camera: Camera) -> torch.Tensor:
+    """Display-referred colour of each Gaussian from this camera: max(0, factor (0.5 + harmonics)). [N, 3]"""
+    means, sh = gaussians.means, gaussians.sh
+    if sh.shape[-2] == 1:
+        colors = spherical_harmonics.dc_to_rgb(sh[:, 0])
+    else:
+        offsets = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
+        colors = spherical_harmonics.to_rgb(sh, torch.nn.functional.normalize(offsets, dim=-1))
+    factor = getattr(gaussians, "shading_factor", None)
+    if factor is not None:
+        colors = colors * factor[:, None]
+    return colors.clamp_min(0.0)
+
+
+def choose_backend(backend: str, means: torch.Tensor) -> str:
+    """Name of the backend that draws tensors like ``means`` when ``backend`` is asked for. Raises BackendError."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
+    numba_is_there = importlib.util.find_spec("numba") is not None
+    if backend == "auto":
+        if means.device.type == "cpu" and means.dtype == torch.float32 and numba_is_there:
+            return "cpu"
+        if means.device.type == "cpu" and means.dtype == torch.float32:
+            log.warning("rasterizer: numba is not installed, using the slow reference; remedy: pip install numba")
+        return "reference"
+    if backend == "cpu":
+        if not numba_is_there:
+            raise errors.BackendError("rasterizer 'cpu': numba is not installed; remedy: pip install numba")
+        if means.device.type != "cpu" or means.dtype != torch.float32:
+            raise errors.BackendError(
+                f"rasterizer 'cpu': expected float32 tensors on the CPU, got {means.dtype} on {means.device}; "
+                "remedy: convert them, or use backend='reference'"
+            )
+    return backend
+
+
+def _check(means, quats, scales, opacities, channels, camera, background, labels) -> None:
+    """Raise ValueError naming the first input whose shape, dtype or content cannot be drawn."""
+    n = len(means)
+    inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, tensor in inputs.items():
+        expected = shapes.get(name, (n, channels.shape[-1] if channels.ndim == 2 and channels.shape[-1] else "D >= 1"))
+        if tuple(tensor.shape) != expected:
+            raise ValueError(f"{name}: expected shape {expected}, got {tuple(tensor.shape)}")
+        if tensor.dtype != means.dtype or tensor.device != means.device or not tensor.is_floating_point():
+            raise ValueError(f"{name}: expected {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}")
+    if background is not None:
+        depth = channels.shape[-1]
+        if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
+            raise ValueError(
+                f"background: expected shape ({depth},) or ({camera.height}, {camera.width}, {depth}), "
+                f"got {tuple(background.shape)}"
+            )
+        inputs["background"] = background
+    if labels is not None and (tuple(labels.shape) != (n,) or labels.is_floating_point()):
+        raise ValueError(f"labels: expected {n} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
+    for name, tensor in inputs.items():
+        # A sum is one fast pass, and not finite as soon as one term is not; only then is the culprit looked for.
+        if not torch.isfinite(tensor.detach().sum(dtype=torch.float64)):
+            bad = torch.nonzero(~torch.isfinite(tensor))
+            if len(bad):
+                index = tuple(bad[0].tolist())
+                raise ValueError(f"{name}: expected finite values, found {tensor[index].item()} at index {index}")
