@@ -1,0 +1,17 @@
+"""Services of the add-on: objects, keyframes, properties, preferences, panels and the worker's client."""
+
+from . import handlers, panels, preferences, properties, worker
+
+MODULES = (properties, preferences, panels, handlers, worker)
+
+
+def register():
+    """Register every module."""
+    for module in MODULES:
+        module.register()
+
+
+def unregister():
+    """Undo `register` in reverse order."""
+    for module in reversed(MODULES):
+        module.unregister()

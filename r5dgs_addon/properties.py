@@ -1,0 +1,103 @@
+"""State that belongs to a .blend file: what each object of a loaded scene is, and the scene's table of words.
+
+Everything that playback, selection and preview need to find their way back after saving, reloading or moving files
+lies here and not in Python's memory.
+"""
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+ROLES = (
+    ("NONE", "None", "Not part of an R5DGS scene"),
+    ("ROOT", "Root", "Carries the world convention of the scene"),
+    ("ANCHOR", "Anchor", "Carries the motion of a motion group"),
+    ("CLOUD", "Cloud", "Gaussians of one object and one motion group"),
+)
+
+
+class R5DGS_PG_object(bpy.types.PropertyGroup):
+    """What one Blender object is in its R5DGS scene."""
+
+    role: EnumProperty(name="Role", description="What this object is in its R5DGS scene", items=ROLES)
+    object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects", default=0)
+    motion_id: IntProperty(name="Motion Group", description="Id of the rigid motion", default=0)
+    start: IntProperty(name="First Gaussian", description="First row in the scene file", default=0)
+    count: IntProperty(name="Gaussians", description="Number of rows in the scene file", default=0)
+    pivot: FloatVectorProperty(name="Pivot", description="Point that the motion turns about, scene coordinates", size=3)
+
+
+class R5DGS_PG_entry(bpy.types.PropertyGroup):
+    """One object of the scene's table; `name` is the object's name."""
+
+    object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
+    aliases: StringProperty(name="Aliases", description="Other words that find it, separated by commas")
+    caption: StringProperty(name="Caption", description="A sentence about it")
+    count: IntProperty(name="Gaussians", description="Number of Gaussians")
+
+
+class R5DGS_PG_scene(bpy.types.PropertyGroup):
+    """The loaded scene that a collection holds."""
+
+    is_scene: BoolProperty(name="R5DGS Scene", description="Whether this collection holds a loaded R5DGS scene")
+    scene_name: StringProperty(name="Name", description="Name of the scene in its file")
+    filepath: StringProperty(
+        name="Scene File",
+        description="The .r5dgs file that the preview reads; relative to the .blend file where possible",
+        subtype="FILE_PATH",
+    )
+    gaussians: IntProperty(name="Gaussians", description="Number of Gaussians in the scene file")
+    t_start: FloatProperty(name="First Time", description="First observed scene time", precision=4)
+    t_max: FloatProperty(name="Last Observed Time", description="Motion is extrapolated after it", precision=4)
+    t_end: FloatProperty(name="Last Time", description="End of the extrapolated keys", precision=4)
+    frames_per_unit: FloatProperty(name="Frames per Unit", description="Frames per unit of scene time", default=60.0)
+    frame_zero: FloatProperty(name="Frame of Time 0", description="Frame at which the scene time is 0", default=1.0)
+    root: PointerProperty(name="Root", description="Empty that carries the world convention", type=bpy.types.Object)
+    table: CollectionProperty(name="Objects", description="The scene's table of objects", type=R5DGS_PG_entry)
+
+
+class R5DGS_PG_match(bpy.types.PropertyGroup):
+    """One answer to the last prompt; `name` is the object's name."""
+
+    object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
+    score: FloatProperty(name="Score", description="How well it matches, at most 1")
+    why: StringProperty(name="Why", description="What matched")
+
+
+class R5DGS_PG_session(bpy.types.PropertyGroup):
+    """What the sidebar shows; not saved."""
+
+    prompt: StringProperty(name="Prompt", description="Words for the objects to select, such as 'red mug'")
+    asked: StringProperty(name="Asked", description="The last prompt that was searched")
+    matches: CollectionProperty(name="Matches", description="Answers to the last prompt", type=R5DGS_PG_match)
+    preview_ms: FloatProperty(name="Preview Time", description="Milliseconds of the last preview in the worker")
+    preview_size: StringProperty(name="Preview Size", description="Size of the last preview")
+
+
+CLASSES = (R5DGS_PG_object, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_match, R5DGS_PG_session)
+
+
+def register():
+    """Register the groups and hang them on objects, collections and the window manager."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Object.r5dgs = PointerProperty(type=R5DGS_PG_object)
+    bpy.types.Collection.r5dgs = PointerProperty(type=R5DGS_PG_scene)
+    bpy.types.WindowManager.r5dgs = PointerProperty(type=R5DGS_PG_session)
+
+
+def unregister():
+    """Undo `register`."""
+    del bpy.types.WindowManager.r5dgs
+    del bpy.types.Collection.r5dgs
+    del bpy.types.Object.r5dgs
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,228 @@
+"""The worker that the Blender add-on talks to: ``python -m r5dgs_core.serve``.
+
+Requests are JSON lines on standard input; each gets one JSON line on standard output, followed by the raw bytes of the
+arrays that the line announces, in order:
+
+    -> {"id": 1, "command": "render", ...}
+    <- {"id": 1, "ok": true, "result": {...}, "arrays": [{"name": "color", "dtype": "<f4", "shape": [H, W, 3]}]} + bytes
+    <- {"id": 1, "ok": false, "error": {"kind": "SceneFileError", "message": "..."}}
+
+One scene stays loaded. The worker ends when its input ends. Torch and the rasterizer are imported when first needed,
+so that ``hello`` can say what is missing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import platform
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from . import errors
+from .scene import lookup, playback, scene_file
+from .scene.cameras import Camera
+from .scene.scene import Scene
+
+PROTOCOL = 1
+NEEDED = ("torch", "numba")
+
+Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+class Server:
+    """Answers requests; holds the scene that was loaded last."""
+
+    def __init__(self) -> None:
+        self._scene: Scene | None = None
+        self._stamp: tuple[str, int, int] | None = None
+        self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
+            "hello": self._hello,
+            "load": self._load,
+            "render": self._render,
+            "query": self._query,
+        }
+
+    def answer(self, request: dict[str, Any]) -> Answer:
+        """Answer one request.
+
+        Args:
+            request: ``command`` and its arguments.
+
+        Returns:
+            The result, JSON values, and arrays by name.
+
+        Raises:
+            R5dgsError: The request asks for what cannot be had.
+        """
+        command = request.get("command")
+        if command not in self._commands:
+            raise errors.ConfigError(f"worker: unknown command {command!r}; known are {', '.join(self._commands)}")
+        return self._commands[command](request)
+
+    def _hello(self, _: dict[str, Any]) -> Answer:
+        missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+        return {"protocol": PROTOCOL, "python": platform.python_version(), "missing": missing, "pid": os.getpid()}, {}
+
+    def _load(self, request: dict[str, Any]) -> Answer:
+        """``path``: read a scene file, unless this very file is loaded already."""
+        path = Path(_need(request, "path", str))
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise errors.SceneFileError(
+                f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
+                "'Scene File' in the R5DGS tab"
+            ) from error
+        stamp = (str(path), status.st_mtime_ns, status.st_size)
+        if self._scene is None or stamp != self._stamp:
+            self._scene, self._stamp = None, None
+            self._scene, self._stamp = scene_file.read(path), stamp
+        return {"name": self._scene.name, "gaussians": len(self._scene.means)}, {}
+
+    def _render(self, request: dict[str, Any]) -> Answer:
+        """Rasterize the loaded scene.
+
+        ``camera``: ``width height intrinsics T_cam_world`` in the scene's world. Either ``t`` (playback) or
+        ``instances``: a list of ``start count matrix``, each a range of Gaussians and the [4, 4] map of its bind state
+        into the scene's world. ``background`` (default true): the scene's sky. ``want``: any of ``depth alpha ids``.
+        """
+        scene = self._loaded()
+        camera = _camera(_need(request, "camera", dict))
+        want = request.get("want", [])
+        unknown = set(want) - {"depth", "alpha", "ids"}
+        if unknown:
+            raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are alpha, depth, ids")
+        scene_render = _rasterizer()
+        started = time.perf_counter()
+        if "instances" in request:
+            pose = scene_render.pose_instances(scene, [_instance(entry) for entry in request["instances"]])
+        else:
+            pose = scene_render.pose_frame(scene, playback.frame(scene, float(_need(request, "t", (int, float)))))
+        posed = time.perf_counter()
+        background = "scene" if request.get("background", True) else None
+        output = scene_render.render_frame(scene, pose, camera, background=background)
+        ended = time.perf_counter()
+        arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
+        for name in want:
+            value = getattr(output, name)
+            if value is not None:
+                arrays[name] = scene_render.to_numpy(value, np.int32 if name == "ids" else np.float32)
+        milliseconds = {"ms_motion": 1e3 * (posed - started), "ms_raster": 1e3 * (ended - posed)}
+        return {**milliseconds, "gaussians": len(pose.means)}, arrays
+
+    def _query(self, request: dict[str, Any]) -> Answer:
+        """``text``: ranked objects of the loaded scene."""
+        found = lookup.search(self._loaded(), _need(request, "text", str))
+        return {"matches": [{"object_id": int(i), "score": float(s), "why": str(w)} for i, s, w in found]}, {}
+
+    def _loaded(self) -> Scene:
+        if self._scene is None:
+            raise errors.ConfigError("worker: no scene is loaded; send 'load' first")
+        return self._scene
+
+
+def _rasterizer():
+    """`raster.scene_render`, whose imports need torch and numba."""
+    try:
+        from .raster import scene_render
+    except ImportError as error:
+        raise errors.BackendError(
+            f"worker: {sys.executable} lacks '{error.name}'; install the core there ('pip install r5dgs')"
+        ) from error
+    return scene_render
+
+
+def _need(request: dict[str, Any], key: str, kind: type | tuple[type, ...]) -> Any:
+    value = request.get(key)
+    if not isinstance(value, kind):
+        raise errors.ConfigError(f"worker: '{request.get('command')}' needs '{key}', found {value!r}")
+    return value
+
+
+def _matrix(value: Any, size: int, what: str) -> np.ndarray:
+    try:
+        matrix = np.asarray(value, np.float64).reshape(size, size)
+    except (TypeError, ValueError):
+        raise errors.ConfigError(f"worker: {what} has to hold {size} x {size} numbers") from None
+    if not np.isfinite(matrix).all():
+        raise errors.ConfigError(f"worker: {what} holds values that are not finite")
+    return matrix
+
+
+def _camera(value: dict[str, Any]) -> Camera:
+    width, height = value.get("width"), value.get("height")
+    if not (isinstance(width, int) and isinstance(height, int) and 0 < width <= 32768 and 0 < height <= 32768):
+        raise errors.ConfigError(f"worker: a camera needs width and height from 1 to 32768, found {width} x {height}")
+    intrinsics = _matrix(value.get("intrinsics"), 3, "the camera's intrinsics")
+    return Camera(width, height, intrinsics, _matrix(value.get("T_cam_world"), 4, "the camera's T_cam_world"))
+
+
+def _instance(value: dict[str, Any]):
+    try:
+        start, count = int(value["start"]), int(value["count"])
+    except (KeyError, TypeError, ValueError):
+        raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {value!r}") from None
+    return _rasterizer().Instance(start, count, _matrix(value.get("matrix"), 4, f"the matrix of rows {start}"))
+
+
+def serve(requests: BinaryIO, answers: BinaryIO) -> None:
+    """Answer requests until the input ends or ``shutdown`` comes.
+
+    Args:
+        requests: JSON lines.
+        answers: Where the answers go.
+    """
+    server = Server()
+    for line in requests:
+        if not line.strip():
+            continue
+        number = None
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise errors.ConfigError("worker: a request has to be a JSON object")
+            number = request.get("id")
+            if request.get("command") == "shutdown":
+                _send(answers, {"id": number, "ok": True, "result": {}}, {})
+                return
+            result, arrays = server.answer(request)
+        except errors.R5dgsError as error:
+            _send(answers, _failure(number, type(error).__name__, str(error)), {})
+        except json.JSONDecodeError as error:
+            _send(answers, _failure(number, "ConfigError", f"worker: a request is not JSON: {error}"), {})
+        except Exception as error:  # the worker outlives a failed request; the traceback goes to its log
+            traceback.print_exc()
+            _send(answers, _failure(number, type(error).__name__, str(error)), {})
+        else:
+            _send(answers, {"id": number, "ok": True, "result": result}, arrays)
+
+
+def _failure(number: Any, kind: str, message: str) -> dict[str, Any]:
+    return {"id": number, "ok": False, "error": {"kind": kind, "message": message}}
+
+
+def _send(answers: BinaryIO, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    entries = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in arrays.items()]
+    answers.write(json.dumps({**header, "arrays": entries}).encode() + b"\n")
+    for array in arrays.values():
+        answers.write(np.ascontiguousarray(array).tobytes())
+    answers.flush()
+
+
+def main() -> None:
+    """Serve on standard input and output; whatever else prints goes to standard error."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    serve(sys.stdin.buffer, answers)
+
+
+if __name__ == "__main__":
+    main()
