@@ -1,0 +1,233 @@
+"""How a motion group moves past t_max: one small set of rates, evaluated in closed form where there is one.
+
+Notation: tau = t - t_max >= 0, p the group's pivot (its centre at t_max). A point of the bind state moves as
+x(t) = p + R(tau) (x(t_max) - p) + d(tau). The fitted curve (R_f, d_f) starts from the identity at tau = 0; the observed
+pose at t_max, which is the bind state, lies off that curve by noise. `offset_rotvec` r and `offset_displacement` e say
+where the curve is at t_max, seen from the bind state, and are blended in with s = 1 - exp(-tau / fade_time):
+
+    R(tau) = R_f(tau) exp(s r),    d(tau) = d_f(tau) + s e.
+
+So R(0) = I and d(0) = 0 to the bit, and the motion converges to the fitted curve R_f exp(r), d_f + e.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from . import rotations, se3
+
+KINDS = ("static", "translation", "ballistic_spin", "constant_twist", "world_twist")
+_VECTORS = (
+    "velocity",
+    "acceleration",
+    "angular_velocity",
+    "angular_acceleration",
+    "center_offset",
+    "offset_rotvec",
+    "offset_displacement",
+)
+_STEP_TOLERANCE = 1e-9  # of the radius; Magnus-4 error of `world_twist`
+
+
+def _zeros() -> np.ndarray:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """Rigid motion past t_max. All rates are those at t_max, in the world frame; all vectors are float64. [3]
+
+    Attributes:
+        kind: "static" (stays), "translation" (velocity, acceleration), "ballistic_spin" (centroid form:
+            d_f = v tau + a tau^2/2 + u - R_f u, R_f = exp(w tau + eps tau^2/2)), "constant_twist" (a screw:
+            R_f = exp(w tau), d_f = V(w tau) v tau) or "world_twist" (v(x) = v + w x (x - p) with v and w linear in
+            time, x in the world; Magnus-4 steps).
+        velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
+        acceleration: a, rate of v.
+        angular_velocity: w, rad per unit of time.
+        angular_acceleration: eps, rate of w.
+        center_offset: u, the body point that moves with v and a, from the pivot at t_max ("ballistic_spin" only).
+            A hinge has v = a = 0 and u on its axis.
+        offset_rotvec: r, rotation of the fitted curve at t_max seen from the bind state, rad.
+        offset_displacement: e, its displacement.
+        fade_time: Time constant with which the offsets are blended in, > 0.
+        radius: Radius of the group, world units: what tolerances refer to.
+        covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
+        covariance_names: Names of its rows, such as "velocity.x".
+    """
+
+    kind: str = "static"
+    velocity: np.ndarray | None = None
+    acceleration: np.ndarray | None = None
+    angular_velocity: np.ndarray | None = None
+    angular_acceleration: np.ndarray | None = None
+    center_offset: np.ndarray | None = None
+    offset_rotvec: np.ndarray | None = None
+    offset_displacement: np.ndarray | None = None
+    fade_time: float = 0.1
+    radius: float = 1.0
+    covariance: np.ndarray | None = None
+    covariance_names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
+        for name in _VECTORS:
+            value = getattr(self, name)
+            vector = np.zeros(3) if value is None else np.array(value, np.float64)
+            if vector.shape != (3,) or not np.isfinite(vector).all():
+                raise ValueError(f"{name}: expected three finite numbers, got {value!r}")
+            vector.flags.writeable = False
+            object.__setattr__(self, name, vector)
+        for name in ("fade_time", "radius"):
+            value = float(getattr(self, name))
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name}: expected a positive number, got {value}")
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
+        if self.covariance is not None:
+            covariance = np.array(self.covariance, np.float64)
+            size = len(self.covariance_names)
+            if covariance.shape != (size, size) or not np.isfinite(covariance).all():
+                raise ValueError(f"covariance: expected finite ({size}, {size}), got {covariance.shape}")
+            object.__setattr__(self, "covariance", covariance)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MotionModel) and self.to_dict() == other.to_dict()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The model as JSON types; `from_dict` restores it to the bit."""
+        result: dict[str, Any] = {"kind": self.kind}
+        for name in _VECTORS:
+            result[name] = getattr(self, name).tolist()
+        result.update(fade_time=self.fade_time, radius=self.radius)
+        if self.covariance is not None:
+            result.update(covariance=self.covariance.tolist(), covariance_names=list(self.covariance_names))
+        return result
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> MotionModel:
+        """Inverse of `to_dict`. Raises ValueError naming the key that is unknown or malformed."""
+        if not isinstance(data, dict) or "kind" not in data:
+            raise ValueError(f"expected an object with the key 'kind', got {data!r}")
+        known = {f.name for f in fields(MotionModel)}
+        unknown = sorted(set(data) - known)
+        if unknown:
+            raise ValueError(f"{unknown[0]}: unknown key of a motion model")
+        try:
+            return MotionModel(**data)
+        except TypeError as error:
+            raise ValueError(f"malformed motion model: {error}") from error
+
+    @property
+    def is_static(self) -> bool:
+        """Whether `evaluate` gives the identity at every time."""
+        moving = [*(getattr(self, n) for n in _VECTORS if n != "center_offset")] if self.kind != "static" else []
+        return not any(v.any() for v in (*moving, self.offset_rotvec, self.offset_displacement))
+
+    @property
+    def turns(self) -> bool:
+        """Whether `evaluate` ever gives a rotation."""
+        spins = self.kind not in ("static", "translation") and (
+            self.angular_velocity.any() or self.angular_acceleration.any()
+        )
+        return bool(spins or self.offset_rotvec.any())
+
+
+STATIC = MotionModel()
+
+
+def evaluate(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of the group relative to its bind state.
+
+    Args:
+        model: The motion.
+        tau: Time since t_max, >= 0, any shape. [...]
+
+    Returns:
+        Unit quaternions wxyz [..., 4] and displacements of the pivot, world [..., 3], float64. tau = 0 gives exactly
+        (1, 0, 0, 0) and 0.
+    """
+    quats, displacements, _, _ = evaluate_with_rates(model, tau)
+    return quats, displacements
+
+
+def evaluate_with_rates(
+    model: MotionModel, tau: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pose as in `evaluate`, with its exact time derivative.
+
+    Returns:
+        Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame, rad per unit [..., 3], and
+        velocities of the pivot [..., 3].
+    """
+    tau = np.asarray(tau, np.float64)
+    if (tau < 0).any():
+        raise ValueError(f"tau: expected times since t_max >= 0, got {tau.min()}")
+    quats, displacements, spins, velocities = curve(model, tau)
+    s = -np.expm1(-tau / model.fade_time)[..., None]
+    rate = (1 - s) / model.fade_time
+    blended = rotations.multiply(quats, rotations.rotvecs_to_quats(s * model.offset_rotvec))
+    return (
+        blended,
+        displacements + s * model.offset_displacement,
+        spins + rate * rotations.rotate(quats, np.broadcast_to(model.offset_rotvec, spins.shape)),
+        velocities + rate * model.offset_displacement,
+    )
+
+
+def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The fitted curve (R_f, d_f) without offsets, from the identity at tau = 0, with its exact derivative.
+
+    Args:
+        model: The motion.
+        tau: Time since t_max, of either sign, any shape. [...]
+
+    Returns:
+        As `evaluate_with_rates`.
+    """
+    tau = np.asarray(tau, np.float64)
+    span = tau[..., None]
+    zero = np.zeros((*tau.shape, 3))
+    v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
+    if model.kind == "static":
+        return rotations.identity(*tau.shape), zero, zero, zero
+    if model.kind == "translation":
+        return rotations.identity(*tau.shape), v * span + 0.5 * a * span**2, zero, v + a * span
+    if model.kind == "ballistic_spin":
+        turn = w * span + 0.5 * eps * span**2
+        quats = rotations.rotvecs_to_quats(turn)
+        spins = se3.v_matrix_times(turn, w + eps * span)
+        arm = rotations.rotate(quats, np.broadcast_to(model.center_offset, zero.shape))
+        d = v * span + 0.5 * a * span**2 + (model.center_offset - arm)
+        return quats, d, spins, v + a * span - rotations.cross(spins, arm)
+    if model.kind == "constant_twist":
+        turn = w * span
+        quats = rotations.rotvecs_to_quats(turn)
+        path = np.broadcast_to(v, zero.shape)
+        return quats, se3.v_matrix_times(turn, path) * span, w + zero, rotations.rotate(quats, path)
+    quats, d = _world_twist(model, tau)
+    spins = w + eps * span
+    return quats, d, spins, v + a * span + rotations.cross(spins, d)
+
+
+def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
+    """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need."""
+    twist = (model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration)
+    v, a, w, eps = twist
+    flat = tau.reshape(-1)
+    tolerance = _STEP_TOLERANCE * model.radius
+    needed = [se3.steps_needed(w, v, eps, a, float(t), model.radius, tolerance) for t in flat]
+    steps = np.array([1 << min(math.ceil(math.log2(n)), 20) for n in needed], np.int64)
+    quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
+    for n in np.unique(steps):
+        rows = np.flatnonzero(steps == n)
+        for block in np.array_split(rows, max(1, len(rows) * int(n) >> 18)):
+            quats[block], displacements[block] = se3.integrate(w, v, eps, a, flat[block], int(n))
+    return quats.reshape(*tau.shape, 4), displacements.reshape(*tau.shape, 3)

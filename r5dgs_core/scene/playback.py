@@ -1,0 +1,221 @@
+"""A scene at any time: poses of its motion groups, and its Gaussians moved by them.
+
+Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
+(the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours. Blender's
+Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce playback at
+sub-frames. Before the first knot the pose is held; past t_max it is the motion model's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import models, rotations
+from .scene import Scene
+
+MODES = ("rigid",)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The Gaussians of a scene at time t.
+
+    `sh` stays in the frame of the bind state: a renderer turns each viewing direction back by the group's rotation
+    (`sh_rotations`) instead of turning the coefficients.
+
+    Attributes:
+        t: Scene time.
+        means: Centres, world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: As in the scene. [N, 3] float32
+        opacity_logits: As in the scene. [N] float32
+        sh: As in the scene, bind frame. [N, K, 3] float32
+        shading_factor: Factor on the colour, >= 0, or None without shading. [N] float32
+        object_ids: [N] int32
+        motion_ids: [N] int32
+        group_quats: Rotation of each motion group since the bind state, unit wxyz. [G, 4] float64
+        group_displacements: Displacement of each group's pivot, world. [G, 3] float64
+    """
+
+    t: float
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    shading_factor: np.ndarray | None
+    object_ids: np.ndarray
+    motion_ids: np.ndarray
+    group_quats: np.ndarray
+    group_displacements: np.ndarray
+
+
+def knots(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Poses at the observed times with signs chosen so that quaternions are continuous and end at (1, 0, 0, 0).
+
+    Returns:
+        Quaternions [G, S, 4] and displacements [G, S, 3], float64.
+    """
+    quats = np.moveaxis(np.asarray(scene.track_poses[..., :4], np.float64), 1, 0)
+    quats = rotations.make_continuous(quats[::-1])[::-1]
+    quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
+    return np.moveaxis(quats, 0, 1), np.asarray(scene.track_poses[..., 4:], np.float64)
+
+
+def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Slopes at knots of the parabola through each knot and its neighbours; at the ends, through the nearest three.
+
+    Args:
+        times: Increasing. [S]
+        values: Values at these times. [..., S, C]
+
+    Returns:
+        Slopes per unit of time; the secant for S = 2, zero for S = 1. [..., S, C]
+    """
+    if len(times) < 2:
+        return np.zeros_like(values)
+    h = np.diff(times)[:, None]
+    secants = np.diff(values, axis=-2) / h
+    if len(times) == 2:
+        return np.repeat(secants, 2, axis=-2)
+    inner = (h[1:] * secants[..., :-1, :] + h[:-1] * secants[..., 1:, :]) / (h[:-1] + h[1:])
+    first = 2 * secants[..., :1, :] - inner[..., :1, :]
+    last = 2 * secants[..., -1:, :] - inner[..., -1:, :]
+    return np.concatenate([first, inner, last], axis=-2)
+
+
+def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
+    quats, displacements = knots(scene)
+    return slopes(scene.track_times, quats), slopes(scene.track_times, displacements)
+
+
+def hermite(left: np.ndarray, right: np.ndarray, m_left: np.ndarray, m_right: np.ndarray, h: float, u: float):
+    """Cubic with given values and slopes at both ends of an interval of length h, at the fraction u. [..., C]"""
+    u2, u3 = u * u, u * u * u
+    return (
+        (2 * u3 - 3 * u2 + 1) * left
+        + (u3 - 2 * u2 + u) * h * m_left
+        + (3 * u2 - 2 * u3) * right
+        + (u3 - u2) * h * m_right
+    )
+
+
+def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of every motion group relative to the bind state.
+
+    Args:
+        scene: The scene.
+        t: Scene time; before the first knot the first pose is held.
+
+    Returns:
+        Unit quaternions wxyz [G, 4] and displacements of the pivots, world [G, 3], float64. At t_max exactly the
+        identity; a group that `follows` another takes its displacement through `follow_matrix` past t_max.
+    """
+    if not np.isfinite(t):
+        raise ValueError(f"t: expected a finite scene time, got {t}")
+    if t < scene.t_max:
+        return _observed_poses(scene, t)
+    count = len(scene.groups)
+    quats, displacements = rotations.identity(count), np.zeros((count, 3))
+    tau = t - scene.t_max
+    for g, group in enumerate(scene.groups):
+        if group.follows is None and not group.model.is_static:
+            quats[g], displacements[g] = models.evaluate(group.model, tau)
+    for g, group in enumerate(scene.groups):
+        if group.follows is not None and group.follow_matrix is not None:
+            displacements[g] = group.follow_matrix @ displacements[group.follows]
+    return quats, displacements
+
+
+def _observed_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
+    times = scene.track_times
+    quats, displacements = knots(scene)
+    if t <= times[0]:
+        return rotations.normalize(quats[:, 0]), displacements[:, 0].copy()
+    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+    h = float(times[k + 1] - times[k])
+    u = (t - float(times[k])) / h
+    quat_slopes, displacement_slopes = slopes(times, quats), slopes(times, displacements)
+    q = hermite(quats[:, k], quats[:, k + 1], quat_slopes[:, k], quat_slopes[:, k + 1], h, u)
+    d = hermite(
+        displacements[:, k], displacements[:, k + 1], displacement_slopes[:, k], displacement_slopes[:, k + 1], h, u
+    )
+    return rotations.normalize(q), d
+
+
+def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
+    """Matrices that bring world directions into each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
+    return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
+
+
+def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
+    """Stretches of equal ids as (start, stop, id). [N]"""
+    if len(ids) == 0:
+        return []
+    cuts = np.flatnonzero(np.diff(ids)) + 1
+    starts = np.concatenate([[0], cuts])
+    stops = np.concatenate([cuts, [len(ids)]])
+    return [(int(a), int(b), int(ids[a])) for a, b in zip(starts, stops, strict=True)]
+
+
+def frame(scene: Scene, t: float, mode: str = "rigid") -> Frame:
+    """The scene's Gaussians at time t.
+
+    Args:
+        scene: The scene.
+        t: Scene time.
+        mode: "rigid": every Gaussian moves with its motion group.
+
+    Returns:
+        The frame. Gaussians of groups that did not move are equal to the bind state to the bit.
+    """
+    if mode not in MODES:
+        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+    group_quats, group_displacements = group_poses(scene, t)
+    return pose(scene, group_quats, group_displacements, t)
+
+
+def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:
+    """The scene's Gaussians with each motion group in a given pose.
+
+    Args:
+        scene: The scene.
+        group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
+        group_displacements: Displacement of each pivot, world. [G, 3]
+        t: Time written into the frame.
+    """
+    means, quats = scene.means, scene.quats
+    shading = None
+    if scene.shading is not None and scene.light_direction is not None:
+        shading = np.ones(len(means), np.float32)
+    rotmats = rotations.quats_to_rotmats(group_quats)
+    moved = np.flatnonzero((group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1))
+    if len(moved):
+        means, quats = means.copy(), quats.copy()
+    for start, stop, g in runs(scene.motion_ids):
+        if g not in moved:
+            continue
+        rows, pivot = slice(start, stop), np.asarray(scene.groups[g].pivot, np.float64)
+        offsets = scene.means[rows].astype(np.float64) - pivot
+        means[rows] = offsets @ rotmats[g].T + (pivot + group_displacements[g])
+        quats[rows] = rotations.multiply(group_quats[g], scene.quats[rows].astype(np.float64))
+        if shading is not None:
+            light = np.asarray(scene.light_direction, np.float64)
+            change = (rotmats[g].T @ light - light).astype(np.float32)
+            shading[rows] = np.maximum(1 + scene.shading[rows] @ change, 0)
+    return Frame(
+        t=float(t),
+        means=means,
+        quats=quats,
+        log_scales=scene.log_scales,
+        opacity_logits=scene.opacity_logits,
+        sh=scene.sh,
+        shading_factor=shading,
+        object_ids=scene.object_ids,
+        motion_ids=scene.motion_ids,
+        group_quats=group_quats,
+        group_displacements=group_displacements,
+    )

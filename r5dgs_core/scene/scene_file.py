@@ -1,0 +1,420 @@
+"""Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/scene_format.md).
+
+Members hold what `Scene` holds, under the same names. Four of them are stored with fewer bits and restored to float32 on
+reading: quats, log_scales and opacity_logits as int16 fixed point, sh and shading as float16.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import secrets
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__, errors
+from ..motion.models import MotionModel
+from . import validation
+from .cameras import Camera
+from .scene import MotionGroup, Scene, SceneObject
+
+logger = logging.getLogger(__name__)
+
+FORMAT = "r5dgs scene"
+FORMAT_VERSION = 1
+JSON_MEMBER = "scene.json"
+
+# Fixed point: stored int16 i stands for i / scale.
+FIXED_POINT = {"quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
+_HALF = ("sh", "shading")
+_MEMORY_DTYPES: dict[str, type] = {
+    "means": np.float32,
+    "quats": np.float32,
+    "log_scales": np.float32,
+    "opacity_logits": np.float32,
+    "sh": np.float32,
+    "object_ids": np.int32,
+    "motion_ids": np.int32,
+    "track_times": np.float64,
+    "track_poses": np.float64,
+    "background_sh": np.float32,
+    "identities": np.float16,
+    "shading": np.float32,
+    "embeddings": np.float32,
+    "vocabulary_embeddings": np.float32,
+}
+_OPTIONAL = ("identities", "shading", "embeddings", "vocabulary_embeddings")
+_STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in _MEMORY_DTYPES.items()}
+for _name in FIXED_POINT:
+    _STORED_DTYPES[_name].add("<i2")
+for _name in _HALF:
+    _STORED_DTYPES[_name].add("<f2")
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError, KeyError)
+
+
+def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
+    """Write a scene, atomically: the old file stays until the new one is complete and on the disk.
+
+    Args:
+        scene: The scene; checked first.
+        path: Where to, its folder must exist.
+        exact: Store everything in the precision of memory instead of the compact one.
+
+    Returns:
+        The path written.
+    """
+    path = Path(path)
+    validation.check(scene, f"{path} (not written)")
+    if not path.parent.is_dir():
+        raise errors.SceneFileError(f"{path}: expected an existing folder, found none; make {path.parent} first")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        try:
+            with open(temporary, "xb") as stream:
+                _write_zip(scene, stream, exact)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    _sync_folder(path.parent)
+    return path
+
+
+def read(path: str | Path) -> Scene:
+    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected; nothing is half-loaded."""
+    path = Path(path)
+    if not path.is_file():
+        raise errors.SceneFileError(
+            f"{path}: expected a .r5dgs file, found {'a folder' if path.is_dir() else 'nothing'}"
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            scene = _read_zip(archive, str(path))
+    except zipfile.BadZipFile as error:
+        raise errors.SceneFileError(
+            f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); bake or copy it again"
+        ) from error
+    except OSError as error:
+        raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
+    validation.check(scene, str(path))
+    return scene
+
+
+def info(scene: Scene) -> dict[str, Any]:
+    """What `r5dgs info` prints, as JSON types."""
+    return {
+        "name": scene.name,
+        "gaussians": len(scene.means),
+        "sh_degree": int(np.sqrt(scene.sh.shape[1])) - 1,
+        "objects": [
+            {"id": o.id, "name": o.name, "aliases": list(o.aliases), "gaussians": o.count} for o in scene.objects
+        ],
+        "motion_groups": [
+            {
+                "id": g.id,
+                "object": g.object_id,
+                "role": g.role,
+                "gaussians": int((scene.motion_ids == g.id).sum()),
+                "model": g.model.kind if g.follows is None else f"follows {g.follows}",
+                "rigid_rms": g.rigid_rms,
+            }
+            for g in scene.groups
+        ],
+        "times": [float(scene.track_times[0]), scene.t_max],
+        "knots": len(scene.track_times),
+        "frames_per_unit": scene.frames_per_unit,
+        "world_convention": scene.world_convention,
+        "cameras": len(scene.cameras),
+        "extent": scene.extent,
+        "identities": scene.identities is not None,
+        "shading": scene.shading is not None,
+        "vocabulary": len(scene.vocabulary),
+    }
+
+
+def _write_zip(scene: Scene, stream: Any, exact: bool) -> None:
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        text = json.dumps(_to_json(scene), indent=1, allow_nan=False, default=_plain, ensure_ascii=False)
+        _add(archive, JSON_MEMBER, text.encode())
+        for name, dtype in _MEMORY_DTYPES.items():
+            array = getattr(scene, name)
+            if array is None:
+                continue
+            buffer = io.BytesIO()
+            stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
+            np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
+            _add(archive, f"{name}.npy", buffer.getvalue())
+
+
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    # A fixed date makes equal scenes equal files.
+    entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.external_attr = 0o644 << 16
+    archive.writestr(entry, data)
+
+
+def _encode(name: str, array: np.ndarray) -> np.ndarray:
+    """Compact form of a member, or the member itself where the compact one cannot hold it."""
+    if name in FIXED_POINT:
+        scaled = np.rint(array.astype(np.float64) * FIXED_POINT[name])
+        fits = len(array) == 0 or np.abs(scaled).max() <= 32767
+        return scaled.astype("<i2") if fits else array
+    if name in _HALF and (array.size == 0 or np.abs(array).max() < 6e4):
+        return array.astype("<f2")
+    return array
+
+
+def _decode(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype == np.int16:
+        values = array.astype(np.float64) / FIXED_POINT[name]
+        if name == "quats":
+            norms = np.linalg.norm(values, axis=-1, keepdims=True)
+            values = np.divide(values, norms, out=values, where=np.abs(norms - 1) < 1e-3)
+        return values.astype(np.float32)
+    return array.astype(_MEMORY_DTYPES[name])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise errors.SceneFileError(f"provenance or needs: expected JSON types, found {type(value).__name__}")
+
+
+def _to_json(scene: Scene) -> dict[str, Any]:
+    light = scene.light_direction
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "generator": f"r5dgs {__version__}",
+        "name": scene.name,
+        "gaussians": len(scene.means),
+        "t_max": float(scene.t_max),
+        "frames_per_unit": float(scene.frames_per_unit),
+        "world_convention": scene.world_convention,
+        "objects": [
+            {
+                "id": o.id,
+                "name": o.name,
+                "aliases": list(o.aliases),
+                "caption": o.caption,
+                "color": [float(c) for c in o.color],
+                "start": o.start,
+                "count": o.count,
+            }
+            for o in scene.objects
+        ],
+        "groups": [
+            {
+                "id": g.id,
+                "object_id": g.object_id,
+                "role": g.role,
+                "anchor_index": g.anchor_index,
+                "pivot": np.asarray(g.pivot, np.float64).tolist(),
+                "model": g.model.to_dict(),
+                "follows": g.follows,
+                "follow_matrix": None if g.follow_matrix is None else np.asarray(g.follow_matrix, np.float64).tolist(),
+                "rigid_rms": float(g.rigid_rms),
+                "rigid_max": float(g.rigid_max),
+            }
+            for g in scene.groups
+        ],
+        "cameras": [
+            {
+                "name": c.name,
+                "width": c.width,
+                "height": c.height,
+                "intrinsics": c.intrinsics.tolist(),
+                "T_cam_world": c.T_cam_world.tolist(),
+            }
+            for c in scene.cameras
+        ],
+        "light_direction": None if light is None else np.asarray(light, np.float64).tolist(),
+        "vocabulary": list(scene.vocabulary),
+        "provenance": scene.provenance,
+        "needs": list(scene.needs),
+    }
+
+
+def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
+    data = _read_json(archive, place)
+    arrays = {name: _read_array(archive, name, place) for name in _MEMORY_DTYPES}
+    json_place = f"{place}: {JSON_MEMBER}"
+    count, means = _get(data, "gaussians", int, json_place), arrays["means"]
+    if means is None or means.shape[:1] != (count,):
+        found = None if means is None else means.shape
+        raise errors.SceneFileError(
+            f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
+        )
+    light = data.get("light_direction")
+    return Scene(
+        name=_get(data, "name", str, json_place),
+        **arrays,  # type: ignore[arg-type]
+        objects=tuple(_each(data, "objects", _read_object, json_place)),
+        groups=tuple(_each(data, "groups", _read_group, json_place)),
+        t_max=_get(data, "t_max", float, json_place),
+        frames_per_unit=_get(data, "frames_per_unit", float, json_place),
+        world_convention=_get(data, "world_convention", str, json_place),
+        cameras=tuple(_each(data, "cameras", _read_camera, json_place)),
+        light_direction=None if light is None else _numbers(data, "light_direction", (3,), json_place),
+        vocabulary=tuple(_words(data, "vocabulary", json_place)),
+        provenance=_get(data, "provenance", dict, json_place),
+        needs=tuple(_each(data, "needs", lambda row, place: dict(row), json_place)),
+    )
+
+
+def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:
+    def refuse(constant: str) -> float:
+        raise ValueError(f"the number {constant}")
+
+    where = f"{place}: {JSON_MEMBER}"
+    if JSON_MEMBER not in archive.namelist():
+        raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found; this is another kind of zip")
+    try:
+        data = json.loads(archive.read(JSON_MEMBER).decode("utf-8"), parse_constant=refuse)
+    except (*_BROKEN, RecursionError) as error:
+        raise errors.SceneFileError(f"{where}: expected readable JSON, found damage ({error})") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise errors.SceneFileError(f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file')
+    version = data.get("format_version")
+    if version != FORMAT_VERSION or isinstance(version, bool):
+        newer = isinstance(version, int) and version > FORMAT_VERSION
+        remedy = "update R5DGS" if newer else "bake the scene again"
+        raise errors.SceneFileError(f"{where}: expected format_version {FORMAT_VERSION}, found {version!r}; {remedy}")
+    return data
+
+
+def _read_array(archive: zipfile.ZipFile, name: str, place: str) -> np.ndarray | None:
+    member = f"{name}.npy"
+    where = f"{place}: {member}"
+    if member not in archive.namelist():
+        if name in _OPTIONAL:
+            return None
+        raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found")
+    try:
+        data = archive.read(member)
+        stream = io.BytesIO(data)
+        version = np.lib.format.read_magic(stream)
+        if version != (1, 0):
+            raise ValueError(f"npy version {version} instead of (1, 0)")
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    except _BROKEN as error:
+        raise errors.SceneFileError(f"{where}: expected a readable array, found damage ({error})") from error
+    if dtype.str not in _STORED_DTYPES[name] or fortran:
+        raise errors.SceneFileError(
+            f"{where}: expected dtype {' or '.join(sorted(_STORED_DTYPES[name]))} in C order, "
+            f"found {dtype.str}{' in Fortran order' if fortran else ''}"
+        )
+    size = dtype.itemsize * int(np.prod(shape, dtype=object)) if shape else dtype.itemsize
+    if len(data) - stream.tell() != size:
+        raise errors.SceneFileError(
+            f"{where}: expected {size} bytes for shape {shape}, found {len(data) - stream.tell()}"
+        )
+    return _decode(name, np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape))
+
+
+def _get(data: dict[str, Any], key: str, kind: type, place: str) -> Any:
+    value = data.get(key)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+        found = "nothing" if key not in data else repr(value)[:60]
+        raise errors.SceneFileError(f"{place}: {key}: expected {kind.__name__}, found {found}")
+    return value
+
+
+def _each(data: dict[str, Any], key: str, reader: Callable[[dict[str, Any], str], Any], place: str) -> list[Any]:
+    rows = _get(data, key, list, place)
+    for i, row in enumerate(rows):
+        if not isinstance(row, dict):
+            raise errors.SceneFileError(f"{place}: {key}[{i}]: expected an object, found {row!r}")
+    return [reader(row, f"{place}: {key}[{i}]") for i, row in enumerate(rows)]
+
+
+def _numbers(data: dict[str, Any], key: str, shape: tuple[int, ...], place: str) -> np.ndarray:
+    try:
+        array = np.array(data.get(key), np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise errors.SceneFileError(
+            f"{place}: {key}: expected finite numbers of shape {shape}, found {data.get(key)!r}"
+        )
+    return array
+
+
+def _words(data: dict[str, Any], key: str, place: str) -> list[str]:
+    words = _get(data, key, list, place)
+    for word in words:
+        if not isinstance(word, str):
+            raise errors.SceneFileError(f"{place}: {key}: expected words, found {word!r}")
+    return words
+
+
+def _read_object(row: dict[str, Any], place: str) -> SceneObject:
+    r, g, b = _numbers(row, "color", (3,), place).tolist()
+    return SceneObject(
+        id=_get(row, "id", int, place),
+        name=_get(row, "name", str, place),
+        aliases=tuple(_words(row, "aliases", place)),
+        caption=_get(row, "caption", str, place),
+        color=(r, g, b),
+        start=_get(row, "start", int, place),
+        count=_get(row, "count", int, place),
+    )
+
+
+def _read_group(row: dict[str, Any], place: str) -> MotionGroup:
+    try:
+        model = MotionModel.from_dict(_get(row, "model", dict, place))
+    except ValueError as error:
+        raise errors.SceneFileError(f"{place}: model: {error}") from error
+    follows = row.get("follows")
+    return MotionGroup(
+        id=_get(row, "id", int, place),
+        object_id=_get(row, "object_id", int, place),
+        role=_get(row, "role", str, place),
+        anchor_index=_get(row, "anchor_index", int, place),
+        pivot=_numbers(row, "pivot", (3,), place),
+        model=model,
+        follows=None if follows is None else _get(row, "follows", int, place),
+        follow_matrix=None if row.get("follow_matrix") is None else _numbers(row, "follow_matrix", (3, 3), place),
+        rigid_rms=_get(row, "rigid_rms", float, place),
+        rigid_max=_get(row, "rigid_max", float, place),
+    )
+
+
+def _read_camera(row: dict[str, Any], place: str) -> Camera:
+    return Camera(
+        width=_get(row, "width", int, place),
+        height=_get(row, "height", int, place),
+        intrinsics=_numbers(row, "intrinsics", (3, 3), place),
+        T_cam_world=_numbers(row, "T_cam_world", (4, 4), place),
+        name=_get(row, "name", str, place),
+    )
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the rename itself on the disk, where the system can (not on Windows)."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        logger.debug("%s: fsync of the folder failed: %s", folder, error)
+    finally:
+        os.close(descriptor)
