@@ -94,6 +94,9 @@ class Scene:
         cameras: The data set's distinct cameras.
         background_sh: Spherical harmonics of the sky over the world's viewing direction, 3DGS basis. [Kb, 3]
         identities: Identity encodings. [N, 16] float16 or None
+        classifier_weight: Linear classifier of identities; row k is the k-th object with id >= 0 of ``objects``.
+            [M + 1, 16] float32 or None
+        classifier_bias: Its bias, in the same order. [M + 1] float32 or None
         shading: How the colour changes as the group turns: factor 1 + (R^T l - l) . g. [N, 3] float32 or None
         light_direction: l above, unit, world. [3]
         embeddings: One row per object of ``objects``, unit. [M, D] or None
@@ -121,6 +124,8 @@ class Scene:
     cameras: tuple[Camera, ...]
     background_sh: np.ndarray
     identities: np.ndarray | None = None
+    classifier_weight: np.ndarray | None = None
+    classifier_bias: np.ndarray | None = None
     shading: np.ndarray | None = None
     light_direction: np.ndarray | None = None
     embeddings: np.ndarray | None = None
