@@ -1,0 +1,168 @@
+"""Render the scene into a training data set: images, exact masks, cameras, times and poses."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+
+from ..r5dgs_addon import capture, capture_objects, capture_views
+from ..r5dgs_core import errors
+
+
+def _items(identifiers, descriptions):
+    return [(name, name.replace("_", " ").title(), text) for name, text in zip(identifiers, descriptions, strict=True)]
+
+
+class R5DGS_OT_capture_dataset(bpy.types.Operator):
+    """Render this scene from many cameras into a data set that R5DGS trains on"""
+
+    bl_idname = "r5dgs.capture_dataset"
+    bl_label = "Capture R5DGS Data Set"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(name="Folder", description="New or empty folder of the data set", subtype="DIR_PATH")
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    resolution_x: IntProperty(name="Width", description="Image width in pixels", default=256, min=1)
+    resolution_y: IntProperty(name="Height", description="Image height in pixels", default=256, min=1)
+    samples: IntProperty(name="Samples", description="Cycles samples per pixel", default=64, min=1)
+    denoise: BoolProperty(name="Denoise", default=True)
+    transparent: BoolProperty(name="Transparent Sky", description="Write RGBA images", default=False)
+    seed: IntProperty(name="Seed", default=0, min=0)
+    view_transform: StringProperty(
+        name="View Transform", description="Standard is plain sRGB; empty keeps the scene's", default="Standard"
+    )
+    device: EnumProperty(name="Device", items=[("CPU", "CPU", ""), ("GPU", "GPU", "As set in the preferences")])
+    frame_start: IntProperty(name="First Frame", description="Frame of t = 0; the scene's if not set")
+    frame_end: IntProperty(name="Last Frame", description="Frame of t = 1; the scene's if not set")
+    frame_step: IntProperty(name="Frame Step", description="Captured frames are this far apart", default=1, min=1)
+    t_max: FloatProperty(name="t_max", description="Last observed time", default=0.75, min=0.0, max=1.0)
+    val_every: IntProperty(name="Val Every", description="Every n-th observed time", default=4, min=1)
+    val_between: BoolProperty(name="Val Between", description="Also half-way between observed times", default=True)
+    test_every: IntProperty(name="Test Every", description="Every n-th later time", default=1, min=1)
+    test_views: IntProperty(name="Test Views", description="Observed views in test, beside novel", default=4, min=0)
+    observed: StringProperty(
+        name="Observed", description="Names of observed cameras (patterns) or their collection; empty for all"
+    )
+    novel: StringProperty(
+        name="Novel", description="Names of novel cameras (patterns) or their collection", default="*novel*"
+    )
+    rig: EnumProperty(
+        name="Rig",
+        items=_items(
+            capture_views.RIGS,
+            (
+                "An arc about the scene camera where the scene has fewer than three cameras",
+                "Only the scene's cameras",
+                "Cameras on an arc",
+                "Cameras on a ring",
+                "Cameras on a hemisphere",
+            ),
+        ),
+    )
+    rig_observed: IntProperty(name="Rig Observed", description="Generated observed cameras", default=10, min=0)
+    rig_novel: IntProperty(name="Rig Novel", description="Generated novel cameras", default=2, min=0)
+    rig_target: StringProperty(name="Rig Target", description="Object to look at; empty for the middle of all objects")
+    rig_radius: FloatProperty(name="Rig Radius", description="Distance from the target; 0 sees all objects", min=0.0)
+    rig_elevation_deg: FloatProperty(name="Rig Elevation", description="Degrees above the target", default=30.0)
+    rig_elevation_spread_deg: FloatProperty(
+        name="Rig Elevation Spread", description="Degrees between neighbours", default=0.0
+    )
+    rig_azimuth_deg: FloatProperty(
+        name="Rig Azimuth", description="Middle of the arc, degrees counter-clockwise from +X", default=-90.0
+    )
+    rig_arc_deg: FloatProperty(name="Rig Arc", description="Length of the arc in degrees", default=120.0)
+    rig_fov_deg: FloatProperty(
+        name="Rig Field of View", description="Horizontal, degrees", default=45.0, min=1.0, max=170.0
+    )
+    objects: EnumProperty(
+        name="Objects",
+        items=_items(
+            capture_objects.CHOICES,
+            (
+                "By pass index where any is set, else what is animated, else what is selected",
+                "Everything with a pass index above 0",
+                "What is in a collection; its child collections are an object each",
+                "What is selected",
+                "What moves or deforms in the frame range",
+            ),
+        ),
+    )
+    object_collection: StringProperty(name="Object Collection", description="Collection that holds the objects")
+
+    def settings(self) -> capture.CaptureSettings:
+        """The properties as settings; a frame range that was not set is the scene's."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(capture.CaptureSettings)}
+        values["directory"] = Path(bpy.path.abspath(self.directory))
+        for name in ("frame_start", "frame_end"):
+            if not self.properties.is_property_set(name):
+                values[name] = None
+        return capture.CaptureSettings(**values)
+
+    def invoke(self, context, event):
+        self._interactive = True
+        if self.directory:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        if not self.directory:
+            self.report({"ERROR"}, "capture.directory: expected a folder for the data set, got nothing")
+            return {"CANCELLED"}
+        self._running = capture.steps(context, self.settings())
+        if bpy.app.background or not getattr(self, "_interactive", False):
+            while True:
+                finished = self._step(context)
+                if finished is not None:
+                    return finished
+        manager = context.window_manager
+        manager.progress_begin(0, 1)
+        manager.modal_handler_add(self)
+        self._timer = manager.event_timer_add(0.05, window=context.window)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        if event.type == "ESC":
+            self._running.close()
+            self.report({"INFO"}, "Capture stopped; nothing was written")
+            return self._end(context, {"CANCELLED"})
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        finished = self._step(context)
+        return {"RUNNING_MODAL"} if finished is None else self._end(context, finished)
+
+    def _step(self, context):
+        """Render one image; the operator's result when that was the last, else None."""
+        try:
+            state = next(self._running)
+        except StopIteration as end:
+            return self._finish(end.value)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if bpy.app.background:
+            print(json.dumps({"event": "capture", **dataclasses.asdict(state)}), flush=True)
+        else:
+            context.window_manager.progress_update(state.done / state.total)
+            context.workspace.status_text_set(
+                f"Capture: image {state.done} of {state.total}, {state.seconds_left:.0f} s left; Esc stops"
+            )
+        return None
+
+    def _finish(self, result):
+        counts = ", ".join(f"{number} {split}" for split, number in result.images.items())
+        self.report({"INFO"}, f"{result.directory}: {counts} images of {len(result.objects)} objects")
+        if result.unseen:
+            self.report({"WARNING"}, f"No image shows: {', '.join(result.unseen)}")
+        return {"FINISHED"}
+
+    def _end(self, context, result):
+        context.window_manager.event_timer_remove(self._timer)
+        context.window_manager.progress_end()
+        context.workspace.status_text_set(None)
+        return result
+
+
+CLASSES = (R5DGS_OT_capture_dataset,)

@@ -1,0 +1,314 @@
+"""Capture: from any .blend to a training data set in the D-NeRF layout, rendered by Cycles with exact object masks.
+
+One render gives the colours and the object ids of a view. Afterwards, also after an error, the scene is as it was.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core import errors
+from . import capture_files, capture_objects, capture_render, capture_views
+from .capture_overrides import Overrides
+
+SPLITS = ("train", "val", "test")
+MAX_OBJECTS = 65535  # what a 16-bit mask can tell apart
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What to capture; every default suits a scene that was never meant for it.
+
+    Attributes:
+        directory: Folder of the data set; absent or empty.
+        resolution_x: Image width in pixels.
+        resolution_y: Image height in pixels.
+        samples: Cycles samples per pixel.
+        denoise: Denoise with OpenImageDenoise.
+        transparent: Write RGBA images with a transparent sky.
+        seed: Sampling seed of the first image; later ones count on from it.
+        view_transform: Blender's view transform; "Standard" is plain sRGB, "" keeps the scene's.
+        device: Cycles device, "CPU" or "GPU".
+        frame_start: Frame of t = 0; None for the scene's.
+        frame_end: Frame of t = 1; None for the scene's.
+        frame_step: Captured frames are this far apart.
+        t_max: Frames up to this time are observed (train and val), later ones are test.
+        val_every: Novel views are rendered at every n-th observed time.
+        val_between: Novel views are also rendered half-way between observed times.
+        test_every: Every n-th later time is rendered.
+        test_views: Number of observed views in test, beside all novel ones.
+        observed: Names of the observed cameras: patterns such as "cam*, left", or a collection; "" for all.
+        novel: The same for the novel cameras.
+        rig: Generated cameras: "NONE", "ARC", "RING", "HEMISPHERE", or "AUTO": an arc about the scene camera where
+            the scene has fewer than three observed cameras of its own.
+        rig_observed: Number of generated observed cameras.
+        rig_novel: Number of generated novel cameras.
+        rig_target: Point, or name of the object, that the rig looks at; "" for the middle of the objects.
+        rig_radius: Distance of the rig from its target; 0 for one that sees all objects.
+        rig_elevation_deg: Elevation of the rig above its target.
+        rig_elevation_spread_deg: Neighbours on an arc or ring differ by this much in elevation.
+        rig_azimuth_deg: Direction of the middle of the arc, counter-clockwise from +X; -90 is Blender's front.
+        rig_arc_deg: Length of the arc.
+        rig_fov_deg: Horizontal field of view of the rig.
+        objects: What counts as an object: "PASS_INDEX", "COLLECTION", "SELECTED", "ANIMATED", or "AUTO": by pass index
+            where any is set, else what is animated or selected.
+        object_collection: Collection for "COLLECTION".
+    """
+
+    directory: Path
+    resolution_x: int = 256
+    resolution_y: int = 256
+    samples: int = 64
+    denoise: bool = True
+    transparent: bool = False
+    seed: int = 0
+    view_transform: str = "Standard"
+    device: str = "CPU"
+    frame_start: int | None = None
+    frame_end: int | None = None
+    frame_step: int = 1
+    t_max: float = 0.75
+    val_every: int = 4
+    val_between: bool = True
+    test_every: int = 1
+    test_views: int = 4
+    observed: str = ""
+    novel: str = "*novel*"
+    rig: str = "AUTO"
+    rig_observed: int = 10
+    rig_novel: int = 2
+    rig_target: str | tuple[float, float, float] = ""
+    rig_radius: float = 0.0
+    rig_elevation_deg: float = 30.0
+    rig_elevation_spread_deg: float = 0.0
+    rig_azimuth_deg: float = -90.0
+    rig_arc_deg: float = 120.0
+    rig_fov_deg: float = 45.0
+    objects: str = "AUTO"
+    object_collection: str = ""
+
+
+@dataclass(frozen=True)
+class CaptureProgress:
+    """Where a capture stands after an image.
+
+    Attributes:
+        done: Images written.
+        total: Images in all.
+        image: The last one, such as "train/r_0000".
+        seconds_left: Estimate from the images so far.
+    """
+
+    done: int
+    total: int
+    image: str
+    seconds_left: float
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """What a finished capture wrote.
+
+    Attributes:
+        directory: Folder of the data set.
+        images: Number of images of each split.
+        objects: Name of each object id.
+        unseen: Names of objects that no image shows.
+    """
+
+    directory: Path
+    images: dict[str, int]
+    objects: dict[int, str]
+    unseen: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TimePlan:
+    """Frames of each split; sub-frames are fractions.
+
+    Attributes:
+        start: Frame of t = 0.
+        end: Frame of t = 1.
+        observed: Frames of train.
+        val: Frames of val.
+        test: Frames of test.
+    """
+
+    start: int
+    end: int
+    observed: tuple[float, ...]
+    val: tuple[float, ...]
+    test: tuple[float, ...]
+
+    def time(self, frame: float) -> float:
+        """Scene time of a frame; 0 where the range is a single frame."""
+        return (frame - self.start) / (self.end - self.start) if self.end > self.start else 0.0
+
+    @property
+    def frames(self) -> tuple[float, ...]:
+        """All frames, increasing, each once."""
+        return tuple(sorted({*self.observed, *self.val, *self.test}))
+
+
+def plan_times(settings: CaptureSettings, scene_start: int, scene_end: int) -> TimePlan:
+    """Divide a frame range into the three splits.
+
+    Args:
+        settings: Frame range, step, t_max and the thinning of val and test.
+        scene_start: First frame where the settings give none.
+        scene_end: Last frame where the settings give none.
+
+    Returns:
+        The frames of each split.
+    """
+    start = scene_start if settings.frame_start is None else settings.frame_start
+    end = scene_end if settings.frame_end is None else settings.frame_end
+    if end < start:
+        raise errors.ConfigError(f"capture: expected frame_end >= frame_start, got {start} to {end}")
+    frames = [float(frame) for frame in range(start, end + 1, settings.frame_step)]
+    last_observed = start + settings.t_max * (end - start) + 1e-6
+    observed = [frame for frame in frames if frame <= last_observed]
+    later = [frame for frame in frames if frame > last_observed]
+    first = min(1, len(observed) - 1)
+    val = observed[first :: settings.val_every]
+    if settings.val_between:
+        gaps = zip(observed[:-1], observed[1:], strict=True)
+        middles = [0.5 * (a + b) for a, b in gaps]
+        val = sorted(val + middles[first + settings.val_every // 2 :: settings.val_every])
+    return TimePlan(start, end, tuple(observed), tuple(val), tuple(later[:: settings.test_every]))
+
+
+def check_settings(settings: CaptureSettings) -> None:
+    """Raise a `ConfigError` for the first setting that cannot be used."""
+    at_least_one = ("resolution_x", "resolution_y", "samples", "frame_step", "val_every", "test_every")
+    for name in at_least_one:
+        if getattr(settings, name) < 1:
+            raise errors.ConfigError(f"capture.{name}: expected at least 1, got {getattr(settings, name)}")
+    for name in ("rig_observed", "rig_novel", "test_views", "rig_radius"):
+        if getattr(settings, name) < 0:
+            raise errors.ConfigError(f"capture.{name}: expected at least 0, got {getattr(settings, name)}")
+    if not 0.0 <= settings.t_max <= 1.0:
+        raise errors.ConfigError(f"capture.t_max: expected a time in [0, 1], got {settings.t_max}")
+    if not 0.0 < settings.rig_fov_deg < 180.0:
+        raise errors.ConfigError(f"capture.rig_fov_deg: expected degrees between 0 and 180, got {settings.rig_fov_deg}")
+    choices = {"rig": capture_views.RIGS, "objects": capture_objects.CHOICES, "device": ("CPU", "GPU")}
+    for name, allowed in choices.items():
+        value = getattr(settings, name)
+        if value not in allowed:
+            raise errors.ConfigError(f"capture.{name}: expected one of {', '.join(allowed)}, got {value!r}")
+
+
+def capture(
+    context: bpy.types.Context,
+    settings: CaptureSettings,
+    progress: Callable[[CaptureProgress], None] | None = None,
+) -> CaptureResult:
+    """Capture the context's scene to a data set folder; see `steps` for what may fail."""
+    running = steps(context, settings)
+    while True:
+        try:
+            state = next(running)
+        except StopIteration as end:
+            return end.value
+        if progress is not None:
+            progress(state)
+
+
+def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[CaptureProgress]:
+    """Capture image by image, so that a caller can show progress and stop in between.
+
+    Closing the iterator early restores the scene and leaves no folder behind. Its return value is the `CaptureResult`.
+
+    Args:
+        context: Its scene and view layer are captured.
+        settings: What to capture.
+
+    Yields:
+        The state after each image.
+
+    Raises:
+        ConfigError: A setting is wrong, or the scene has no usable camera or object.
+        DatasetError: The folder exists and is not empty.
+        BackendError: OpenImageIO or Cycles is missing.
+    """
+    check_settings(settings)
+    capture_files.require_openimageio()
+    scene = context.scene
+    plan = plan_times(settings, scene.frame_start, scene.frame_end)
+    with Overrides() as overrides, capture_files.new_folder(Path(settings.directory)) as folder:
+        overrides.keep_frame(scene)
+        survey = capture_objects.survey(context, plan.frames, overrides)
+        objects = capture_objects.choose(context.view_layer, survey, settings.objects, settings.object_collection)
+        highest = max(o.id for o in objects)
+        if highest > MAX_OBJECTS:
+            raise errors.ConfigError(
+                f"capture: a mask tells {MAX_OBJECTS} objects apart, found {len(objects)} with ids up to {highest}; "
+                "join some, or choose fewer by collection"
+            )
+        capture_objects.assign_ids(objects, overrides)
+        views = capture_views.choose(context, settings, capture_objects.bounds(survey, objects), overrides)
+        temporary = capture_render.prepare(context, settings, overrides)
+        frames: dict[str, list[dict]] = {split: [] for split in SPLITS}
+        seen: set[int] = set()
+        jobs = list(_jobs(plan, views, settings.test_views))
+        started = time.monotonic()
+        for done, (split, frame, view) in enumerate(jobs):
+            scene.frame_set(math.floor(frame), subframe=frame - math.floor(frame))
+            scene.cycles.seed = (settings.seed + done) % 2**31
+            image, ids = capture_render.render_view(context, view.camera, settings.transparent, temporary)
+            seen.update(np.unique(ids).tolist())
+            stem = f"{split}/r_{len(frames[split]):04d}"
+            capture_files.write_view(folder, stem, image, ids, wide=highest > 255)
+            camera = capture_views.describe(context, view.camera, settings.resolution_x, settings.resolution_y)
+            frames[split].append({"file_path": f"./{stem}", "time": plan.time(frame), "view": view.name, **camera})
+            seconds_left = (time.monotonic() - started) / (done + 1) * (len(jobs) - done - 1)
+            yield CaptureProgress(done + 1, len(jobs), stem, seconds_left)
+        header = {
+            "frames_per_unit": float(max(plan.end - plan.start, 1)),
+            "w": settings.resolution_x,
+            "h": settings.resolution_y,
+        }
+        for split in SPLITS:
+            capture_files.write_transforms(folder, split, header, frames[split])
+        capture_files.write_json(folder / "objects.json", {str(o.id): o.name for o in objects})
+        capture_files.write_json(folder / "ground_truth.json", _ground_truth(plan, survey, objects))
+    return CaptureResult(
+        directory=Path(settings.directory),
+        images={split: len(frames[split]) for split in SPLITS},
+        objects={o.id: o.name for o in objects},
+        unseen=tuple(o.name for o in objects if o.id not in seen),
+    )
+
+
+def _jobs(
+    plan: TimePlan, views: capture_views.Views, test_views: int
+) -> Iterator[tuple[str, float, capture_views.View]]:
+    """Split, frame and view of every image, a frame's images together since changing the frame costs most."""
+    picks = np.linspace(0, len(views.observed) - 1, min(test_views, len(views.observed))).round().astype(int)
+    later_views = [views.observed[i] for i in picks] + list(views.novel)
+    for frame in plan.frames:
+        if frame in plan.observed:
+            yield from (("train", frame, view) for view in views.observed)
+        if frame in plan.val:
+            yield from (("val", frame, view) for view in views.novel)
+        if frame in plan.test:
+            yield from (("test", frame, view) for view in later_views)
+
+
+def _ground_truth(
+    plan: TimePlan, survey: capture_objects.Survey, objects: tuple[capture_objects.CapturedObject, ...]
+) -> dict:
+    """Rigid pose of every object at every captured time."""
+    rows = [
+        {"name": o.name, "id": o.id, "matrices": [m.tolist() for m in capture_objects.poses(survey, o)]}
+        for o in objects
+    ]
+    t_max = plan.time(plan.observed[-1])
+    return {"times": [plan.time(frame) for frame in plan.frames], "t_max": t_max, "objects": rows}
