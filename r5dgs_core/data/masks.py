@@ -36,10 +36,8 @@ def read(path: Path, colors: Mapping[int, int] | None = None) -> np.ndarray:
         return _read_indices(path)
     pixels = images.read_png(path)
     channels = pixels.shape[2]
-    if channels < 3 or _is_gray(pixels):
-        ids = pixels[..., 0].astype(np.int32)
-    else:
-        ids = _colors_to_ids(path, pixels, colors)
+    coded = channels >= 3 and not _is_gray(pixels)
+    ids = _colors_to_ids(path, pixels, colors) if coded else pixels[..., 0].astype(np.int32)
     if channels in (2, 4):
         ids[pixels[..., -1] == 0] = 0
     return ids

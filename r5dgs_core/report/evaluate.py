@@ -1,0 +1,256 @@
+"""A baked scene against the images, masks and true poses of its data set.
+
+The result has one fixed shape (docs/evaluation.md), so that it can be compared across versions. Renderings are rounded
+to 8 bits before they are measured, as a file would hold them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..data import images
+from ..motion import rotations
+from ..raster import scene_render
+from ..scene import playback
+from ..scene.cameras import Camera
+from ..scene.scene import MotionGroup, Scene
+from . import metrics
+
+METRICS = (
+    "psnr",
+    "psnr_pooled",
+    "psnr_objects",
+    "ssim",
+    "flip",
+    "lpips",
+    "miou",
+    "miou_matched",
+    "ms_motion",
+    "ms_raster",
+    "images",
+)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One picture of a scene.
+
+    Attributes:
+        color: Display-referred sRGB, rounded to 8 bits. [H, W, 3] float32
+        ids: Object of each pixel, 0 = background. [H, W] int32
+        ms_motion: Time that the motion took, milliseconds.
+        ms_raster: Time that the rendering took, milliseconds.
+    """
+
+    color: np.ndarray
+    ids: np.ndarray
+    ms_motion: float
+    ms_raster: float
+
+
+def evaluate(
+    scene: Scene,
+    dataset: datasets.Dataset,
+    *,
+    modes: Sequence[str] = ("rigid",),
+    splits: Sequence[str] = ("val", "test"),
+    background: np.ndarray | None = None,
+    backend: str = "auto",
+    train: dict[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Measure a scene on the held-out views of a data set.
+
+    Args:
+        scene: The scene.
+        dataset: The data set.
+        modes: Ways to move past t_max, of `playback.MODES`.
+        splits: Splits to measure.
+        background: Colour behind transparent pixels of the true images, sRGB, white where None. [3]
+        backend: Rasterizer.
+        train: What the training took: "seconds", "iterations", "gaussians".
+        progress: Called with images measured and their number.
+
+    Returns:
+        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types; what could
+        not be computed is None.
+    """
+    total = sum(len(dataset.views(split)) for split in splits) * len(modes)
+    done = 0
+    result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
+    for split in splits:
+        result["splits"][split] = {}
+        views = dataset.views(split)
+        for mode in modes:
+            tally = _Tally([item.id for item in scene.objects if item.id > 0] or sorted(dataset.object_names))
+            if views:
+                render(scene, views[0].camera, views[0].t, mode, backend=backend)  # compiles; not timed
+            for view in views:
+                rendering = render(scene, view.camera, view.t, mode, backend=backend)
+                tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view))
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+            result["splits"][split][mode] = tally.result()
+    given = train if train is not None else scene.provenance.get("train", {})
+    result["train"] = {
+        "seconds": given.get("seconds"),
+        "iterations": given.get("iterations"),
+        "gaussians": given.get("gaussians", len(scene.means)),
+    }
+    return result
+
+
+def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
+    """Render colour and object ids of a scene at a time, with the milliseconds that it took.
+
+    The id of a pixel is the classifier's answer to the blended identities where the scene has both, else the object
+    with the largest weight in the pixel.
+    """
+    start = time.perf_counter()
+    frame = playback.frame(scene, t, mode)
+    moved = time.perf_counter()
+    classified = scene.identities is not None and scene.classifier_weight is not None
+    output = scene_render.render_frame(
+        scene, frame, camera, backend=backend, features=scene.identities if classified else None
+    )
+    color = scene_render.to_numpy(output.color, np.float32)
+    rendered = time.perf_counter()
+    if classified:
+        ids = classify(scene, scene_render.to_numpy(output.features, np.float32))
+    else:
+        ids = np.maximum(scene_render.to_numpy(output.ids, np.int32), 0)
+    rounded = images.to_uint8(color).astype(np.float32) / np.float32(255.0)
+    return Rendering(rounded, ids, 1e3 * (moved - start), 1e3 * (rendered - moved))
+
+
+def classify(scene: Scene, features: np.ndarray) -> np.ndarray:
+    """Object of each pixel from its blended identity encoding: argmax of the scene's classifier.
+
+    Args:
+        scene: The scene, with classifier.
+        features: Blended identities, no background term. [H, W, 16]
+
+    Returns:
+        Object ids. [H, W] int32
+
+    Source: Gaussian Grouping (Ye et al. 2024), section 3.2.
+    """
+    if scene.classifier_weight is None or scene.classifier_bias is None:
+        raise ValueError("the scene has no classifier")
+    classes = np.array([item.id for item in scene.objects if item.id >= 0], np.int32)
+    if scene.classifier_weight.shape[0] != len(classes):
+        raise ValueError(f"expected {len(classes)} rows in classifier_weight, got {scene.classifier_weight.shape[0]}")
+    logits = features @ scene.classifier_weight.T.astype(np.float32) + scene.classifier_bias.astype(np.float32)
+    return classes[logits.argmax(axis=-1)]
+
+
+def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> list[dict[str, Any]]:
+    """Error of each object's predicted pose at the last time of the ground truth.
+
+    The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times
+    decide (`metrics.aligned_pose_error`).
+
+    Returns:
+        Per object ``id name position_error rotation_error_deg``: world units and degrees, None where the object has no
+        true pose or no motion group. Without ground truth, one row per object of the scene.
+    """
+    rows = {
+        item.id: {"id": item.id, "name": item.name, "position_error": None, "rotation_error_deg": None}
+        for item in scene.objects
+        if item.id > 0
+    }
+    if ground_truth is None:
+        return list(rows.values())
+    times = ground_truth.times
+    observed = (times <= scene.t_max + 1e-9) & (times >= scene.track_times[0] - 1e-9)
+    poses = [playback.group_poses(scene, float(t)) for t in times]
+    for object_id, name, truth in zip(ground_truth.object_ids, ground_truth.names, ground_truth.matrices, strict=True):
+        row = rows.setdefault(
+            object_id, {"id": object_id, "name": name, "position_error": None, "rotation_error_deg": None}
+        )
+        group = _body(scene, object_id)
+        if group is None or not observed.any():
+            continue
+        motion = np.stack([_matrix(group, quats[group.id], moves[group.id]) for quats, moves in poses])
+        position, angle = metrics.aligned_pose_error(motion, truth, observed, group.pivot)
+        row["position_error"], row["rotation_error_deg"] = position, angle
+    return [rows[key] for key in sorted(rows)]
+
+
+def _body(scene: Scene, object_id: int) -> MotionGroup | None:
+    """The motion group that carries most of an object's Gaussians; shadows do not count."""
+    candidates = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
+    if not candidates:  # an object at rest may be a member of the pinned group
+        pinned = scene.groups[0] if scene.groups else None
+        mine = scene.means[scene.object_ids == object_id]
+        if pinned is None or not len(mine):
+            return None
+        center = mine.mean(axis=0).astype(np.float64)
+        return MotionGroup(pinned.id, object_id, "pinned", -1, center, pinned.model)
+    members = [int(((scene.object_ids == object_id) & (scene.motion_ids == group.id)).sum()) for group in candidates]
+    return candidates[int(np.argmax(members))]
+
+
+def _matrix(group: MotionGroup, quat: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Map from the bind state to the world: x -> p + R (x - p) + d. [4, 4]"""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotations.quats_to_rotmats(quat)
+    pivot = np.asarray(group.pivot, np.float64)
+    matrix[:3, 3] = pivot + displacement - matrix[:3, :3] @ pivot
+    return matrix
+
+
+class _Tally:
+    """Collects the errors of a split's images and averages them."""
+
+    def __init__(self, ids: Sequence[int]) -> None:
+        self.ids = ids
+        self.values: dict[str, list[float]] = {name: [] for name in METRICS}
+        self.errors: list[float] = []
+        self.counts = np.zeros((len(ids) + 1, len(ids) + 1), np.int64)
+        self.masked = False
+
+    def add(self, rendering: Rendering, truth: np.ndarray, mask: np.ndarray | None) -> None:
+        self.errors.append(metrics.mse(rendering.color, truth))
+        self.values["psnr"].append(metrics.psnr_of_mse(self.errors[-1]))
+        self.values["ssim"].append(metrics.ssim(rendering.color, truth))
+        flip = metrics.flip(rendering.color, truth)
+        if flip is not None:
+            self.values["flip"].append(flip)
+        if mask is not None:
+            self.masked = True
+            self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, mask > 0))
+            self.counts += metrics.confusion(rendering.ids, mask, self.ids)
+        self.values["ms_motion"].append(rendering.ms_motion)
+        self.values["ms_raster"].append(rendering.ms_raster)
+
+    def result(self) -> dict[str, Any]:
+        out: dict[str, Any] = dict.fromkeys(METRICS)
+        for name in ("psnr", "psnr_objects", "ssim", "flip"):
+            out[name] = _mean(self.values[name])
+        for name in ("ms_motion", "ms_raster"):
+            out[name] = float(np.median(self.values[name])) if self.values[name] else None
+        out["psnr_pooled"] = metrics.psnr_pooled(self.errors) if self.errors else None
+        if self.masked:
+            out["miou"] = _finite(metrics.miou(self.counts))
+            out["miou_matched"] = _finite(metrics.miou_matched(self.counts))
+        out["images"] = len(self.errors)
+        return out
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Mean of the values that are numbers; None where there are none."""
+    kept = [value for value in values if not math.isnan(value)]
+    return float(np.mean(kept)) if kept else None
+
+
+def _finite(value: float) -> float | None:
+    return None if math.isnan(value) else value

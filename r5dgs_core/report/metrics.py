@@ -1,0 +1,234 @@
+"""Errors of images, id maps and poses, each as the paper or the field defines it.
+
+Images are float in [0, 1], display-referred sRGB, [H, W, 3]. Id maps are integers, 0 = background, [H, W].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import optimize
+
+MSE_FLOOR = 1e-10  # equal images score 100 dB, so that means stay finite
+SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def mse(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float:
+    """Mean squared error over pixels and channels.
+
+    Args:
+        image: Rendered. [H, W, 3]
+        truth: Ground truth. [H, W, 3]
+        where: Pixels that count, all where None. [H, W] bool
+
+    Returns:
+        The mean; NaN where no pixel counts.
+    """
+    _check_pair(image, truth)
+    squared = (image.astype(np.float64) - truth.astype(np.float64)) ** 2
+    if where is not None:
+        squared = squared[where]
+    return float(squared.mean()) if squared.size else math.nan
+
+
+def psnr_of_mse(value: float) -> float:
+    """Peak signal-to-noise ratio of a mean squared error in dB, at most 100."""
+    return -10.0 * math.log10(max(value, MSE_FLOOR))
+
+
+def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float:
+    """PSNR of one image in dB, over the pixels ``where`` holds; at most 100; NaN where no pixel counts."""
+    value = mse(image, truth, where)
+    return math.nan if math.isnan(value) else psnr_of_mse(value)
+
+
+def psnr_pooled(errors: Sequence[float]) -> float:
+    """PSNR of the mean of the images' squared errors: at most the mean of their PSNR. NaN without images.
+
+    Source: FreeGave's ``MAEPSNR``, -10 log10(mean(10^(-PSNR / 10))).
+    """
+    return psnr_of_mse(float(np.mean(errors))) if len(errors) else math.nan
+
+
+def ssim(image: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity as 3D Gaussian Splatting computes it.
+
+    Window 11 x 11, Gaussian of sigma 1.5, zero padding, constants 0.01 and 0.03, mean over pixels and channels.
+    Packages that pad by reflection or leave the border out give other values (differences up to 0.007).
+
+    Args:
+        image: Rendered. [H, W, 3]
+        truth: Ground truth. [H, W, 3]
+
+    Returns:
+        The mean similarity, 1 for equal images.
+
+    Source: Wang et al. 2004, Eq. 13, with the padding of the 3DGS code.
+    """
+    _check_pair(image, truth)
+    x, y = image.astype(np.float64), truth.astype(np.float64)
+    mean_x, mean_y, xx, yy, xy = _blur(np.stack([x, y, x * x, y * y, x * y]))
+    var_x, var_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
+    denominator = (mean_x**2 + mean_y**2 + SSIM_C1) * (var_x + var_y + SSIM_C2)
+    return float((numerator / denominator).mean())
+
+
+def flip(image: np.ndarray, truth: np.ndarray) -> float | None:
+    """Mean FLIP error of display-referred images; None where `flip-evaluator` (extra ``metrics``) is not installed."""
+    try:
+        import flip_evaluator
+    except ImportError:
+        return None
+    _check_pair(image, truth)
+    reference, test = (np.ascontiguousarray(np.clip(a, 0, 1), np.float32) for a in (truth, image))
+    _, mean, _ = flip_evaluator.evaluate(reference, test, "LDR")
+    return float(mean)
+
+
+def confusion(predicted: np.ndarray, truth: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+    """Count pixels by true and predicted id.
+
+    Args:
+        predicted: Predicted ids. [H, W]
+        truth: True ids. [H, W]
+        ids: The ids that are told apart; others, -1 among them, are counted in a last row and column. (M,)
+
+    Returns:
+        Pixels with true id ``ids[i]`` and predicted id ``ids[j]``. [M + 1, M + 1] int64
+    """
+    if predicted.shape != truth.shape:
+        raise ValueError(f"expected id maps of one size, got {predicted.shape} and {truth.shape}")
+    order = np.argsort(ids)
+    keys, count = np.asarray(ids)[order], len(ids)
+
+    def index(values: np.ndarray) -> np.ndarray:
+        at = np.minimum(np.searchsorted(keys, values), max(count - 1, 0))
+        return np.where(keys[at] == values, order[at], count) if count else np.zeros(values.shape, np.int64)
+
+    flat = index(truth).astype(np.int64) * (count + 1) + index(predicted)
+    return np.bincount(flat.ravel(), minlength=(count + 1) ** 2).reshape(count + 1, count + 1)
+
+
+def ious(counts: np.ndarray) -> np.ndarray:
+    """Intersection over union of every true id with every predicted one, 0 where both are absent. [M, M]
+
+    Args:
+        counts: `confusion`. [M + 1, M + 1]
+    """
+    true, predicted = counts.sum(axis=1)[:-1], counts.sum(axis=0)[:-1]
+    common = counts[:-1, :-1].astype(np.float64)
+    return common / np.maximum(true[:, None] + predicted[None, :] - common, 1)
+
+
+def miou(counts: np.ndarray) -> float:
+    """Mean over the ids present in the truth of their IoU with the same predicted id.
+
+    Args:
+        counts: `confusion`, of one image or summed over many (pooled). [M + 1, M + 1]
+
+    Returns:
+        The mean; NaN where the truth has none of the ids.
+    """
+    present = counts[:-1].sum(axis=1) > 0
+    return float(np.diag(ious(counts))[present].mean()) if present.any() else math.nan
+
+
+def miou_matched(counts: np.ndarray) -> float:
+    """As `miou`, after the one-to-one map from predicted to true ids with the largest sum of IoU (Hungarian method)."""
+    present = counts[:-1].sum(axis=1) > 0
+    if not present.any():
+        return math.nan
+    table = ious(counts)[present]
+    rows, columns = optimize.linear_sum_assignment(table, maximize=True)
+    return float(table[rows, columns].sum() / present.sum())
+
+
+def miou_macro(per_image: Sequence[np.ndarray]) -> float:
+    """Mean over images of `miou`, images without objects left out; NaN where there are none."""
+    values = [value for value in map(miou, per_image) if not math.isnan(value)]
+    return float(np.mean(values)) if values else math.nan
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Rotation nearest to a matrix, or to the mean of rotations (chordal mean). [..., 3, 3]"""
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.ones((*matrix.shape[:-2], 3))
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return (u * sign[..., None, :]) @ vt
+
+
+def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between rotations in degrees, accurate near 0 and 180. [..., 3, 3], [..., 3, 3] -> [...]"""
+    between = np.swapaxes(a, -1, -2) @ b
+    axis = np.stack(
+        [
+            between[..., 2, 1] - between[..., 1, 2],
+            between[..., 0, 2] - between[..., 2, 0],
+            between[..., 1, 0] - between[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(between, axis1=-2, axis2=-1) - 1.0))
+
+
+def rigid(matrices: np.ndarray) -> np.ndarray:
+    """Object-to-world matrices without their scale: rotation and translation. [..., 4, 4]"""
+    out = np.array(matrices, np.float64)
+    out[..., :3, :3] = nearest_rotation(out[..., :3, :3] / np.linalg.norm(out[..., :3, :3], axis=-2, keepdims=True))
+    return out
+
+
+def aligned_pose_error(
+    predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray
+) -> tuple[float, float]:
+    """Error at the last time of a predicted motion against true poses given in another frame of the object.
+
+    The constant rigid offset A between both frames is the mean of P(t)^-1 T(t) over the observed times (chordal mean of
+    the rotations), so that what is left at the last time is error of the motion alone.
+
+    Args:
+        predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
+        truth: Object to world at the same times; scale is removed. [T, 4, 4]
+        observed: Times that the offset may use, at least one. [T] bool
+        center: Centre of the object in the bind state; its distance is measured. [3]
+
+    Returns:
+        Distance of the centres at the last time in world units, and angle between the rotations in degrees.
+    """
+    if not observed.any():
+        raise ValueError("observed: expected at least one time")
+    poses = rigid(truth)
+    offsets = np.linalg.inv(predicted[observed]) @ poses[observed]
+    align = np.eye(4)
+    align[:3, :3] = nearest_rotation(offsets[:, :3, :3].mean(axis=0))
+    # The translation is averaged at the centre, not at the object's origin, which may lie far off.
+    p_object = np.einsum("tij,tj->ti", np.linalg.inv(offsets), np.append(center, 1.0)[None].repeat(len(offsets), 0))
+    align[:3, 3] = np.asarray(center) - align[:3, :3] @ p_object.mean(axis=0)[:3]
+    last = predicted[-1] @ align
+    p_center = np.linalg.inv(align) @ np.append(center, 1.0)
+    distance = np.linalg.norm(((last - poses[-1]) @ p_center)[:3])
+    return float(distance), float(rotation_angle_deg(last[:3, :3], poses[-1, :3, :3]))
+
+
+def _check_pair(image: np.ndarray, truth: np.ndarray) -> None:
+    if image.shape != truth.shape or image.ndim != 3:
+        raise ValueError(f"expected two images [H, W, C] of one size, got {image.shape} and {truth.shape}")
+
+
+def _blur(images: np.ndarray) -> np.ndarray:
+    """Gaussian window with zero padding, separable. [B, H, W, C]"""
+    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
+    window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
+    window /= window.sum()
+    for axis in (1, 2):
+        length = images.shape[axis]
+        width = [(SSIM_RADIUS, SSIM_RADIUS) if a == axis else (0, 0) for a in range(4)]
+        padded = np.pad(images, width)
+        images = np.zeros_like(images)
+        for k, weight in enumerate(window.tolist()):
+            images += weight * np.take(padded, np.arange(k, k + length), axis=axis)
+    return images
