@@ -46,11 +46,20 @@ _MEMORY_DTYPES: dict[str, type] = {
     "track_poses": np.float64,
     "background_sh": np.float32,
     "identities": np.float16,
+    "classifier_weight": np.float32,
+    "classifier_bias": np.float32,
     "shading": np.float32,
     "embeddings": np.float32,
     "vocabulary_embeddings": np.float32,
 }
-_OPTIONAL = ("identities", "shading", "embeddings", "vocabulary_embeddings")
+_OPTIONAL = (
+    "identities",
+    "classifier_weight",
+    "classifier_bias",
+    "shading",
+    "embeddings",
+    "vocabulary_embeddings",
+)
 _STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in _MEMORY_DTYPES.items()}
 for _name in FIXED_POINT:
     _STORED_DTYPES[_name].add("<i2")

@@ -22,6 +22,7 @@ def check(scene: Scene, place: str) -> None:
     """Raise `SceneFileError` naming ``place``, the member and what was expected where the scene is inconsistent."""
     count = len(scene.means)
     knots, groups = len(scene.track_times), len(scene.groups)
+    classes = sum(item.id >= 0 for item in scene.objects)
     if scene.sh.ndim != 3 or scene.sh.shape[1] not in SH_BASES:
         _fail(place, "sh", f"({count}, K, 3) with K one of {SH_BASES}", scene.sh.shape)
     if scene.background_sh.ndim != 2 or scene.background_sh.shape[0] not in SH_BASES:
@@ -38,6 +39,8 @@ def check(scene: Scene, place: str) -> None:
         "track_poses": ((groups, knots, 7), np.float64),
         "background_sh": ((scene.background_sh.shape[0], 3), None),
         "identities": ((count, 16), None),
+        "classifier_weight": ((classes, 16), np.float32),
+        "classifier_bias": ((classes,), np.float32),
         "shading": ((count, 3), np.float32),
         "light_direction": ((3,), None),
         "embeddings": ((len(scene.objects), None), None),
@@ -58,6 +61,8 @@ def check(scene: Scene, place: str) -> None:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(-1))[0])
             _fail(place, name, "finite numbers", f"NaN or infinity in row {bad}")
+    if (scene.classifier_weight is None) != (scene.classifier_bias is None):
+        _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
     _check_units(scene, place)
     _check_times(scene, place)
     _check_objects(scene, place)
