@@ -1,0 +1,148 @@
+"""Laws of rendering a posed scene."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from r5dgs_core.motion import rotations  # noqa: E402
+from r5dgs_core.raster import scene_render  # noqa: E402
+from r5dgs_core.raster.scene_render import Instance  # noqa: E402
+from r5dgs_core.scene import playback  # noqa: E402
+from tests import scenes  # noqa: E402
+
+CAMERA = scenes.orbit_camera(0.7, 48, 40)
+# Two float32 orders of the same operations: a cut-off (alpha < 1/255) may fall differently in a pixel or two.
+TOLERANCE = 5e-3
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scenes.make_scene(n=300, sh_degree=2, seed=3)
+
+
+def matrix(rotation=(1.0, 0, 0, 0), translation=(0.0, 0, 0), scale=1.0):
+    result = np.eye(4)
+    result[:3, :3] = rotations.quats_to_rotmats(rotations.normalize(np.asarray(rotation, np.float64))) * scale
+    result[:3, 3] = translation
+    return result
+
+
+def whole(scene, transform):
+    return [Instance(0, len(scene.means), transform)]
+
+
+def image(scene, pose, camera=CAMERA, **options):
+    return scene_render.render_frame(scene, pose, camera, **options).color.numpy()
+
+
+def group_instances(scene, t):
+    quats, displacements = playback.group_poses(scene, t)
+    result = []
+    for start, stop, g in playback.runs(scene.motion_ids):
+        pivot = scene.groups[g].pivot
+        transform = matrix(quats[g])
+        transform[:3, 3] = pivot + displacements[g] - transform[:3, :3] @ pivot
+        result.append(Instance(start, stop - start, transform))
+    return result
+
+
+@pytest.mark.parametrize("t", [0.0, 0.31, scenes.T_MAX, 0.93])
+def test_instances_at_the_groups_poses_render_like_playback(scene, t):
+    played = image(scene, playback.frame(scene, t))
+    posed = image(scene, scene_render.pose_instances(scene, group_instances(scene, t)))
+    np.testing.assert_allclose(posed, played, atol=TOLERANCE)
+
+
+def test_identity_instances_are_the_bind_state(scene):
+    posed = scene_render.pose_instances(scene, whole(scene, np.eye(4)))
+    np.testing.assert_array_equal(posed.means, scene.means)
+    np.testing.assert_allclose(posed.quats, scene.quats, atol=1e-6)
+    np.testing.assert_array_equal(posed.log_scales, scene.log_scales)
+    np.testing.assert_array_equal(posed.shading_factor, 1)
+
+
+def test_moving_scene_and_camera_together_changes_nothing(scene):
+    unshaded = dataclasses.replace(scene, shading=None, light_direction=None)
+    transform = matrix((0.8, 0.3, -0.4, 0.2), (0.4, -1.0, 0.3), scale=1.7)
+    camera_world = np.linalg.inv(CAMERA.T_cam_world)
+    moved_world = transform @ camera_world
+    moved_world[:3, :3] /= 1.7
+    moved = dataclasses.replace(CAMERA, T_cam_world=np.linalg.inv(moved_world))
+    still = image(unshaded, scene_render.pose_instances(unshaded, whole(unshaded, np.eye(4))))
+    np.testing.assert_allclose(
+        image(unshaded, scene_render.pose_instances(unshaded, whole(unshaded, transform)), moved), still, atol=TOLERANCE
+    )
+
+
+def test_shapes_follow_any_linear_map(scene):
+    rng = np.random.default_rng(0)
+    for linear in (rng.normal(size=(3, 3)), np.diag([-1.0, 1, 1]), np.diag([2.0, 1, 0.5])):
+        transform = np.eye(4)
+        transform[:3, :3] = linear
+        posed = scene_render.pose_instances(scene, whole(scene, transform))
+        before, after = covariances(scene.quats, scene.log_scales), covariances(posed.quats, posed.log_scales)
+        expected = linear @ before @ linear.T
+        np.testing.assert_allclose(after, expected, atol=1e-5 * np.abs(expected).max())
+        np.testing.assert_allclose(np.linalg.norm(posed.quats, axis=-1), 1, atol=1e-6)
+
+
+def covariances(quats, log_scales):
+    axes = rotations.quats_to_rotmats(quats.astype(np.float64)) * np.exp(log_scales.astype(np.float64))[:, None, :]
+    return axes @ np.swapaxes(axes, -1, -2)
+
+
+def test_a_mirrored_object_looks_mirrored(scene):
+    unshaded = dataclasses.replace(scene, shading=None, light_direction=None)
+    camera = scenes.orbit_camera(0.0, 40, 40)  # looks along -x: mirroring y mirrors the picture
+    mirrored = scene_render.pose_instances(unshaded, whole(unshaded, np.diag([1.0, -1, 1, 1])))
+    still = scene_render.pose_instances(unshaded, whole(unshaded, np.eye(4)))
+    np.testing.assert_allclose(
+        image(unshaded, mirrored, camera), image(unshaded, still, camera)[:, ::-1], atol=TOLERANCE
+    )
+
+
+def test_nothing_shown_leaves_the_sky(scene):
+    sky = np.zeros((4, 3), np.float32)
+    sky[0], sky[2] = [0.4, 0.2, 0.1], [0.3, 0.3, 0.3]  # brighter upwards
+    scene = dataclasses.replace(scene, background_sh=sky)
+    output = scene_render.render_frame(scene, scene_render.pose_instances(scene, []), CAMERA)
+    np.testing.assert_allclose(output.color.numpy(), scene_render.sky(scene, CAMERA), atol=1e-6)
+    assert float(output.alpha.max()) == 0
+    assert scene_render.sky(scene, CAMERA)[0].mean() > scene_render.sky(scene, CAMERA)[-1].mean() + 0.01
+
+
+def test_a_range_left_out_is_not_seen_and_a_range_given_twice_is_seen_twice(scene):
+    body = scene.object(1)
+    here, there = np.eye(4), matrix(translation=(0, 0, 0.5))
+    ids = scene_render.render_frame(
+        scene, scene_render.pose_instances(scene, [Instance(body.start, body.count, here)]), CAMERA
+    ).ids
+    assert set(np.unique(ids.numpy())) <= {-1, 1}
+    twice = scene_render.pose_instances(scene, [Instance(body.start, body.count, m) for m in (here, there)])
+    assert len(twice.means) == 2 * body.count
+    np.testing.assert_allclose(twice.means[body.count :] - twice.means[: body.count], [[0, 0, 0.5]] * body.count, atol=1e-6)
+
+
+def test_black_and_given_backgrounds(scene):
+    nothing = scene_render.pose_instances(scene, [])
+    assert np.all(image(scene, nothing, background=None) == 0)
+    np.testing.assert_allclose(image(scene, nothing, background=np.array([0.1, 0.2, 0.3]))[5, 5], [0.1, 0.2, 0.3])
+    with pytest.raises(ValueError, match="background"):
+        image(scene, nothing, background="white")
+
+
+@pytest.mark.parametrize(
+    ("instance", "message"),
+    [
+        (Instance(0, 10**6, np.eye(4)), "leave the scene"),
+        (Instance(-1, 2, np.eye(4)), "leave the scene"),
+        (Instance(0, 2, np.diag([1.0, 1, 0, 1])), "flattens"),
+        (Instance(0, 2, np.full((4, 4), np.nan)), "finite"),
+    ],
+)
+def test_impossible_instances_are_refused(scene, instance, message):
+    with pytest.raises(ValueError, match=message):
+        scene_render.pose_instances(scene, [instance])
