@@ -84,8 +84,8 @@ def project(
         settings: For near plane, frustum clamp and dilation.
 
     Returns:
-        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], depths [N]. Rows before the near plane are finite
-        and meaningless.
+        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], depths [N]. Rows before the near plane are
+        finite and meaningless.
 
     Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
     """

@@ -1,0 +1,186 @@
+"""Backend `cpu`: float32 on any number of threads, forward and backward; results do not depend on that number."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..scene.cameras import Camera
+from . import cpu_blending, cpu_projection, cpu_tiles
+from .compile import run
+from .reference import frustum_slopes
+from .settings import RasterSettings, RasterStats, SplatImage
+
+_WORTH_A_THREAD = 2000  # Gaussians; fewer are projected before a second thread would wake up
+_EMPTY = np.empty((0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """What the backward pass needs of the forward pass, all numpy and never handed out."""
+
+    camera: Camera
+    view: np.ndarray
+    limits: np.ndarray
+    order: np.ndarray
+    tile_starts: np.ndarray
+    tile_ends: np.ndarray
+    pair_ranks: np.ndarray
+    pair_slots: np.ndarray
+    slot_starts: np.ndarray
+    geometry: np.ndarray
+    values: np.ndarray
+    background: np.ndarray
+    image: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    transmittance: np.ndarray
+
+
+def rasterize_splats(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    channels: torch.Tensor,
+    camera: Camera,
+    background: torch.Tensor | None,
+    labels: torch.Tensor | None,
+    settings: RasterSettings,
+    stats: RasterStats | None,
+) -> SplatImage:
+    """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
+    image, alpha, depth, ids = _Rasterize.apply(
+        means, quats, scales, opacities, channels, background, camera, labels, settings, stats
+    )
+    return SplatImage(image, alpha, depth, ids if labels is not None else None)
+
+
+def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
+    """Everything that projection needs, in the order of the constants in `cpu_projection`. [26] float64"""
+    k, T = camera.intrinsics, camera.T_cam_world
+    return np.array(
+        [
+            *(k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]),
+            *frustum_slopes(camera, settings),
+            *(camera.width, camera.height, settings.near_plane, settings.dilation, settings.alpha_min),
+            *T[:3, :3].ravel(),
+            *T[:3, 3],
+        ],
+        np.float64,
+    )
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quats, scales, opacities, channels, background, camera, labels, settings, stats):
+        arrays = [t.detach().contiguous().numpy() for t in (means, quats, scales, opacities, channels)]
+        n, n_channels = channels.shape
+        if background is None:
+            behind = np.zeros((1, n_channels), np.float32)
+        else:
+            behind = background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
+        view = pack_view(camera, settings)
+        radii = np.zeros(n, np.float32)
+        state, ids = _forward(arrays, behind, camera, labels, settings, view, radii)
+        if stats is not None:
+            stats.radii = torch.from_numpy(radii)
+            stats.visible = stats.radii > 0
+            stats.grad_norm = torch.zeros(n)
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(means, quats, scales, opacities)
+        ctx.state, ctx.stats, ctx.n_channels = state, stats, n_channels
+        ctx.background_shape = None if background is None else background.shape
+        # Copies are handed out: a caller that changes the image in place must not change the gradient.
+        results = [torch.from_numpy(a.copy()) for a in (state.image, state.alpha, state.depth)]
+        ids = torch.from_numpy(ids)
+        ctx.mark_non_differentiable(ids)
+        return (*results, ids)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, d_image, d_alpha, d_depth, d_ids):
+        state: _Pass = ctx.state
+        arrays = [t.detach().contiguous().numpy() for t in ctx.saved_tensors]
+        if d_image is None:
+            d_image = torch.zeros(state.image.shape)
+        d_image = d_image.contiguous().numpy()
+        d_alpha = _EMPTY if d_alpha is None else d_alpha.contiguous().numpy()
+        d_depth = _EMPTY if d_depth is None else d_depth.contiguous().numpy()
+        gradients, grad_norm = _backward(state, arrays, ctx.n_channels, d_image, d_alpha, d_depth)
+        if ctx.stats is not None:
+            ctx.stats.grad_norm = torch.from_numpy(grad_norm)
+        d_background = None
+        if ctx.needs_input_grad[5]:
+            shown = d_image * state.transmittance[..., None]
+            shape = ctx.background_shape
+            d_background = torch.from_numpy(shown if len(shape) == 3 else shown.sum((0, 1), dtype=np.float64))
+            d_background = d_background.to(torch.float32)
+        return (*(torch.from_numpy(g) for g in gradients), d_background, None, None, None, None)
+
+
+def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple[_Pass, np.ndarray]:
+    """Project, sort, assign and blend; fills ``radii`` [N]."""
+    means, quats, scales, opacities, channels = arrays
+    n, n_channels = channels.shape
+    height, width = camera.height, camera.width
+    geometry = np.empty((n, cpu_projection.GEOMETRY), np.float32)
+    depths = np.empty(n, np.float32)
+    run(
+        cpu_projection.project, n // _WORTH_A_THREAD,
+        view, means, quats, scales, opacities, geometry, depths, radii,
+    )  # fmt: skip
+    order = cpu_tiles.sort_by_depth(depths, radii)
+    ranked = np.empty((len(order), cpu_projection.GEOMETRY), np.float32)
+    values = np.empty((len(order), (n_channels + 4) // 4 * 4), np.float32)
+    run(
+        cpu_projection.gather, len(order) // _WORTH_A_THREAD,
+        order, geometry, depths, channels, ranked, values,
+    )  # fmt: skip
+    tile_starts, pair_ranks, pair_slots, slot_starts = cpu_tiles.assign_tiles(ranked, width, height)
+    votes, planes = np.zeros(0, np.int32), 0
+    if labels is not None and len(order):
+        votes = labels.detach().cpu().numpy()[order].clip(-1).astype(np.int32) + np.int32(1)
+        planes = int(votes.max()) + 1
+    limits = np.array(
+        [math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min, settings.id_alpha_min],
+        np.float32,
+    )
+    image = np.empty((height, width, n_channels), np.float32)
+    alpha, depth, transmittance = (np.empty((height, width), np.float32) for _ in range(3))
+    ids = np.full((height, width), -1, np.int32)
+    tile_ends = np.empty(len(tile_starts) - 1, np.int64)
+    run(
+        cpu_blending.blend, len(tile_ends) // 2,
+        tile_starts, pair_ranks, ranked, values, votes, planes, background, limits, image, alpha, depth, transmittance,
+        ids, tile_ends,
+    )  # fmt: skip
+    state = _Pass(
+        camera, view, limits, order, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values,
+        background, image, alpha, depth, transmittance,
+    )  # fmt: skip
+    return state, ids
+
+
+def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
+    """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
+    means, quats, scales, opacities = arrays
+    n = len(means)
+    slots = np.empty((len(state.pair_ranks), cpu_projection.MOMENTS + state.values.shape[1]), np.float32)
+    run(
+        cpu_blending.blend_backward, len(state.tile_ends) // 2,
+        state.tile_starts, state.tile_ends, state.pair_ranks, state.pair_slots, state.geometry, state.values,
+        state.background, state.limits, state.image, state.alpha, state.depth, state.transmittance, d_image, d_alpha,
+        d_depth, slots,
+    )  # fmt: skip
+    gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
+    gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]
+    grad_norm = np.zeros(n, np.float32)
+    run(
+        cpu_projection.project_backward, len(state.order) // _WORTH_A_THREAD,
+        state.view, means, quats, scales, opacities, state.order, state.slot_starts, slots, *gradients, grad_norm,
+    )  # fmt: skip
+    return gradients, grad_norm
