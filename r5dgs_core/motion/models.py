@@ -13,7 +13,7 @@ So R(0) = I and d(0) = 0 to the bit, and the motion converges to the fitted curv
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -61,13 +61,13 @@ class MotionModel:
     """
 
     kind: str = "static"
-    velocity: np.ndarray | None = None
-    acceleration: np.ndarray | None = None
-    angular_velocity: np.ndarray | None = None
-    angular_acceleration: np.ndarray | None = None
-    center_offset: np.ndarray | None = None
-    offset_rotvec: np.ndarray | None = None
-    offset_displacement: np.ndarray | None = None
+    velocity: np.ndarray = field(default_factory=_zeros)
+    acceleration: np.ndarray = field(default_factory=_zeros)
+    angular_velocity: np.ndarray = field(default_factory=_zeros)
+    angular_acceleration: np.ndarray = field(default_factory=_zeros)
+    center_offset: np.ndarray = field(default_factory=_zeros)
+    offset_rotvec: np.ndarray = field(default_factory=_zeros)
+    offset_displacement: np.ndarray = field(default_factory=_zeros)
     fade_time: float = 0.1
     radius: float = 1.0
     covariance: np.ndarray | None = None
@@ -78,7 +78,7 @@ class MotionModel:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
         for name in _VECTORS:
             value = getattr(self, name)
-            vector = np.zeros(3) if value is None else np.array(value, np.float64)
+            vector = np.array(value, np.float64)
             if vector.shape != (3,) or not np.isfinite(vector).all():
                 raise ValueError(f"{name}: expected three finite numbers, got {value!r}")
             vector.flags.writeable = False
@@ -201,26 +201,42 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
     if model.kind == "translation":
         return rotations.identity(*tau.shape), v * span + 0.5 * a * span**2, zero, v + a * span
     if model.kind == "ballistic_spin":
-        turn = w * span + 0.5 * eps * span**2
-        quats = rotations.rotvecs_to_quats(turn)
-        spins = se3.v_matrix_times(turn, w + eps * span)
-        arm = rotations.rotate(quats, np.broadcast_to(model.center_offset, zero.shape))
-        d = v * span + 0.5 * a * span**2 + (model.center_offset - arm)
-        return quats, d, spins, v + a * span - rotations.cross(spins, arm)
+        return spin_curve(v, a, w, eps, model.center_offset, span)
     if model.kind == "constant_twist":
-        turn = w * span
-        quats = rotations.rotvecs_to_quats(turn)
-        path = np.broadcast_to(v, zero.shape)
-        return quats, se3.v_matrix_times(turn, path) * span, w + zero, rotations.rotate(quats, path)
+        return twist_curve(v, w, span)
     quats, d = _world_twist(model, tau)
     spins = w + eps * span
     return quats, d, spins, v + a * span + rotations.cross(spins, d)
 
 
+def spin_curve(
+    v: np.ndarray, a: np.ndarray, w: np.ndarray, eps: np.ndarray, center: np.ndarray, span: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The "ballistic_spin" curve, all arguments broadcast: rates [..., 3] as in `MotionModel`, times span [..., 1].
+
+    The angular velocity is V(phi) phi' with phi = w tau + eps tau^2/2.
+    """
+    turn = w * span + 0.5 * eps * span**2
+    quats = rotations.rotvecs_to_quats(turn)
+    spins = se3.v_matrix_times(turn, w + eps * span)
+    arm = rotations.rotate(quats, center + 0 * turn)
+    d = v * span + 0.5 * a * span**2 + (center - arm)
+    return quats, d, spins, v + a * span - rotations.cross(spins, arm)
+
+
+def twist_curve(
+    v: np.ndarray, w: np.ndarray, span: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The "constant_twist" curve, all arguments broadcast: v, w [..., 3], times span [..., 1]."""
+    turn = w * span
+    quats = rotations.rotvecs_to_quats(turn)
+    path = v + 0 * turn
+    return quats, se3.v_matrix_times(turn, path) * span, w + 0 * turn, rotations.rotate(quats, path)
+
+
 def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
     """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need."""
-    twist = (model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration)
-    v, a, w, eps = twist
+    v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
     tolerance = _STEP_TOLERANCE * model.radius
     needed = [se3.steps_needed(w, v, eps, a, float(t), model.radius, tolerance) for t in flat]

@@ -49,7 +49,7 @@ def _horner(coefficients: tuple[float, ...], x: Array) -> Array:
 
 
 def _split(angle2: Array) -> tuple[Any, Array, Array, Array]:
-    """Mask of small angles, the squared angle where small (else 0) and where large (else 1), and the root of the latter.
+    """Mask of small angles, squared angle where small (else 0) and where large (else 1), and the root of the latter.
 
     `where` also differentiates the branch that it discards, so both branches get a safe argument first.
     """
@@ -138,7 +138,7 @@ def rotate(quats: Array, vectors: Array) -> Array:
 
 
 def rotvecs_to_quats(rotvecs: Array) -> Array:
-    """Exponential map: rotation vectors to unit quaternions; zero gives (1, 0, 0, 0) to the bit. [..., 3] -> [..., 4]"""
+    """Exponential map, rotation vectors to unit quaternions; zero gives (1, 0, 0, 0) exactly. [..., 3] -> [..., 4]"""
     xp = array_namespace(rotvecs)
     quarter = 0.25 * (rotvecs * rotvecs).sum(-1)[..., None]
     return xp.concatenate([cosine(quarter), 0.5 * sine_ratio(quarter) * rotvecs], -1)

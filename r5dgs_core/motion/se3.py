@@ -71,7 +71,7 @@ def recentre(
         center: The new origin in old coordinates. [..., 3]
 
     Returns:
-        v and a about the new origin. Twists about a far origin cancel badly in rounding (DYNAMICS 2.4).
+        v and a about the new origin. Twists about a far origin cancel badly in rounding.
     """
     return v + rotations.cross(w, center), a + rotations.cross(eps, center)
 
@@ -189,7 +189,10 @@ def _bracket(x: Pose, y: Pose) -> Pose:
 
 
 def phi_2_times(w: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """phi_2([w]) v = (I/2 + C W + D W^2) v with D = (x^2/2 - 1 + cos x)/x^4: the double integral of exp(w s) v. [..., 3]"""
+    """phi_2([w]) v = (I/2 + C W + D W^2) v, the double integral of exp(w s) v over 0 <= s <= s' <= 1. [..., 3]
+
+    With D = (x^2/2 - 1 + cos x)/x^4, x = |w|.
+    """
     angle2 = (w * w).sum(-1)[..., None]
     c = rotations.remainder_ratio(angle2)
     small = angle2 < 1.0

@@ -1,9 +1,9 @@
 """A scene at any time: poses of its motion groups, and its Gaussians moved by them.
 
 Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
-(the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours. Blender's
-Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce playback at
-sub-frames. Before the first knot the pose is held; past t_max it is the motion model's.
+(the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours.
+Blender's Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce
+playback at sub-frames. Before the first knot the pose is held; past t_max it is the motion model's.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import models, rotations
+from ..motion import keyframes, models, rotations
 from .scene import Scene
 
 MODES = ("rigid",)
@@ -92,17 +92,6 @@ def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return slopes(scene.track_times, quats), slopes(scene.track_times, displacements)
 
 
-def hermite(left: np.ndarray, right: np.ndarray, m_left: np.ndarray, m_right: np.ndarray, h: float, u: float):
-    """Cubic with given values and slopes at both ends of an interval of length h, at the fraction u. [..., C]"""
-    u2, u3 = u * u, u * u * u
-    return (
-        (2 * u3 - 3 * u2 + 1) * left
-        + (u3 - 2 * u2 + u) * h * m_left
-        + (3 * u2 - 2 * u3) * right
-        + (u3 - u2) * h * m_right
-    )
-
-
 def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
     """Pose of every motion group relative to the bind state.
 
@@ -136,11 +125,11 @@ def _observed_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
     if t <= times[0]:
         return rotations.normalize(quats[:, 0]), displacements[:, 0].copy()
     k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
-    h = float(times[k + 1] - times[k])
-    u = (t - float(times[k])) / h
+    h = times[k + 1] - times[k]
+    u = (t - times[k]) / h
     quat_slopes, displacement_slopes = slopes(times, quats), slopes(times, displacements)
-    q = hermite(quats[:, k], quats[:, k + 1], quat_slopes[:, k], quat_slopes[:, k + 1], h, u)
-    d = hermite(
+    q = keyframes.hermite(quats[:, k], quats[:, k + 1], quat_slopes[:, k], quat_slopes[:, k + 1], h, u)
+    d = keyframes.hermite(
         displacements[:, k], displacements[:, k + 1], displacement_slopes[:, k], displacement_slopes[:, k + 1], h, u
     )
     return rotations.normalize(q), d
@@ -188,9 +177,8 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         t: Time written into the frame.
     """
     means, quats = scene.means, scene.quats
-    shading = None
-    if scene.shading is not None and scene.light_direction is not None:
-        shading = np.ones(len(means), np.float32)
+    gradients, light = scene.shading, scene.light_direction
+    shading = None if gradients is None or light is None else np.ones(len(means), np.float32)
     rotmats = rotations.quats_to_rotmats(group_quats)
     moved = np.flatnonzero((group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1))
     if len(moved):
@@ -202,10 +190,9 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         offsets = scene.means[rows].astype(np.float64) - pivot
         means[rows] = offsets @ rotmats[g].T + (pivot + group_displacements[g])
         quats[rows] = rotations.multiply(group_quats[g], scene.quats[rows].astype(np.float64))
-        if shading is not None:
-            light = np.asarray(scene.light_direction, np.float64)
+        if shading is not None and gradients is not None and light is not None:
             change = (rotmats[g].T @ light - light).astype(np.float32)
-            shading[rows] = np.maximum(1 + scene.shading[rows] @ change, 0)
+            shading[rows] = np.maximum(1 + gradients[rows] @ change, 0)
     return Frame(
         t=float(t),
         means=means,

@@ -1,6 +1,6 @@
 """Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/scene_format.md).
 
-Members hold what `Scene` holds, under the same names. Four of them are stored with fewer bits and restored to float32 on
+Members hold what `Scene` holds, under the same names. Some are stored with fewer bits and restored to float32 on
 reading: quats, log_scales and opacity_logits as int16 fixed point, sh and shading as float16.
 """
 
@@ -100,7 +100,7 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
 
 
 def read(path: str | Path) -> Scene:
-    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected; nothing is half-loaded."""
+    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected."""
     path = Path(path)
     if not path.is_file():
         raise errors.SceneFileError(
@@ -111,7 +111,8 @@ def read(path: str | Path) -> Scene:
             scene = _read_zip(archive, str(path))
     except zipfile.BadZipFile as error:
         raise errors.SceneFileError(
-            f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); bake or copy it again"
+            f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "
+            "bake or copy it again"
         ) from error
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error

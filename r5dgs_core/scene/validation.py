@@ -168,5 +168,6 @@ def _check_group(scene: Scene, place: str, row: int, group: MotionGroup) -> None
         return
     if not 0 <= group.follows < len(scene.groups) or scene.groups[group.follows].follows is not None:
         _fail(place, where, "to follow a group that follows none", group.follows)
-    if np.shape(group.follow_matrix) != (3, 3) or not np.isfinite(group.follow_matrix).all():
+    matrix = group.follow_matrix
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         _fail(place, where, "a finite follow_matrix (3, 3)", group.follow_matrix)

@@ -1,0 +1,247 @@
+"""Few keys that reproduce a rigid motion within a tolerance, for editors that interpolate with cubic Bezier curves.
+
+Between two keys each component is the cubic with the given values and slopes at both ends; in Blender: BEZIER keys with
+free handles at a third of the interval. Quaternions are interpolated by component and normalised, as Blender does.
+Location and rotation have their own key times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import models, rotations
+
+MAX_STEP_RAD = math.radians(120.0)
+_FINER = 4  # points of the checking grid per possible key time
+_FIRST_INTERVALS = 64
+_MOST_INTERVALS = 1 << 15
+
+Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Sampler = Callable[[np.ndarray], Samples]
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of one curve with C components.
+
+    Attributes:
+        times: Increasing. [K]
+        values: [K, C]
+        left_slopes: Slope with which the curve arrives, per unit of time. [K, C]
+        right_slopes: Slope with which it leaves; differs from the left one at a kink. [K, C]
+    """
+
+    times: np.ndarray
+    values: np.ndarray
+    left_slopes: np.ndarray
+    right_slopes: np.ndarray
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Keys of a rigid motion: location [K, 3] and rotation, unit wxyz with continuous signs [K', 4]."""
+
+    location: Keys
+    rotation: Keys
+
+
+def model_sampler(model: models.MotionModel, t_max: float) -> Sampler:
+    """Poses and slopes of a motion model at scene times >= t_max, for `reduce`."""
+
+    def sample(times: np.ndarray) -> Samples:
+        quats, displacements, spins, velocities = models.evaluate_with_rates(model, np.maximum(times - t_max, 0.0))
+        return quats, displacements, rotations.quat_rates(quats, spins), velocities
+
+    return sample
+
+
+def reduce(
+    sample: Sampler,
+    t0: float,
+    t1: float,
+    tolerance: float,
+    radius: float,
+    forced_times: Sequence[float] = (),
+) -> Curves:
+    """Choose keys so that every point of the body stays within ``tolerance`` of the motion.
+
+    Args:
+        sample: Function of times [S] that gives quaternions [S, 4], displacements [S, 3] and their slopes per unit of
+            time [S, 4], [S, 3]. It should be smooth between t0 and t1: where it has a kink, reduce both sides and
+            `join` them.
+        t0: First time.
+        t1: Last time, > t0.
+        tolerance: Largest distance of any point from its place, world units, > 0.
+        radius: Largest distance of a point from the pivot, world units.
+        forced_times: Times inside (t0, t1) that get a key in any case.
+
+    Returns:
+        Location and rotation keys; one key for a curve that is constant within its share of the tolerance. The error
+        |dd| + 2 radius sin(dtheta / 2) holds on a grid four times finer than the possible key times, whose own density
+        doubles until single steps hold the tolerance. No rotation step is above 120 degrees.
+    """
+    if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
+        raise ValueError(f"t0, t1: expected t0 < t1, got {t0} and {t1}")
+    if not (tolerance > 0 and radius >= 0):
+        raise ValueError(f"tolerance, radius: expected > 0 and >= 0, got {tolerance} and {radius}")
+    cuts = sorted({float(t) for t in forced_times if t0 < t < t1})
+    bounds = [t0, *cuts, t1]
+    intervals = _FIRST_INTERVALS
+    while True:
+        grid = np.concatenate(
+            [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+            + [np.array([t1])]
+        )
+        location, rotation = _Curve.pair(sample(grid), grid, tolerance, radius)
+        possible = np.arange(0, len(grid), _FINER)
+        steps_hold = location.holds_steps(possible) and rotation.holds_steps(possible)
+        if steps_hold or intervals >= _MOST_INTERVALS:
+            break
+        intervals *= 2
+    forced = possible[::intervals]
+    return Curves(location.greedy(possible, forced), rotation.greedy(possible, forced))
+
+
+def join(first: Curves, second: Curves) -> Curves:
+    """Curves of two motions that meet: the end of ``first`` is the start of ``second``; the kink between them stays."""
+
+    def chain(a: Keys, b: Keys, flip: float) -> Keys:
+        values, left, right = b.values * flip, b.left_slopes * flip, b.right_slopes * flip
+        if a.times[-1] != b.times[0]:
+            return Keys(
+                np.concatenate([a.times, b.times]),
+                np.concatenate([a.values, values]),
+                np.concatenate([a.left_slopes, left]),
+                np.concatenate([a.right_slopes, right]),
+            )
+        return Keys(
+            np.concatenate([a.times, b.times[1:]]),
+            np.concatenate([a.values, values[1:]]),
+            np.concatenate([a.left_slopes, left[1:]]),
+            np.concatenate([a.right_slopes[:-1], right]),
+        )
+
+    flip = -1.0 if float(first.rotation.values[-1] @ second.rotation.values[0]) < 0 else 1.0
+    return Curves(chain(first.location, second.location, 1.0), chain(first.rotation, second.rotation, flip))
+
+
+def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray:
+    """Value of the curve as Blender evaluates it; held before the first and after the last key.
+
+    Args:
+        keys: The keys.
+        times: [...]
+        unit: Normalise, for quaternions.
+
+    Returns:
+        [..., C]
+    """
+    times = np.clip(np.asarray(times, np.float64), keys.times[0], keys.times[-1])
+    if len(keys.times) == 1:
+        values = np.broadcast_to(keys.values[0], (*times.shape, keys.values.shape[1])).copy()
+    else:
+        k = np.clip(np.searchsorted(keys.times, times, side="right") - 1, 0, len(keys.times) - 2)
+        h = (keys.times[k + 1] - keys.times[k])[..., None]
+        u = (times - keys.times[k])[..., None] / h
+        values = hermite(keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1], h, u)
+    return rotations.normalize(values) if unit else values
+
+
+def hermite(
+    left: np.ndarray, right: np.ndarray, left_slope: np.ndarray, right_slope: np.ndarray, h: np.ndarray, u: np.ndarray
+) -> np.ndarray:
+    """Cubic with given values and slopes at both ends of an interval of length h, at its fraction u. All broadcast."""
+    u2 = u * u
+    u3 = u2 * u
+    return (
+        (2 * u3 - 3 * u2 + 1) * left
+        + (u3 - 2 * u2 + u) * h * left_slope
+        + (3 * u2 - 2 * u3) * right
+        + (u3 - u2) * h * right_slope
+    )
+
+
+class _Curve:
+    """Samples of one curve on the checking grid, and the tolerance that it has to hold."""
+
+    def __init__(
+        self, times: np.ndarray, values: np.ndarray, slopes: np.ndarray, tolerance: float, radius: float | None
+    ):
+        self.times, self.values, self.slopes = times, values, slopes
+        self.tolerance, self.radius = tolerance, radius
+        self.constant = bool((self.error(self.values[:1], self.values) <= tolerance).all())
+
+    @staticmethod
+    def pair(samples: Samples, times: np.ndarray, tolerance: float, radius: float) -> tuple[_Curve, _Curve]:
+        """Location and rotation; each gets half of the tolerance, all of it where the other stands still."""
+        quats, displacements, quat_slopes, displacement_slopes = (np.asarray(x, np.float64) for x in samples)
+        signs = np.where((rotations.make_continuous(quats) * quats).sum(-1) < 0, -1.0, 1.0)[:, None]
+        arguments = (
+            (displacements, displacement_slopes, None),
+            (quats * signs, quat_slopes * signs, radius),
+        )
+        still = [_Curve(times, v, s, 1e-3 * tolerance, r).constant for v, s, r in arguments]
+        shares = [tolerance if other else 0.5 * tolerance for other in still[::-1]]
+        location, rotation = (_Curve(times, v, s, x, r) for (v, s, r), x in zip(arguments, shares, strict=True))
+        return location, rotation
+
+    def error(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+        """Largest distance of a point. [..., C] -> [...]"""
+        if self.radius is None:
+            return np.linalg.norm(values - truth, axis=-1)
+        angle = rotations.angle_between(rotations.normalize(values), truth)
+        return 2 * self.radius * np.sin(0.5 * angle)
+
+    def holds(self, start: int, stop: int) -> bool:
+        """Whether one cubic from sample ``start`` to ``stop`` is good enough at all samples between."""
+        return bool(self._segments_hold(np.array([start]), np.array([stop]), np.arange(start + 1, stop)[None]).all())
+
+    def holds_steps(self, possible: np.ndarray) -> bool:
+        """Whether each single step between possible key times is good enough."""
+        inside = possible[:-1, None] + np.arange(1, _FINER)
+        return self.constant or bool(self._segments_hold(possible[:-1], possible[1:], inside).all())
+
+    def _segments_hold(self, start: np.ndarray, stop: np.ndarray, inside: np.ndarray) -> np.ndarray:
+        h = (self.times[stop] - self.times[start])[:, None, None]
+        u = (self.times[inside] - self.times[start][:, None])[..., None] / h
+        left, right = self.values[start][:, None], self.values[stop][:, None]
+        cubic = hermite(left, right, self.slopes[start][:, None], self.slopes[stop][:, None], h, u)
+        good = np.all(self.error(cubic, self.values[inside]) <= self.tolerance, axis=-1)
+        if self.radius is not None:
+            good &= (self.values[start] * self.values[stop]).sum(-1) >= math.cos(0.5 * MAX_STEP_RAD)
+        return good
+
+    def greedy(self, possible: np.ndarray, forced: np.ndarray) -> Keys:
+        """Farthest reach from each key, by galloping and bisection; at most one possible step where none is good."""
+        chosen = [0]
+        if not self.constant:
+            for stop in forced[1:] // _FINER:
+                position = chosen[-1] // _FINER
+                while position < stop:
+                    position += self._reach(position, int(stop))
+                    chosen.append(int(possible[position]))
+        rows = np.array(chosen)
+        slopes = np.zeros_like(self.slopes[rows]) if self.constant else self.slopes[rows]
+        return Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())
+
+    def _reach(self, position: int, stop: int) -> int:
+        """Possible steps that one cubic from ``position`` can take, at least 1."""
+
+        def good(length: int) -> bool:
+            return self.holds(position * _FINER, (position + length) * _FINER)
+
+        most = stop - position
+        low, high = 1, 2
+        while high <= most and good(high):
+            low, high = high, 2 * high
+        high = min(high, most + 1)
+        if low < most < high and good(most):
+            return most
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if good(middle) else (low, middle)
+        return low

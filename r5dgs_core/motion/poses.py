@@ -1,0 +1,150 @@
+"""The rigid motion that best carries one cloud of points into another.
+
+Notation: x_i source, y_i target, w_i weights, c and c' their weighted centroids. The fit is y = c' + R (x - c).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import rotations
+
+_MAD_TO_SIGMA = 1.4826
+UNDETERMINED_RAD = 0.1
+
+
+@dataclass(frozen=True)
+class RigidFit:
+    """A fitted rigid motion.
+
+    Attributes:
+        quat: Rotation R, unit wxyz. [4]
+        displacement: Of the weighted centroid, c' - c. [3]
+        center: Weighted centroid of the source, c. [3]
+        residuals: Distance of each target point from its fitted place. [n]
+        weights: Final weights, those given times the robust ones. [n]
+        undetermined_axes: Directions in the source about which the points do not fix the rotation. [0..3, 3]
+        rotation_covariance: Of the rotation vector error, source frame, rad^2; pi^2 on undetermined axes. [3, 3]
+    """
+
+    quat: np.ndarray
+    displacement: np.ndarray
+    center: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    undetermined_axes: np.ndarray
+    rotation_covariance: np.ndarray
+
+    def displacement_at(self, point: np.ndarray) -> np.ndarray:
+        """Displacement of any point that moves with the body, such as the group's pivot. [..., 3]"""
+        return self.center + self.displacement + rotations.rotate(self.quat, point - self.center) - point
+
+
+def fit_rigid(
+    source: np.ndarray,  # [n, 3]
+    target: np.ndarray,  # [n, 3]
+    weights: np.ndarray | None = None,  # [n]
+    *,
+    rounds: int = 6,
+    hint: np.ndarray | None = None,  # [4]
+) -> RigidFit:
+    """Fit a rotation and a translation robustly (Kabsch with Cauchy reweighting).
+
+    Where the points leave the rotation about an axis open (a line, one point, noise larger than the lever), that part
+    is taken from ``hint``, so that the answer is the rotation nearest to it among those that fit.
+
+    Args:
+        source: Points before. [n, 3]
+        target: The same points after. [n, 3]
+        weights: Of the points, >= 0 with a positive sum, or None for equal ones. [n]
+        rounds: Rounds of reweighting; none is needed where no residual is far above the median.
+        hint: Expected rotation, unit wxyz; None for the identity.
+
+    Returns:
+        The fit; det R = +1 always.
+
+    Source: Kabsch 1976, with the sign of the smallest singular vector set for det R = +1; Cauchy weights
+        1 / (1 + (r / s)^2) with s = 2 * 1.4826 * median(r); rotation covariance sigma^2 J^-1 with
+        J = sum w (|r|^2 I - r r^T).
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape or len(source) == 0:
+        raise ValueError(f"expected two equal shapes (n, 3) with n >= 1, got {source.shape} and {target.shape}")
+    base = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
+    if base.shape != (len(source),) or not (base >= 0).all() or not base.sum() > 0:
+        raise ValueError(f"weights: expected ({len(source)},) numbers >= 0 with a positive sum")
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise ValueError("source, target: expected finite points")
+
+    current = base / base.sum()
+    quat, center, moved, residuals = _kabsch(source, target, current)
+    size = float(np.sqrt(np.sum(current * ((source - center) ** 2).sum(-1))))
+    for _ in range(rounds):
+        used = residuals[base > 0]
+        median = float(np.median(used))
+        if used.max() <= 4 * median or used.max() <= 1e-12 * max(size, 1e-300):
+            break
+        scale = max(2 * _MAD_TO_SIGMA * median, 1e-9 * max(size, 1e-300))
+        current = base / (1 + (residuals / scale) ** 2)
+        current = current / current.sum()
+        quat, center, moved, residuals = _kabsch(source, target, current)
+
+    axes, covariance = _uncertainty(source - center, residuals, current, size)
+    if len(axes):
+        known = np.array([1.0, 0, 0, 0]) if hint is None else rotations.normalize(np.asarray(hint, np.float64))
+        quat = known
+        if len(axes) == 1:
+            fitted, _, _, _ = _kabsch(source, target, current)
+            start, end = rotations.rotate(known, axes[0]), rotations.rotate(fitted, axes[0])
+            quat = rotations.multiply(shortest_turn(start, end), known)
+        residuals = np.linalg.norm(target - moved - rotations.rotate(quat, source - center), axis=-1)
+    return RigidFit(quat, moved - center, center, residuals, current, axes, covariance)
+
+
+def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes one unit vector to another; about any normal where they oppose. [3] -> [4]"""
+    cosine = float(start @ end)
+    if cosine < -1 + 1e-12:
+        other = np.eye(3)[int(np.argmin(np.abs(start)))]
+        normal = np.cross(start, other)
+        return np.concatenate([[0.0], normal / np.linalg.norm(normal)])
+    return rotations.normalize(np.concatenate([[1 + cosine], np.cross(start, end)]))
+
+
+def _kabsch(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation, the two centroids and the residuals for given weights of sum 1."""
+    center, moved = weights @ source, weights @ target
+    x, y = source - center, target - moved
+    u, _, vt = np.linalg.svd((y * weights[:, None]).T @ x)
+    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0
+    rotmat = u @ vt
+    return rotations.rotmats_to_quats(rotmat), center, moved, np.linalg.norm(y - x @ rotmat.T, axis=-1)
+
+
+def _uncertainty(
+    offsets: np.ndarray, residuals: np.ndarray, weights: np.ndarray, size: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Axes that the points leave open, and the covariance of the rotation, both in the source frame."""
+    relative = weights / weights.max()
+    inertia = np.einsum("n,nij->ij", relative, _inertias(offsets))
+    dof = max(3 * float(relative.sum()) - 6, 1.0)
+    sigma2 = float(np.sum(relative * residuals**2)) / dof
+    values, vectors = np.linalg.eigh(inertia)
+    floor = 1e-12 * max(float(values[-1]), 1e-300)
+    variances = np.where(values > floor, sigma2 / np.maximum(values, floor), np.pi**2)
+    spread = float(np.abs(offsets).max()) if len(offsets) else 0.0
+    free = (values <= floor) | (variances > UNDETERMINED_RAD**2)
+    if spread <= 1e-300 or size <= 1e-300 or free.sum() > 1:
+        free[:] = True
+    variances = np.minimum(np.where(free, np.pi**2, variances), np.pi**2)
+    return vectors[:, free].T.copy(), (vectors * variances) @ vectors.T
+
+
+def _inertias(offsets: np.ndarray) -> np.ndarray:
+    """|r|^2 I - r r^T of each point. [n, 3] -> [n, 3, 3]"""
+    squares = (offsets**2).sum(-1)[:, None, None] * np.eye(3)
+    return squares - offsets[:, :, None] * offsets[:, None, :]
