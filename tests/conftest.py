@@ -1,0 +1,31 @@
+"""What holds for all tests: which Blender there is, and Hypothesis without deadlines (first calls compile)."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import sys
+
+import hypothesis
+import pytest
+
+BPY_PYTHON = (3, 11)
+
+hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
+hypothesis.settings.load_profile("r5dgs")
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    """Say beside the platform whether Blender's tests can run, and if not, why."""
+    if importlib.util.find_spec("bpy") is not None:
+        return f"blender: bpy {importlib.metadata.version('bpy')}"
+    here = f"{sys.version_info.major}.{sys.version_info.minor}"
+    if sys.version_info[:2] != BPY_PYTHON:
+        wanted = ".".join(map(str, BPY_PYTHON))
+        return f"blender: ABSENT, its tests are skipped: the bpy module exists for Python {wanted}, this is {here}"
+    remedy = "pip install -c constraints.txt -e '.[test]'"
+    return f"blender: ABSENT, its tests are skipped: bpy is not installed, {remedy}"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--update-golden", action="store_true", help="write golden images anew instead of comparing")

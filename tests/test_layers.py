@@ -1,0 +1,270 @@
+"""The directions of the house: who may import whom, read from the sources and tried with packages blocked."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Which rooms of the core a room may import, itself and `errors` aside: motion <- scene <- (data, raster, model) <-
+# train; report stands on baked scenes, so it needs no trainer; the command line may use everything.
+ALLOWED = {
+    "errors": set(),
+    "motion": set(),
+    "scene": {"motion"},
+    "data": {"motion", "scene"},
+    "model": {"motion", "scene"},
+    "raster": {"motion", "scene", "model"},
+    "semantics": {"motion", "scene", "data", "model", "raster"},
+    "train": {"motion", "scene", "data", "model", "raster"},
+    "report": {"motion", "scene", "data", "model", "raster", "semantics"},
+    "serve": {"motion", "scene", "model", "raster", "semantics"},
+    "cli": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve"},
+}
+LIGHT = {"errors", "motion", "scene"}
+BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
+HEAVY = {"torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"}
+TORCH_TIER = {"torch", "numba", "gsplat", "transformers", "torchvision"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import: of a module by absolute name, whether relative in the source, whether inside a function."""
+
+    target: str
+    relative: bool
+    late: bool
+    line: int
+
+
+def imports_of(source: str, package: str) -> Iterator[Import]:
+    """All imports of a module that lives in ``package``; ``from a import b`` counts as a.b, as b may be a module."""
+
+    def visit(node: ast.AST, late: bool) -> Iterator[Import]:
+        for child in ast.iter_child_nodes(node):
+            inside = late or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            if isinstance(child, ast.Import):
+                for alias in child.names:
+                    yield Import(alias.name, False, late, child.lineno)
+            elif isinstance(child, ast.ImportFrom):
+                base = child.module or ""
+                if child.level:
+                    parents = package.split(".")[: len(package.split(".")) - child.level + 1]
+                    base = ".".join([*parents, *([base] if base else [])])
+                for alias in child.names:
+                    yield Import(f"{base}.{alias.name}", bool(child.level), late, child.lineno)
+            yield from visit(child, inside)
+
+    yield from visit(ast.parse(source), False)
+
+
+def modules_in(folder: str) -> Iterator[tuple[Path, str]]:
+    """Source files under a folder of the root and the package that each lives in."""
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        yield path, ".".join(path.relative_to(ROOT).parent.parts)
+
+
+def room(module: str) -> str | None:
+    """Room of the core that a module belongs to: r5dgs_core.scene.cameras -> scene."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "r5dgs_core" and len(parts) > 1 and parts[1] in ALLOWED else None
+
+
+def core_problems(source: str, package: str, own: str) -> list[str]:
+    """What a module of a room imports against the directions."""
+    problems = []
+    for item in imports_of(source, package):
+        top, other = item.target.split(".")[0], room(item.target)
+        if top in BLENDER or top in ("r5dgs_addon", "operators", "r5dgs"):
+            problems.append(f"line {item.line}: the core imports {item.target}")
+        if top == "r5dgs_core" and not item.relative:
+            problems.append(f"line {item.line}: {item.target} is not relative, so it breaks inside the extension")
+        if other and other not in ALLOWED[own] | {own, "errors"}:
+            problems.append(f"line {item.line}: {own} imports {item.target}")
+        if own in LIGHT and not item.relative and top not in sys.stdlib_module_names | {"numpy"}:
+            problems.append(f"line {item.line}: the light tier imports {item.target}")
+    return problems
+
+
+def addon_problems(source: str, package: str) -> list[str]:
+    """What a module of the extension imports against the directions."""
+    problems = []
+    for item in imports_of(source, package):
+        top = item.target.split(".")[0]
+        inside = item.target.removeprefix("r5dgs.")
+        if top in TORCH_TIER:
+            problems.append(f"line {item.line}: the add-on imports {item.target}")
+        if top in HEAVY and not item.late:
+            problems.append(f"line {item.line}: {item.target} is imported before it is needed")
+        if not item.relative and top in ("r5dgs_core", "r5dgs_addon", "operators", "r5dgs"):
+            problems.append(f"line {item.line}: {item.target} is not relative")
+        if item.relative and room(inside) not in LIGHT | {None} and not (item.late and room(inside) == "data"):
+            problems.append(f"line {item.line}: the add-on imports {item.target}, which is not of the light tier")
+        if package.startswith("r5dgs.r5dgs_addon") and inside.startswith("operators"):
+            problems.append(f"line {item.line}: a service imports an operator, {item.target}")
+    return problems
+
+
+def test_every_room_of_the_core_has_its_place():
+    found = {path.stem for path in (ROOT / "r5dgs_core").iterdir() if path.suffix == ".py" and path.stem != "__init__"}
+    found |= {path.parent.name for path in (ROOT / "r5dgs_core").glob("*/__init__.py")}
+    assert found - {"__main__"} <= set(ALLOWED)
+    assert {"motion", "scene", "data", "model", "raster", "train", "report"} <= found
+
+
+def test_the_allowed_directions_have_no_circle():
+    settled: set[str] = set()
+    while len(settled) < len(ALLOWED):
+        ready = {name for name, needs in ALLOWED.items() if name not in settled and needs <= settled}
+        assert ready, f"circle among {set(ALLOWED) - settled}"
+        settled |= ready
+
+
+@pytest.mark.parametrize("own", sorted(ALLOWED))
+def test_no_room_of_the_core_imports_upward(own):
+    problems = []
+    for path, package in modules_in("r5dgs_core"):
+        module = f"{package}.{path.stem}" if path.stem != "__init__" else package
+        if room(module) == own:
+            problems += [f"{path.relative_to(ROOT)}: {text}" for text in core_problems(path.read_text(), package, own)]
+    assert not problems, "\n".join(problems)
+
+
+@pytest.mark.parametrize("folder", ["r5dgs_addon", "operators"])
+def test_the_extension_imports_only_the_light_tier(folder):
+    files = list(modules_in(folder))
+    assert files
+    problems = []
+    for path, package in files:
+        found = addon_problems(path.read_text(), f"r5dgs.{package}")
+        problems += [f"{path.relative_to(ROOT)}: {text}" for text in found]
+    assert not problems, "\n".join(problems)
+
+
+def test_the_root_imports_nothing_before_it_registers():
+    early = [item for item in imports_of((ROOT / "__init__.py").read_text(), "r5dgs") if not item.late]
+    assert [item.target for item in early if item.target.split(".")[0] != "__future__"] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "package", "own"),
+    [
+        ("import bpy", "r5dgs_core.train", "train"),
+        ("def f():\n    from mathutils import Vector", "r5dgs_core.cli", "cli"),
+        ("from ..train import trainer", "r5dgs_core.report", "report"),
+        ("from .. import report", "r5dgs_core.train", "train"),
+        ("from ..scene.scene import Scene", "r5dgs_core.motion", "motion"),
+        ("from r5dgs_core.motion import models", "r5dgs_core.train", "train"),
+        ("def f():\n    import torch", "r5dgs_core.motion", "motion"),
+        ("from scipy.spatial import cKDTree", "r5dgs_core.scene", "scene"),
+        ("from . import cli", "r5dgs_core", "serve"),
+    ],
+)
+def test_the_scan_of_the_core_sees_a_wrong_import(source, package, own):
+    assert core_problems(source, package, own)
+
+
+@pytest.mark.parametrize(
+    ("source", "package"),
+    [
+        ("import torch", "r5dgs.r5dgs_addon"),
+        ("def f():\n    import numba", "r5dgs.operators"),
+        ("import OpenImageIO", "r5dgs.r5dgs_addon"),
+        ("from ..r5dgs_core.raster import scene_render", "r5dgs.r5dgs_addon"),
+        ("def f():\n    from ..r5dgs_core import train", "r5dgs.operators"),
+        ("from r5dgs_core.scene import scene_file", "r5dgs.operators"),
+        ("from ..operators import load_scene", "r5dgs.r5dgs_addon"),
+        ("from .. import operators", "r5dgs.r5dgs_addon"),
+    ],
+)
+def test_the_scan_of_the_extension_sees_a_wrong_import(source, package):
+    assert addon_problems(source, package)
+
+
+@pytest.mark.parametrize(
+    ("source", "package", "own"),
+    [
+        ("from . import rotations\nimport numpy as np\nimport math", "r5dgs_core.motion", "motion"),
+        ("from .. import errors\nfrom ..motion import models", "r5dgs_core.scene", "scene"),
+        ("import torch\nfrom ..raster import rasterize", "r5dgs_core.train", "train"),
+    ],
+)
+def test_the_scan_of_the_core_lets_right_imports_pass(source, package, own):
+    assert core_problems(source, package, own) == []
+
+
+BLOCKER = """
+import importlib, importlib.util, json, pkgutil, sys
+
+class Blocker:
+    def __init__(self, names): self.names = set(names)
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname.split(".")[0] in self.names:
+            raise ImportError(f"{fullname} is blocked")
+
+root, blocked = sys.argv[1], json.loads(sys.argv[2])
+sys.meta_path.insert(0, Blocker(blocked))
+"""
+
+IMPORT_LIGHT_TIER = """
+sys.path.insert(0, root)
+import r5dgs_core.errors
+seen = []
+for name in ("motion", "scene"):
+    package = importlib.import_module(f"r5dgs_core.{name}")
+    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(info.name)
+        seen.append(info.name)
+assert not set(sys.modules) & set(blocked)
+print(len(seen))
+"""
+
+REGISTER_EXTENSION = """
+spec = importlib.util.spec_from_file_location("r5dgs", root + "/__init__.py", submodule_search_locations=[root])
+extension = importlib.util.module_from_spec(spec)
+sys.modules["r5dgs"] = extension
+spec.loader.exec_module(extension)
+import bpy
+for _ in range(2):
+    extension.register()
+    assert bpy.ops.r5dgs.load_scene.get_rna_type().identifier == "R5DGS_OT_load_scene"
+    extension.unregister()
+seen = [name for name in sys.modules if name.startswith("r5dgs.")]
+for package in ("r5dgs_addon", "operators"):
+    for info in pkgutil.walk_packages([f"{root}/{package}"], f"r5dgs.{package}."):
+        importlib.import_module(info.name)
+assert not set(sys.modules) & set(blocked)
+print(len(seen))
+"""
+
+
+def run_blocked(code: str, blocked: set[str], tmp_path: Path) -> str:
+    """Run code in a fresh Python in which importing ``blocked`` packages fails."""
+    command = [sys.executable, "-c", BLOCKER + code, str(ROOT), json.dumps(sorted(blocked))]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_light_tier_imports_with_numpy_alone(tmp_path):
+    assert int(run_blocked(IMPORT_LIGHT_TIER, HEAVY | BLENDER, tmp_path).split()[-1]) >= 8
+
+
+def test_the_block_is_a_block(tmp_path):
+    with pytest.raises(AssertionError, match="torch is blocked"):
+        run_blocked("import torch", HEAVY, tmp_path)
+
+
+@pytest.mark.blender
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed (see the report's header)")
+def test_the_extension_registers_twice_without_the_torch_tier(tmp_path):
+    assert int(run_blocked(REGISTER_EXTENSION, HEAVY, tmp_path).split()[-1]) > 10
