@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import load_scene, preview, select_by_prompt, worker_test
+from . import capture_dataset, check_worker, load_scene, preview, select_by_prompt
 
-MODULES = (load_scene, select_by_prompt, preview, worker_test)
+MODULES = (load_scene, select_by_prompt, preview, check_worker, capture_dataset)
 
 
 def _menu_import(menu, context):
@@ -12,8 +12,10 @@ def _menu_import(menu, context):
 
 
 def _menu_export(menu, context):
-    if hasattr(bpy.types, "R5DGS_OT_capture_dataset"):
-        menu.layout.operator("r5dgs.capture_dataset", text="R5DGS Training Data Set")
+    menu.layout.operator(capture_dataset.R5DGS_OT_capture_dataset.bl_idname, text="R5DGS Training Data Set")
+
+
+MENUS = ((bpy.types.TOPBAR_MT_file_import, _menu_import), (bpy.types.TOPBAR_MT_file_export, _menu_export))
 
 
 def register():
@@ -21,14 +23,15 @@ def register():
     for module in MODULES:
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
-    bpy.types.TOPBAR_MT_file_import.append(_menu_import)
-    bpy.types.TOPBAR_MT_file_export.append(_menu_export)
+    for menu, draw in MENUS:
+        menu.append(draw)
 
 
 def unregister():
     """Undo `register` in reverse order."""
-    bpy.types.TOPBAR_MT_file_export.remove(_menu_export)
-    bpy.types.TOPBAR_MT_file_import.remove(_menu_import)
+    for menu, draw in MENUS:
+        menu.remove(draw)
     for module in reversed(MODULES):
         for cls in reversed(module.CLASSES):
             bpy.utils.unregister_class(cls)
+

@@ -1,5 +1,7 @@
 """What differs between Blender versions, found by feature and not by number. Nothing else asks for a version."""
 
+import atexit
+
 import bpy
 
 KEYFRAME = bpy.types.Keyframe.bl_rna
@@ -94,3 +96,17 @@ def emission_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
         material.use_nodes = True
     material.node_tree.nodes.clear()
     return material.node_tree
+
+
+def call_at_exit(unregister) -> None:
+    """Unregister before Python ends in the bpy module, which crashes there while panels or menus are registered.
+
+    Blender itself disables its extensions in time.
+    """
+    if not bpy.app.binary_path:  # true of the module only
+        atexit.register(unregister)
+
+
+def do_not_call_at_exit(unregister) -> None:
+    """Undo `call_at_exit`."""
+    atexit.unregister(unregister)

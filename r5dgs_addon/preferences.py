@@ -38,7 +38,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         if os.environ.get(ENVIRONMENT):
             layout.label(text=f"{ENVIRONMENT} is set and wins: {os.environ[ENVIRONMENT]}", icon="INFO")
         layout.prop(self, "worker_timeout")
-        layout.operator("r5dgs.test_worker", icon="PLAY")
+        layout.operator("r5dgs.check_worker", icon="PLAY")
 
 
 def get() -> "R5DGS_AP_preferences | None":

@@ -1,0 +1,176 @@
+"""The motion of a group as F-curves of its anchor.
+
+In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and the
+knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys are
+taken from the motion model under the same tolerance; they are of another key type, and the key at t_max may have a kink.
+"""
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core.motion import keyframes as reduction
+from ..r5dgs_core.motion import rotations
+from ..r5dgs_core.motion.keyframes import Curves, Keys
+from ..r5dgs_core.scene import playback
+from ..r5dgs_core.scene.scene import Scene
+from . import compat, timeline
+
+# Of the scene's size. Blender may differ from playback by 1e-5: float32 evaluation and a second curve take their shares.
+TOLERANCE = 3e-6
+OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
+
+
+def animate(
+    anchor: bpy.types.Object, scene: Scene, motion_id: int, times: timeline.Times, tolerance: float = TOLERANCE
+) -> None:
+    """Key an anchor with the motion of its group; a group that stays put gets no keys.
+
+    Args:
+        anchor: Empty at the group's pivot, rotation mode quaternion.
+        scene: The scene.
+        motion_id: The motion group.
+        times: Scene times and their frames.
+        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+    """
+    if motion_id == 0:
+        return
+    motion = curves(scene, motion_id, times.t_end, tolerance)
+    location, rotation = motion.location, motion.rotation
+    moves, turns = _varies(location.values), _varies(rotation.values)
+    if not (moves or turns):
+        return
+    fcurves = compat.new_fcurves(anchor, anchor.name)
+    if moves:
+        pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
+        placed = Keys(location.times, location.values + pivot, location.left_slopes, location.right_slopes)
+        write(fcurves, "location", placed, times)
+    if turns:
+        write(fcurves, "rotation_quaternion", rotation, times)
+
+
+def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float) -> Curves:
+    """Keys of a motion group from the first knot to ``t_end``, over scene time.
+
+    Args:
+        scene: The scene.
+        motion_id: The motion group.
+        t_end: Last time; nothing is extrapolated where it is not past t_max.
+        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+
+    Returns:
+        Displacement of the pivot and rotation, with a key at t_max unless they never change.
+    """
+    members = scene.means[scene.motion_ids == motion_id].astype(np.float64)
+    pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
+    radius = float(np.linalg.norm(members - pivot, axis=-1).max(initial=0.0))
+    allowed = tolerance * scene.extent
+    observed = _observed(scene, motion_id, allowed, radius)
+    if t_end <= scene.t_max:
+        return observed
+    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius)
+    ready = [
+        _hold(first, scene.t_max) if len(first.times) == 1 and len(second.times) > 1 else first
+        for first, second in ((observed.location, future.location), (observed.rotation, future.rotation))
+    ]
+    return reduction.join(Curves(*ready), future)
+
+
+def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
+    """One key per knot, which is playback itself, or fewer keys where they hold the tolerance."""
+    times = np.asarray(scene.track_times, np.float64)
+    quats, displacements = (values[motion_id] for values in playback.knots(scene))
+    quat_slopes, displacement_slopes = (values[motion_id] for values in playback.knot_slopes(scene))
+    exact = Curves(
+        Keys(times, displacements, displacement_slopes, displacement_slopes),
+        Keys(times, quats, quat_slopes, quat_slopes),
+    )
+    if len(times) < 2:
+        return exact
+
+    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        raw, raw_slopes = _cubic(exact.rotation, at)
+        moved, moved_slopes = _cubic(exact.location, at)
+        norm = np.linalg.norm(raw, axis=-1, keepdims=True)
+        unit = raw / norm
+        return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
+
+    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius)
+    return Curves(
+        *(
+            few if len(few.times) < len(times) else all_knots
+            for few, all_knots in ((fewer.location, exact.location), (fewer.rotation, exact.rotation))
+        )
+    )
+
+
+def _future(scene: Scene, motion_id: int) -> reduction.Sampler:
+    """Motion past t_max: the group's own model, or what it follows as `playback.group_poses` does."""
+    group = scene.groups[motion_id]
+    if group.follows is None or group.follow_matrix is None:
+        return reduction.model_sampler(group.model, scene.t_max)
+    leader = reduction.model_sampler(scene.groups[group.follows].model, scene.t_max)
+    follow = np.asarray(group.follow_matrix, np.float64)
+
+    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        _, displacements, _, velocities = leader(at)
+        quats = rotations.identity(len(at))
+        return quats, displacements @ follow.T, np.zeros_like(quats), velocities @ follow.T
+
+    return sample
+
+
+def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values and slopes of the cubic between keys, at times within them. [S] -> [S, C], [S, C]"""
+    k = np.clip(np.searchsorted(keys.times, at, side="right") - 1, 0, len(keys.times) - 2)
+    h = (keys.times[k + 1] - keys.times[k])[:, None]
+    u = (at - keys.times[k])[:, None] / h
+    start, stop, leave, arrive = keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1]
+    slopes = 6 * (u - u * u) * (stop - start) / h + (1 - 4 * u + 3 * u * u) * leave + (3 * u * u - 2 * u) * arrive
+    return reduction.hermite(start, stop, leave, arrive, h, u), slopes
+
+
+def _hold(keys: Keys, t: float) -> Keys:
+    """A constant curve with a second key at t, so that what comes after it does not bend it."""
+    still = np.zeros_like(keys.values[[0, 0]])
+    return Keys(np.array([keys.times[0], t]), keys.values[[0, 0]], still, still)
+
+
+def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
+    """Write a curve as F-curves with Bezier keys and free handles; a component that never changes gets one key.
+
+    Args:
+        fcurves: Where they go; free of this path.
+        data_path: "location" or "rotation_quaternion".
+        curve: The keys.
+        times: Scene times and their frames.
+    """
+    bezier = compat.keyframe_enum("interpolation", "BEZIER")
+    free = compat.keyframe_enum("handle_left_type", "FREE")
+    kinds = {kind: compat.keyframe_enum("type", kind) for kind in (OBSERVED_KEY, EXTRAPOLATED_KEY)}
+    frames = times.frame(1.0) - times.frame(0.0)
+    for index in range(curve.values.shape[1]):
+        keep = slice(None) if _varies(curve.values[:, index : index + 1]) else slice(0, 1)
+        t, value = curve.times[keep], curve.values[keep, index]
+        gaps = np.diff(t)
+        before = np.concatenate([gaps[:1], gaps]) if len(gaps) else np.ones(1)
+        after = np.concatenate([gaps, gaps[-1:]]) if len(gaps) else np.ones(1)
+        frame = times.frame(0.0) + frames * t
+        left = np.stack([frame - frames * before / 3, value - curve.left_slopes[keep, index] * before / 3], axis=-1)
+        right = np.stack([frame + frames * after / 3, value + curve.right_slopes[keep, index] * after / 3], axis=-1)
+        kind = np.where(t > times.t_max + 1e-9, kinds[EXTRAPOLATED_KEY], kinds[OBSERVED_KEY])
+        fcurve = fcurves.new(data_path, index=index)
+        points = fcurve.keyframe_points
+        points.add(len(t))
+        count = len(t)
+        points.foreach_set("interpolation", np.full(count, bezier, np.int32))
+        points.foreach_set("handle_left_type", np.full(count, free, np.int32))
+        points.foreach_set("handle_right_type", np.full(count, free, np.int32))
+        points.foreach_set("type", kind.astype(np.int32))
+        points.foreach_set("co", np.stack([frame, value], axis=-1).astype(np.float32).ravel())
+        points.foreach_set("handle_left", left.astype(np.float32).ravel())
+        points.foreach_set("handle_right", right.astype(np.float32).ravel())
+        fcurve.update()
+
+
+def _varies(values: np.ndarray) -> bool:
+    return bool((values != values[:1]).any())

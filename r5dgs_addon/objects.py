@@ -1,0 +1,247 @@
+"""A scene as Blender objects: a collection, a root empty, and per object a collection with anchors and point clouds.
+
+Notation: the root carries the world convention W; the anchor of motion group g stands at the group's pivot p and turns
+and moves by the group's pose (R, d). A point x of the bind state is shown at W T(p + d) R T(-p) x, the last factor being
+the cloud's parent inverse, so that the point cloud holds the file's own coordinates.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from ..r5dgs_core.scene import cameras
+from ..r5dgs_core.scene.scene import MotionGroup, Scene
+from . import clouds, compat, handlers, keyframes, timeline
+
+NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a scene is built.
+
+    Attributes:
+        world_convention: Key of `cameras.WORLD_TO_BLENDER`, or "" for the file's own.
+        frame_zero: Frame at which the scene time is 0.
+        t_end: Scene time up to which motion is extrapolated; None for `timeline.default_end`.
+        key_tolerance: Error of the reduced keys, fraction of the scene's size.
+        fit_timeline: Whether the frame range and the marker are set.
+        view_dependence: Whether spherical harmonics above degree 0 are stored on the points.
+    """
+
+    world_convention: str = ""
+    frame_zero: float = 1.0
+    t_end: float | None = None
+    key_tolerance: float = keyframes.TOLERANCE
+    fit_timeline: bool = True
+    view_dependence: bool = True
+
+
+@dataclass(frozen=True)
+class Range:
+    """Consecutive Gaussians of one object and one motion group."""
+
+    object_id: int
+    motion_id: int
+    start: int
+    count: int
+
+
+def ranges(scene: Scene) -> list[Range]:
+    """The scene's Gaussians cut where object or motion group change."""
+    pairs = np.stack([scene.object_ids, scene.motion_ids], axis=-1).astype(np.int64)
+    if len(pairs) == 0:
+        return []
+    starts = np.concatenate([[0], np.flatnonzero((np.diff(pairs, axis=0) != 0).any(-1)) + 1, [len(pairs)]])
+    return [
+        Range(int(pairs[a, 0]), int(pairs[a, 1]), int(a), int(b - a))
+        for a, b in zip(starts[:-1], starts[1:], strict=True)
+    ]
+
+
+def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options = Options()) -> bpy.types.Collection:
+    """Build a scene in the active Blender scene. After an error everything is as it was before.
+
+    Args:
+        context: Its scene and view layer get the objects.
+        scene: The scene.
+        path: File that it came from; remembered for the preview.
+        options: How to build.
+
+    Returns:
+        The collection ``R5DGS <name>``.
+    """
+    with nothing_left_after_error():
+        times = timeline.Times.of(scene, options.frame_zero, options.t_end)
+        collection = bpy.data.collections.new(_name(f"R5DGS {scene.name}"))
+        context.scene.collection.children.link(collection)
+        root = _root(collection, scene, options.world_convention or scene.world_convention)
+        _describe(collection, scene, path, root, times)
+        material = clouds.material(_name(f"R5DGS {scene.name}"))
+        children: dict[int, bpy.types.Collection] = {}
+        anchors: dict[tuple[int, int], bpy.types.Object] = {}
+        for part in ranges(scene):
+            child = children.get(part.object_id)
+            if child is None:
+                child = bpy.data.collections.new(_name(object_name(scene, part.object_id)))
+                collection.children.link(child)
+                children[part.object_id] = child
+            key = (part.object_id if part.motion_id == 0 else 0, part.motion_id)
+            if key not in anchors:
+                anchors[key] = _anchor(child, root, scene, part)
+                keyframes.animate(anchors[key], scene, part.motion_id, times, options.key_tolerance)
+            _cloud(child, anchors[key], scene, part, material, options.view_dependence)
+        if options.fit_timeline:
+            timeline.fit(context.scene, times)
+        context.view_layer.update()
+    for selected in context.selected_objects:
+        selected.select_set(False)
+    root.select_set(True)
+    context.view_layer.objects.active = root
+    return collection
+
+
+@contextlib.contextmanager
+def nothing_left_after_error() -> Iterator[None]:
+    """Remove all data that the block made, if it raises."""
+    kinds = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
+    before = {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in kinds}
+    try:
+        yield
+    except BaseException:
+        made = [data for kind in kinds for data in getattr(bpy.data, kind) if data.session_uid not in before[kind]]
+        bpy.data.batch_remove(made)
+        raise
+
+
+def object_name(scene: Scene, object_id: int) -> str:
+    """Name of an object of the table, or one made of its id where the table lacks it."""
+    try:
+        return scene.object(object_id).name
+    except KeyError:
+        return "unassigned" if object_id < 0 else f"object {object_id}"
+
+
+def scene_collections() -> list[bpy.types.Collection]:
+    """All collections that hold a loaded R5DGS scene."""
+    return [collection for collection in bpy.data.collections if collection.r5dgs.is_scene]
+
+
+def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None:
+    """The loaded scene that the active object belongs to, else the first one in the active Blender scene."""
+    inside = set(context.scene.collection.children_recursive)
+    candidates = [collection for collection in scene_collections() if collection in inside]
+    active = context.view_layer.objects.active
+    if active is not None:
+        for collection in candidates:
+            if active.name in collection.all_objects and collection.all_objects[active.name] == active:
+                return collection
+    return candidates[0] if candidates else None
+
+
+def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Object]:
+    """Objects of a loaded scene that have one of these roles."""
+    return [obj for obj in collection.all_objects if obj.r5dgs.role in roles]
+
+
+def _name(text: str) -> str:
+    return text.encode()[:NAME_BYTES].decode(errors="ignore")
+
+
+def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bpy.types.Object:
+    root = bpy.data.objects.new(_name(f"{scene.name} root"), None)
+    root.r5dgs.role = "ROOT"
+    root.empty_display_type = "PLAIN_AXES"
+    root.empty_display_size = 0.1 * scene.extent
+    root.rotation_mode = "QUATERNION"
+    root.rotation_quaternion = Matrix(cameras.WORLD_TO_BLENDER[convention].tolist()).to_quaternion()
+    collection.objects.link(root)
+    return root
+
+
+def _pivot(scene: Scene, part: Range) -> np.ndarray:
+    """Where the anchor stands: the group's pivot; the middle of the object where the group is the pinned one. [3]"""
+    if part.motion_id != 0:
+        return np.asarray(scene.groups[part.motion_id].pivot, np.float64)
+    if part.object_id <= 0:
+        return np.zeros(3)
+    return np.median(scene.means[part.start : part.start + part.count].astype(np.float64), axis=0)
+
+
+def _anchor_name(scene: Scene, part: Range) -> str:
+    group: MotionGroup = scene.groups[part.motion_id]
+    if group.role == "shadow":
+        return f"{object_name(scene, group.object_id)} shadow anchor"
+    return f"{object_name(scene, part.object_id if part.motion_id == 0 else group.object_id)} anchor"
+
+
+def _anchor(
+    collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range
+) -> bpy.types.Object:
+    anchor = bpy.data.objects.new(_name(_anchor_name(scene, part)), None)
+    pivot = _pivot(scene, part)
+    anchor.empty_display_type = "ARROWS"
+    anchor.empty_display_size = 0.05 * scene.extent
+    anchor.rotation_mode = "QUATERNION"
+    anchor.location = pivot
+    anchor.parent = root
+    state = anchor.r5dgs
+    state.role, state.object_id, state.motion_id, state.pivot = "ANCHOR", part.object_id, part.motion_id, pivot
+    collection.objects.link(anchor)
+    return anchor
+
+
+def _cloud(
+    collection: bpy.types.Collection,
+    anchor: bpy.types.Object,
+    scene: Scene,
+    part: Range,
+    material: bpy.types.Material,
+    view_dependence: bool,
+) -> bpy.types.Object:
+    name = object_name(scene, part.object_id)
+    group = scene.groups[part.motion_id]
+    if group.role == "shadow" and group.object_id != part.object_id:
+        name = f"{object_name(scene, group.object_id)} shadow"
+    cloud = compat.new_point_cloud(_name(name), part.count, collection)
+    clouds.fill(cloud.data, scene, slice(part.start, part.start + part.count), view_dependence)
+    cloud.data.materials.append(material)
+    color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
+    cloud.color = (*color, 1.0)
+    cloud.parent = anchor
+    cloud.matrix_parent_inverse = Matrix.Translation(-Vector(anchor.location))
+    state = cloud.r5dgs
+    state.role, state.object_id, state.motion_id, state.pivot = "CLOUD", part.object_id, part.motion_id, anchor.location
+    state.start, state.count = part.start, part.count
+    return cloud
+
+
+def _color(scene: Scene, object_id: int) -> tuple[float, float, float]:
+    try:
+        return scene.object(object_id).color
+    except KeyError:
+        return (0.5, 0.5, 0.5)
+
+
+def _describe(
+    collection: bpy.types.Collection, scene: Scene, path: Path, root: bpy.types.Object, times: timeline.Times
+) -> None:
+    state = collection.r5dgs
+    state.is_scene = True
+    state.scene_name = scene.name
+    state.filepath = handlers.relative_to(str(path.resolve()), bpy.data.filepath)
+    state.gaussians = len(scene.means)
+    state.root = root
+    state.t_start, state.t_max, state.t_end = times.t_start, times.t_max, times.t_end
+    state.frames_per_unit, state.frame_zero = times.frames_per_unit, times.frame_zero
+    for item in scene.objects:
+        entry = state.table.add()
+        entry.name, entry.object_id = item.name, item.id
+        entry.aliases = ", ".join(item.aliases)
+        entry.caption, entry.count = item.caption, item.count
+

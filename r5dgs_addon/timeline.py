@@ -1,0 +1,65 @@
+"""Scene time and Blender frames: frame = frame_zero + t * frames_per_unit."""
+
+import math
+from dataclasses import dataclass
+
+import bpy
+
+from ..r5dgs_core.scene.scene import Scene
+
+MARKER = "t_max"
+
+
+@dataclass(frozen=True)
+class Times:
+    """The times of a loaded scene and their frames.
+
+    Attributes:
+        t_start: First observed time.
+        t_max: Last observed time.
+        t_end: End of the extrapolated keys.
+        frames_per_unit: Frames per unit of scene time.
+        frame_zero: Frame at which the scene time is 0.
+    """
+
+    t_start: float
+    t_max: float
+    t_end: float
+    frames_per_unit: float
+    frame_zero: float
+
+    @staticmethod
+    def of(scene: Scene, frame_zero: float = 1.0, t_end: float | None = None) -> "Times":
+        """The times of a scene; an end before t_max counts as t_max."""
+        start = float(scene.track_times[0])
+        end = default_end(scene) if t_end is None else max(float(t_end), scene.t_max)
+        return Times(start, float(scene.t_max), end, float(scene.frames_per_unit), float(frame_zero))
+
+    def frame(self, t: float) -> float:
+        """Frame of a scene time, with its fraction."""
+        return self.frame_zero + t * self.frames_per_unit
+
+    def time(self, frame: float) -> float:
+        """Scene time of a frame; inverse of `frame`."""
+        return (frame - self.frame_zero) / self.frames_per_unit
+
+
+def of_collection(collection: bpy.types.Collection) -> Times:
+    """The times of a loaded scene, from its properties."""
+    state = collection.r5dgs
+    return Times(state.t_start, state.t_max, state.t_end, state.frames_per_unit, state.frame_zero)
+
+
+def default_end(scene: Scene) -> float:
+    """How far motion is extrapolated unless the user says otherwise: a third of the observed span, and at least to 1."""
+    start = float(scene.track_times[0])
+    return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
+
+
+def fit(scene: bpy.types.Scene, times: Times) -> None:
+    """Set a Blender scene's frame range to the scene's times and mark t_max."""
+    scene.frame_start = max(math.floor(times.frame(times.t_start) + 1e-6), 0)
+    scene.frame_end = max(math.ceil(times.frame(times.t_end) - 1e-6), scene.frame_start)
+    frame = round(times.frame(times.t_max))
+    if not any(marker.name == MARKER and marker.frame == frame for marker in scene.timeline_markers):
+        scene.timeline_markers.new(MARKER, frame=frame)

@@ -1,0 +1,63 @@
+"""Blender for the add-on's tests: the extension loaded once as package `r5dgs`, factory settings around each test."""
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+CORE = "r5dgs.r5dgs_core"
+
+
+class _OneCore(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Resolves `r5dgs.r5dgs_core.x` to the one `r5dgs_core.x`, so that classes are the same on both sides."""
+
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname == CORE or fullname.startswith(CORE + "."):
+            return importlib.machinery.ModuleSpec(fullname, self)
+        return None
+
+    def create_module(self, spec):
+        module = importlib.import_module(spec.name.removeprefix("r5dgs."))
+        self._own_spec = module.__spec__
+        return module
+
+    def exec_module(self, module):
+        module.__spec__ = self._own_spec  # importlib has put the alias's there
+
+
+def load_extension():
+    """The repository root as package `r5dgs`, loaded once."""
+    if "r5dgs" not in sys.modules:
+        sys.meta_path.insert(0, _OneCore())
+        spec = importlib.util.spec_from_file_location(
+            "r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
+        )
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["r5dgs"] = module
+        spec.loader.exec_module(module)
+    return sys.modules["r5dgs"]
+
+
+@pytest.fixture(scope="session")
+def extension():
+    """The extension, registered for the whole session."""
+    pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+    module = load_extension()
+    module.register()
+    yield module
+    module.unregister()
+
+
+@pytest.fixture(autouse=True)
+def blender(extension):
+    """`bpy` with factory settings."""
+    import bpy
+
+    bpy.ops.wm.read_homefile(app_template="")
+    return bpy
