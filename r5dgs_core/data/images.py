@@ -59,7 +59,7 @@ def read_raw(path: Path) -> np.ndarray:
     name = str(spec.format)
     kind = oiio.UINT8 if name == "uint8" else oiio.UINT16 if name == "uint16" else oiio.FLOAT
     pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
-    problem = source.geterror()
+    problem = " ".join(source.geterror().split())
     source.close()
     if pixels is None or problem:
         raise errors.DatasetError(f"{path}: the image cannot be decoded ({problem or 'no pixels'}); is it truncated?")

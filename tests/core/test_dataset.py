@@ -1,0 +1,388 @@
+"""Reading data sets: both layouts, every hint that files give, and one clear error for each fault."""
+
+import dataclasses
+import json
+import math
+import shutil
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from r5dgs_core import errors
+from r5dgs_core.data import dataset, images
+from r5dgs_core.scene import cameras
+
+WIDTH, HEIGHT = 12, 8
+ANGLE = 0.8
+
+
+def camera_matrix(angle: float) -> list[list[float]]:
+    """Camera to world with OpenGL axes, on a circle about the origin, looking at it."""
+    back = np.array([math.cos(angle), math.sin(angle), 0.0])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([np.cross([0, 0, 1], back), [0, 0, 1], back], axis=-1)
+    matrix[:3, 3] = 3 * back
+    return matrix.tolist()
+
+
+def write_image(root, file_path: str, channels: int = 3, value: int = 100) -> None:
+    images.write_png(root / f"{file_path}.png", np.full((HEIGHT, WIDTH, channels), value, np.uint8))
+
+
+def write_json(path, content) -> None:
+    path.write_text(json.dumps(content))
+
+
+def write_flat(root, **extra) -> dict[str, dict]:
+    """Two observed cameras at three times, a novel one in val, one later time in test; returns the camera files."""
+    files = {}
+    plan = {
+        "train": [(k, t) for t in (0.0, 0.25, 0.5) for k in (0, 1)],
+        "val": [(2, 0.25)],
+        "test": [(0, 1.0), (2, 1.0)],
+    }
+    for split, views in plan.items():
+        frames = []
+        for i, (k, t) in enumerate(views):
+            frames.append({"file_path": f"./{split}/r_{i:03d}", "time": t, "transform_matrix": camera_matrix(0.7 * k)})
+            write_image(root, f"{split}/r_{i:03d}", value=10 * i + 5)
+            ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+            ids[2:4, i : i + 3] = 1 + i % 2
+            images.write_png(root / "object_mask" / split / f"r_{i:03d}.png", ids)
+        files[split] = {"camera_angle_x": ANGLE, "frames": frames, **extra}
+        write_json(root / f"transforms_{split}.json", files[split])
+    write_json(root / "objects.json", {"1": "mug", "2": {"name": "red apple", "aliases": ["fruit"]}})
+    return files
+
+
+@pytest.fixture
+def flat(tmp_path):
+    write_flat(tmp_path)
+    return tmp_path
+
+
+def change(root, edit, split: str = "train"):
+    """Change one camera file in place."""
+    path = root / f"transforms_{split}.json"
+    content = json.loads(path.read_text())
+    edit(content)
+    write_json(path, content)
+
+
+def test_the_flat_layout_is_read(flat):
+    data = dataset.read(flat)
+    assert [len(data.train), len(data.val), len(data.test)] == [6, 1, 2]
+    view = data.train[3]
+    assert (view.name, view.t, view.split) == ("train/r_003", 0.25, "train")
+    np.testing.assert_allclose(cameras.cam_world_to_opengl(view.camera.T_cam_world), camera_matrix(0.7), atol=1e-12)
+    assert view.camera.intrinsics[0, 0] == pytest.approx(0.5 * WIDTH / math.tan(0.5 * ANGLE))
+    assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
+    assert data.object_names == {1: "mug", 2: "red apple"}
+    assert data.object_aliases == {2: ("fruit",)}
+    np.testing.assert_array_equal(data.times, [0.0, 0.25, 0.5])
+    assert (data.t_max, data.frames_per_unit, data.world_convention) == (0.5, 60.0, "blender")
+    assert data.ground_truth is None and not data.has_alpha
+
+
+def test_views_of_one_camera_share_its_name_across_splits(flat):
+    data = dataset.read(flat)
+    assert [view.camera.name for view in data.train] == ["cam0", "cam1"] * 3
+    assert [view.camera.name for view in data.test] == ["cam0", "cam2"]
+    assert [camera.name for camera in data.cameras] == ["cam0", "cam1", "cam2"]
+
+
+def test_named_cameras_keep_their_name_and_moving_ones_are_told_apart(flat):
+    def edit(content):
+        for i, frame in enumerate(content["frames"]):
+            frame["view"] = "left" if i % 2 == 0 else "walk"
+            if i == 5:
+                frame["transform_matrix"] = camera_matrix(2.0)
+
+    change(flat, edit)
+    data = dataset.read(flat)
+    assert [view.camera.name for view in data.train] == ["left", "walk", "left", "walk", "left", "walk@1"]
+
+
+def test_the_nested_layout_gives_the_same_views(flat, tmp_path_factory):
+    root = tmp_path_factory.mktemp("nested")
+    shutil.copytree(flat, root, dirs_exist_ok=True)
+    for split in dataset.SPLITS:
+        content = json.loads((root / f"transforms_{split}.json").read_text())
+        parts = {}
+        for frame in content["frames"]:
+            key = json.dumps(frame["transform_matrix"])
+            part = parts.setdefault(key, {"transform_matrix": frame["transform_matrix"], "frames": []})
+            part["frames"].append({"file_path": frame["file_path"], "time": frame["time"]})
+        nested = {f"camera{i}": part for i, part in enumerate(parts.values())}
+        write_json(root / f"transforms_{split}.json", {"camera_angle_x": ANGLE, "data": nested})
+    a, b = dataset.read(flat), dataset.read(root)
+    for split in dataset.SPLITS:
+        nested = {view.name: view for view in b.views(split)}
+        assert set(nested) == {view.name for view in a.views(split)}
+        for view in a.views(split):
+            assert nested[view.name].t == view.t
+            np.testing.assert_array_equal(nested[view.name].camera.T_cam_world, view.camera.T_cam_world)
+            np.testing.assert_array_equal(nested[view.name].camera.intrinsics, view.camera.intrinsics)
+    assert b.train[0].camera.name == "camera0"
+
+
+def test_missing_times_are_spread_evenly(flat):
+    change(flat, lambda content: [frame.pop("time") for frame in content["frames"]])
+    np.testing.assert_allclose([view.t for view in dataset.read(flat).train], np.arange(6) / 5)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "given"), [(".png", True), (".PNG", True), (".jpg", True), (".jpg", False), (".exr", False)]
+)
+def test_images_are_found_by_any_suffix_given_or_not(flat, suffix, given):
+    source = flat / "train" / "r_000.png"
+    target = source.with_suffix(suffix)
+    if suffix.lower() == ".png":
+        source.rename(target)
+    else:
+        import OpenImageIO as oiio
+
+        oiio.ImageBuf(str(source)).write(str(target))
+        source.unlink()
+    change(flat, lambda content: content["frames"][0].update(file_path=f"train/r_000{suffix if given else ''}"))
+    view = dataset.read(flat).train[0]
+    assert view.name == "train/r_000"
+    assert view.mask_path is not None
+    assert dataset.load_image(view).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_intrinsics_of_the_file_win_and_follow_the_size_of_the_image(flat):
+    lens = {"fl_x": 40.0, "fl_y": 44.0, "cx": 11.0, "cy": 9.0, "w": 2 * WIDTH, "h": 2 * HEIGHT}
+    change(flat, lambda content: content.update(lens))
+    k = dataset.read(flat).train[0].camera.intrinsics
+    np.testing.assert_allclose(k, [[20.0, 0, 5.5], [0, 22.0, 4.5], [0, 0, 1]])
+
+
+def test_one_frame_may_have_its_own_lens(flat):
+    change(flat, lambda content: content["frames"][2].update(camera_angle_x=1.1))
+    views = dataset.read(flat).train
+    assert views[2].camera.intrinsics[0, 0] == pytest.approx(0.5 * WIDTH / math.tan(0.55))
+    assert views[2].camera.name != views[0].camera.name
+
+
+@hypothesis.given(st.floats(0.01, 20.0), st.floats(0, 2 * math.pi))
+def test_a_uniform_scale_of_the_camera_matrix_is_removed(scale, angle):
+    from r5dgs_core.data import transforms
+
+    matrix = np.array(camera_matrix(angle))
+    scaled = matrix.copy()
+    scaled[:3, :3] *= scale
+    checked = transforms.rigid_matrix("here", scaled.tolist())
+    expected = cameras.opengl_to_cam_world(matrix)
+    np.testing.assert_allclose(cameras.opengl_to_cam_world(checked), expected, atol=1e-9)
+
+
+def test_absent_splits_are_empty(flat):
+    (flat / "transforms_val.json").unlink()
+    (flat / "transforms_test.json").unlink()
+    data = dataset.read(flat)
+    assert data.val == data.test == ()
+    assert dataset.load_split(data, "val")[0].shape[0] == 0
+
+
+def test_masks_are_optional_view_by_view(flat):
+    (flat / "object_mask" / "train" / "r_001.png").unlink()
+    data = dataset.read(flat)
+    assert dataset.load_mask(data.train[1]) is None
+    colors, ids = dataset.load_split(data, "train")
+    assert colors.shape == (6, HEIGHT, WIDTH, 3) and colors.dtype == np.uint8
+    assert (ids[1] == -1).all() and set(np.unique(ids[0])) == {0, 1}
+    shutil.rmtree(flat / "object_mask")
+    assert all(view.mask_path is None for view in dataset.read(flat).train)
+
+
+def test_masks_of_another_size_are_brought_to_the_image(flat):
+    small = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    images.write_png(flat / "object_mask" / "train" / "r_000.png", small)
+    ids = dataset.load_mask(dataset.read(flat).train[0])
+    np.testing.assert_array_equal(ids, np.repeat(np.repeat(small, 4, 0), 4, 1))
+
+
+def test_masks_coded_by_colour_agree_between_splits(flat):
+    for split, color in (("train", (0, 0, 9)), ("test", (0, 0, 5))):
+        pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        pixels[0, 0] = (0, 0, 9)
+        pixels[0, 1] = color
+        images.write_png(flat / "object_mask" / split / "r_000.png", pixels)
+    data = dataset.read(flat)
+    assert dataset.load_mask(data.train[0])[0, :2].tolist() == [2, 2]
+    assert dataset.load_mask(data.test[0])[0, :2].tolist() == [2, 1]
+
+
+def test_transparent_pixels_show_the_background(flat):
+    pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    pixels[..., 0], pixels[..., 3] = 200, 51
+    images.write_png(flat / "train" / "r_000.png", pixels)
+    data = dataset.read(flat)
+    assert data.has_alpha
+    np.testing.assert_allclose(dataset.load_rgba(data.train[0])[0, 0], np.array([200, 0, 0, 51]) / 255, atol=1e-6)
+    white = dataset.load_image(data.train[0])
+    np.testing.assert_allclose(white[0, 0], 0.2 * np.array([200 / 255, 0, 0]) + 0.8, atol=1e-6)
+    black = dataset.load_image(data.train[0], np.zeros(3))
+    np.testing.assert_allclose(black[0, 0], [0.2 * 200 / 255, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hints", "expected"),
+    [
+        ({"frames_per_unit": 24}, 24.0),
+        ({"fps": 30, "duration": 4.0}, 120.0),
+        ({"fps": 30}, 60.0),
+        ({}, 60.0),
+    ],
+)
+def test_frames_per_unit_follows_the_hints(tmp_path, hints, expected):
+    write_flat(tmp_path, **hints)
+    assert dataset.read(tmp_path).frames_per_unit == expected
+
+
+def test_frames_per_unit_follows_frame_numbers(flat):
+    for split in dataset.SPLITS:
+        change(
+            flat,
+            lambda content: [frame.update(frame=int(80 * frame["time"]) + 1) for frame in content["frames"]],
+            split,
+        )
+    assert dataset.read(flat).frames_per_unit == pytest.approx(80.0)
+
+
+def test_the_digest_changes_with_cameras_and_images_only(flat):
+    before = dataset.read(flat).digest
+    assert dataset.read(flat).digest == before
+    write_image(flat, "train/r_000", value=6)
+    after_image = dataset.read(flat).digest
+    change(flat, lambda content: content["frames"][0].update(time=0.01))
+    assert len({before, after_image, dataset.read(flat).digest}) == 3
+
+
+def ground_truth(times=(0.0, 0.25, 0.5, 1.0)) -> dict:
+    matrices = [camera_matrix(t) for t in times]
+    return {"t_max": 0.5, "times": list(times), "objects": [{"id": 3, "name": "car", "matrices": matrices}]}
+
+
+def test_true_poses_are_read_and_name_their_objects(flat):
+    write_json(flat / "ground_truth.json", ground_truth())
+    data = dataset.read(flat)
+    assert data.ground_truth.matrices.shape == (1, 4, 4, 4)
+    assert data.ground_truth.object_ids == (3,) and data.object_names[3] == "car"
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda content: content.pop("times"),
+        lambda content: content["objects"][0]["matrices"].pop(),
+        lambda content: content["objects"][0].update(id="three"),
+        lambda content: content.update(times=[0.0, 0.5, 0.25, 1.0]),
+        lambda content: content.update(objects=content["objects"] * 2),
+        lambda content: content["objects"][0]["matrices"][1][0].__setitem__(0, math.nan),
+    ],
+)
+def test_faulty_true_poses_are_one_clear_error(flat, edit):
+    content = ground_truth()
+    edit(content)
+    write_json(flat / "ground_truth.json", content)
+    with pytest.raises(errors.DatasetError, match=r"ground_truth\.json: "):
+        dataset.read(flat)
+
+
+def mirrored(frame):
+    frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1, 1, 1])).tolist()
+
+
+def sheared(frame):
+    frame["transform_matrix"][0][1] += 0.3
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda frame: frame.pop("file_path"), "frame 2: expected an object with a 'file_path'"),
+        (lambda frame: frame.update(file_path="train/gone"), r"frame 2 \(train/gone\): the image is missing"),
+        (lambda frame: frame.update(file_path="train/r_001"), r"frame 2 .*listed twice"),
+        (lambda frame: frame.pop("time"), "frame 2 has no 'time'"),
+        (lambda frame: frame.update(time="noon"), "frame 2 .*'time' must be a finite number, found 'noon'"),
+        (lambda frame: frame.update(time=math.nan), "frame 2 .*'time' must be a finite number"),
+        (lambda frame: frame.pop("transform_matrix"), "frame 2 .*'transform_matrix' is missing"),
+        (lambda frame: frame.update(transform_matrix=[[1, 2], [3]]), "frame 2 .*4x4"),
+        (lambda frame: frame["transform_matrix"][0].__setitem__(0, math.nan), "frame 2 .*NaN"),
+        (lambda frame: frame.update(transform_matrix=np.zeros((4, 4)).tolist()), "frame 2 .*not a rigid"),
+        (sheared, "frame 2 .*not rigid"),
+        (mirrored, "frame 2 .*mirrors"),
+        (lambda frame: frame.update(camera_angle_x=4.0), "frame 2 .*radians"),
+        (lambda frame: frame.update(k1=0.1), "frame 2 .*distortion"),
+        (lambda frame: frame.update(w=100, h=20, fl_x=50), "frame 2 .*the image is 12x8, 'w' and 'h' say 100x20"),
+        (lambda frame: frame.update(fl_x=-3.0), "frame 2 .*positive"),
+    ],
+)
+def test_a_faulty_frame_is_one_clear_error(flat, edit, message):
+    change(flat, lambda content: edit(content["frames"][2]))
+    with pytest.raises(errors.DatasetError, match=rf"transforms_train\.json.*{message}"):
+        dataset.read(flat)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"frames": [', "line 1, column"),
+        ("[]", "expected a JSON object"),
+        ('{"camera_angle_x": 1}', "expected 'frames'"),
+        ('{"frames": []}', "at least one frame"),
+        ('{"data": {"a": {}}}', r"data\['a'\]"),
+    ],
+)
+def test_a_faulty_camera_file_is_one_clear_error(flat, content, message):
+    (flat / "transforms_train.json").write_text(content)
+    with pytest.raises(errors.DatasetError, match=rf"transforms_train\.json.*{message}"):
+        dataset.read(flat)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "expected an object"),
+        ({"mug": "1"}, "object ids as keys"),
+        ({"1": {"label": "mug"}}, "expected a name"),
+        ({"1": "mug", "2": "mug"}, "used twice"),
+    ],
+)
+def test_faulty_object_names_are_one_clear_error(flat, content, message):
+    write_json(flat / "objects.json", content)
+    with pytest.raises(errors.DatasetError, match=rf"objects\.json: .*{message}"):
+        dataset.read(flat)
+
+
+def test_a_folder_that_is_no_data_set_is_told_apart(tmp_path):
+    with pytest.raises(errors.DatasetError, match="found nothing"):
+        dataset.read(tmp_path / "nowhere")
+    with pytest.raises(errors.DatasetError, match=r"transforms_train\.json: the file is missing"):
+        dataset.read(tmp_path)
+    write_json(tmp_path / "transforms.json", {})
+    with pytest.raises(errors.DatasetError, match=r"split transforms\.json"):
+        dataset.read(tmp_path)
+
+
+def test_images_of_different_sizes_cannot_be_stacked(flat):
+    images.write_png(flat / "train" / "r_004.png", np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint8))
+    data = dataset.read(flat)
+    with pytest.raises(errors.DatasetError, match=r"r_004\.png: 24x8, but r_000\.png is 12x8"):
+        dataset.load_split(data, "train")
+
+
+def test_an_image_that_changed_since_reading_is_noticed(flat):
+    data = dataset.read(flat)
+    images.write_png(flat / "train" / "r_000.png", np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(errors.DatasetError, match="the image changed"):
+        dataset.load_image(data.train[0])
+
+
+def test_a_data_set_cannot_be_changed_in_place(flat):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        dataset.read(flat).name = "other"
