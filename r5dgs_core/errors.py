@@ -27,3 +27,7 @@ class BackendError(R5dgsError):
 
 class TrainingError(R5dgsError):
     """Training cannot go on."""
+
+
+class Interrupted(R5dgsError):
+    """The user or the system asked to stop; what was done is kept, and the message says how to go on."""

@@ -1,0 +1,190 @@
+"""The ``r5dgs`` command: demo, train, bake, evaluate, info.
+
+Each sub-command is a function ``run_<name>`` that does the work and can be called without the command line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from . import __version__, errors
+
+
+def run_train(
+    data: Path, out: Path, *, config_path: Path | None, overrides: list[str], resume: bool, progress_kind: str
+) -> None:
+    """Train a run folder from a data set (see `train.run.train`)."""
+    from .progress import make
+    from .train import config, run
+
+    if resume and (config_path or overrides) and (out / "run.json").exists():
+        raise errors.ConfigError("--resume goes on with the run's own configuration; leave out --config and --set")
+    settings = config.load(config_path, overrides)
+    with make(progress_kind) as progress:
+        run.train(data, out, settings, resume=resume, progress=progress)
+
+
+def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
+    """Turn a run into a scene file (see `train.bake.run_bake`)."""
+    from .train import bake
+
+    scene = bake.run_bake(run_folder, out, data)
+    print(f"{out}: {len(scene.means)} Gaussians, {sum(o.id > 0 for o in scene.objects)} objects, t_max {scene.t_max:g}")
+
+
+def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path: Path | None) -> dict[str, Any]:
+    """Measure a run or scene file on its data set's held-out views; writes ``evaluation.json`` beside it.
+
+    Args:
+        target: A run folder, or a `.r5dgs` file.
+        data: The data set; by default the one a run was trained on.
+        modes: Playback modes.
+        json_path: Where the result goes instead.
+
+    Returns:
+        The evaluation, in the shape of ``evaluation.json``.
+    """
+    from rich.console import Console
+
+    from .data import dataset as datasets
+    from .report import evaluate, table
+    from .scene import scene_file
+    from .train import bake, checkpoint
+
+    if target.is_dir():
+        run = checkpoint.open_run(target)
+        dataset = datasets.read(data if data is not None else run.dataset_root)
+        scene = bake.bake(run, dataset)
+        default = target / "evaluation.json"
+    else:
+        scene = scene_file.read(target)
+        if data is None:
+            raise errors.DatasetError(
+                f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR"
+            )
+        dataset = datasets.read(data)
+        default = target.with_suffix(".evaluation.json")
+    result = evaluate.evaluate(scene, dataset, modes=modes, train=scene.provenance.get("train"))
+    path = json_path or default
+    checkpoint.write_atomic(path, json.dumps(result, indent=2).encode())
+    Console().print(table.make(result))
+    print(f"written: {path}")
+    return result
+
+
+def run_info(path: Path, *, as_json: bool) -> None:
+    """Say what is in a scene file."""
+    from .scene import scene_file
+
+    found = scene_file.info(scene_file.read(path))
+    if as_json:
+        print(json.dumps(found, indent=2))
+        return
+    for key, value in found.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            print(f"{key}:")
+            for row in value:
+                print(
+                    "  "
+                    + "  ".join(f"{name}={_short(item)}" for name, item in row.items() if item not in ("", [], None))
+                )
+        else:
+            print(f"{key}: {_short(value)}")
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(prog="r5dgs", description="Semantic 4D Gaussians: train, bake, evaluate.")
+    top.add_argument("--version", action="version", version=f"r5dgs {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add_training(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
+        p.add_argument(
+            "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key; may be repeated"
+        )
+        p.add_argument("--progress", choices=("auto", "json", "none"), default="auto", help="how progress is shown")
+
+    demo = commands.add_parser("demo", help="train, bake and measure the bundled data set")
+    demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="run folder (default: demo)")
+    demo.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    add_training(demo)
+
+    train = commands.add_parser("train", help="train a data set into a run folder")
+    train.add_argument("data", type=Path, help="data set folder with transforms_train.json")
+    train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
+    train.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    add_training(train)
+
+    bake = commands.add_parser("bake", help="turn a run into a scene file")
+    bake.add_argument("run", type=Path, help="run folder")
+    bake.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
+    bake.add_argument("--data", type=Path, metavar="DIR", help="data set, where it has moved")
+
+    evaluate = commands.add_parser("evaluate", help="measure a run or scene on held-out views")
+    evaluate.add_argument("target", type=Path, help="run folder or .r5dgs file")
+    evaluate.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
+    evaluate.add_argument("--mode", action="append", metavar="MODE", help="playback mode; may be repeated")
+    evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
+
+    info = commands.add_parser("info", help="say what is in a scene file")
+    info.add_argument("file", type=Path, help=".r5dgs file")
+    info.add_argument("--json", action="store_true", help="as JSON")
+    return top
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status (0, 1 for an error that the user can act on, 130 when stopped)."""
+    args = parser().parse_args(arguments)
+    try:
+        _dispatch(args)
+    except errors.Interrupted as stop:
+        print(f"r5dgs: {stop}", file=sys.stderr)
+        return 130
+    except errors.R5dgsError as error:
+        print(f"r5dgs: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("r5dgs: stopped", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _dispatch(args: argparse.Namespace) -> None:
+    if args.command == "demo":
+        from .demo import run_demo
+
+        run_demo(
+            args.out,
+            config_path=args.config,
+            overrides=args.set,
+            resume=args.resume,
+            progress_kind=args.progress,
+        )
+    elif args.command == "train":
+        run_train(
+            args.data,
+            args.out,
+            config_path=args.config,
+            overrides=args.set,
+            resume=args.resume,
+            progress_kind=args.progress,
+        )
+    elif args.command == "bake":
+        run_bake(args.run, args.out, args.data)
+    elif args.command == "evaluate":
+        run_evaluate(args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json)
+    else:
+        run_info(args.file, as_json=args.json)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

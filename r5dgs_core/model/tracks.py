@@ -1,0 +1,148 @@
+"""Tracks: one SE(3) motion per body, as knots at the observed times.
+
+Notation: G motion groups, S knots. Group g moves a canonical point x to c_g + R_g(t) (x - c_g) + d_g(t) with a fixed
+centre c_g. Group 0 is pinned. A shadow group takes d = A d_caster with A = I - n n^T + s n^T (n the normal of the
+support plane, s the learned slope along it) and does not turn.
+
+A knot's rotation is exp(rotvec) * base: ``rotvecs`` is what the optimizer moves, ``base_quats`` absorbs it from time
+to time (`rebase`), so that an object may turn by any angle and the exponential stays far from its singularity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..motion import rotations
+
+
+@dataclass(frozen=True)
+class GroupPoses:
+    """Poses of all groups at one time: unit quats [G, 4], their matrices [G, 3, 3], displacements [G, 3]."""
+
+    quats: Tensor
+    rotmats: Tensor
+    displacements: Tensor
+
+
+class Tracks:
+    """Poses of the bodies at the knots, and of the shadows that follow them.
+
+    Args:
+        times: Knots, increasing. [S]
+        centers: Fixed centres of the bodies, row 0 for the pinned group. [B, 3]
+        translations: Displacements at the knots. [B, S, 3]
+        base_quats: Rotations at the knots, unit wxyz. [B, S, 4]
+        casters: Body that each shadow group follows; shadow groups are numbered from B on. [W]
+        plane_normal: Unit normal of the support plane, or None without shadows. [3]
+    """
+
+    def __init__(
+        self,
+        times: np.ndarray,
+        centers: Tensor,
+        translations: Tensor,
+        base_quats: Tensor,
+        casters: Tensor | None = None,
+        plane_normal: Tensor | None = None,
+    ):
+        self.times = np.asarray(times, np.float64)
+        self.centers = centers
+        self.base_quats = base_quats
+        self.casters = casters if casters is not None else torch.zeros(0, dtype=torch.int64)
+        self.plane_normal = plane_normal if plane_normal is not None else torch.tensor([0.0, 0.0, 1.0])
+        self.params: dict[str, Tensor] = {
+            "translations": translations.detach().requires_grad_(True),
+            "rotvecs": torch.zeros_like(translations).requires_grad_(True),
+            "slope": torch.zeros(3).requires_grad_(True),
+        }
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies, the pinned group included."""
+        return len(self.centers)
+
+    @property
+    def groups(self) -> int:
+        """Number of motion groups, shadows included."""
+        return self.bodies + len(self.casters)
+
+    def group_centers(self) -> Tensor:
+        """Centres of all groups; a shadow's is its caster's. [G, 3]"""
+        return torch.cat([self.centers, self.centers[self.casters]])
+
+    def follow_matrix(self) -> Tensor:
+        """Linear map from a caster's displacement to its shadow's. [3, 3]"""
+        n = self.plane_normal
+        slope = self.params["slope"]
+        in_plane = slope - (slope @ n) * n
+        return torch.eye(3) - torch.outer(n, n) + torch.outer(in_plane, n)
+
+    def locate(self, t: float) -> tuple[int, int, float]:
+        """The knots around a time and the weight of the second: exact at a knot, held outside the range."""
+        upper = int(np.clip(np.searchsorted(self.times, t), 0, len(self.times) - 1))
+        lower = max(upper - 1, 0)
+        span = self.times[upper] - self.times[lower]
+        weight = float(np.clip((t - self.times[lower]) / span, 0.0, 1.0)) if span > 0 else 0.0
+        if weight > 1 - 1e-9:
+            return upper, upper, 0.0
+        return (lower, lower, 0.0) if weight < 1e-9 else (lower, upper, weight)
+
+    def poses(self, t: float) -> GroupPoses:
+        """Differentiable poses of all groups at a time (between knots: normalised linear interpolation)."""
+        lower, upper, weight = self.locate(t)
+        quats, displacements = self._knot(lower)
+        if weight > 0:
+            other_quats, other_displacements = self._knot(upper)
+            sign = torch.where((quats * other_quats).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+            mixed = (1 - weight) * quats + weight * sign * other_quats
+            quats = mixed / mixed.norm(dim=-1, keepdim=True)
+            displacements = (1 - weight) * displacements + weight * other_displacements
+        if len(self.casters):
+            followed = displacements[self.casters] @ self.follow_matrix().T
+            still = torch.zeros(len(self.casters), 4)
+            still[:, 0] = 1.0
+            quats = torch.cat([quats, still])
+            displacements = torch.cat([displacements, followed])
+        return GroupPoses(quats, rotations.quats_to_rotmats(quats), displacements)
+
+    def _knot(self, s: int) -> tuple[Tensor, Tensor]:
+        moving = torch.ones(self.bodies, 1)
+        moving[0] = 0.0
+        quats = rotations.multiply(
+            rotations.rotvecs_to_quats(self.params["rotvecs"][:, s] * moving), self.base_quats[:, s]
+        )
+        return quats, self.params["translations"][:, s] * moving
+
+    def knot_quats(self) -> Tensor:
+        """Rotations of the bodies at all knots. [B, S, 4]"""
+        return rotations.multiply(rotations.rotvecs_to_quats(self.params["rotvecs"]), self.base_quats)
+
+    @torch.no_grad()
+    def rebase(self) -> None:
+        """Fold the learned rotation vectors into the base and start them at zero again."""
+        self.base_quats = rotations.normalize(self.knot_quats()).detach()
+        self.params["rotvecs"].zero_()
+
+    def roughness(self) -> Tensor:
+        """Mean squared second difference of displacements and rotations over the knots (0 for steady motion).
+
+        Knots may be unevenly spaced: divided differences are scaled by the squared mean spacing, so that even spacing
+        gives plain second differences.
+        """
+        if len(self.times) < 3 or self.bodies < 2:
+            return torch.zeros(())
+        step = torch.from_numpy(np.diff(self.times)).float()[None, :, None]
+        quats = self.knot_quats()[1:]
+        turns = rotations.quats_to_rotvecs(rotations.multiply(quats[:, 1:], rotations.conjugate(quats[:, :-1])))
+        shifts = self.params["translations"][1:, 1:] - self.params["translations"][1:, :-1]
+        mean_step = step.mean()
+        total = torch.zeros(())
+        for change in (shifts, turns):
+            rate = change / step
+            second = 2 * (rate[:, 1:] - rate[:, :-1]) / (step[:, 1:] + step[:, :-1]) * mean_step**2
+            total = total + (second**2).mean()
+        return total

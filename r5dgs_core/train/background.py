@@ -1,0 +1,58 @@
+"""The learned sky: spherical harmonics over the world's viewing direction, behind everything.
+
+A constant sky is its first coefficient; a horizon gradient needs the next ones. Views with a fixed background colour
+(transparent images) use the first coefficient alone and do not train it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..model import spherical_harmonics
+from ..scene import cameras
+from ..scene.cameras import Camera
+
+DEGREE = 2
+
+
+class Background:
+    """Sky colour by viewing direction.
+
+    Args:
+        coefficients: Start values. [Kb, 3]
+        learned: Whether they are trained.
+    """
+
+    def __init__(self, coefficients: Tensor, learned: bool):
+        self.learned = learned
+        self.params: dict[str, Tensor] = {"background": coefficients.detach().requires_grad_(learned)}
+        self._bases: dict[bytes, Tensor] = {}
+
+    def image(self, camera: Camera) -> Tensor:
+        """Colours behind the pixels of a camera: [3] for a fixed colour, else [H, W, 3]."""
+        coefficients = self.params["background"]
+        if not self.learned:
+            return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
+        key = camera.T_cam_world[:3, :3].tobytes() + camera.intrinsics.tobytes() + bytes([len(coefficients)])
+        if key not in self._bases:
+            if len(self._bases) > 64:
+                self._bases.clear()
+            rays = cameras.pixel_rays(camera)
+            basis = spherical_harmonics.basis(rays.reshape(-1, 3), spherical_harmonics.degree_of(len(coefficients)))
+            self._bases[key] = torch.from_numpy(np.asarray(basis, np.float32))
+        shape = (camera.height, camera.width, 3)
+        return (self._bases[key] @ coefficients + 0.5).clamp(0, 1).reshape(shape)
+
+
+def fixed(color: np.ndarray) -> Background:
+    """A background of one colour that is not trained. [3]"""
+    return Background(torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
+
+
+def learned(color: np.ndarray) -> Background:
+    """A trained sky that starts at one colour. [3]"""
+    start = torch.zeros((DEGREE + 1) ** 2, 3)
+    start[0] = torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))
+    return Background(start, True)

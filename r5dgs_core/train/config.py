@@ -1,0 +1,281 @@
+"""The configuration of a run: dataclasses by section, read from TOML, changed by ``--set section.key=value``.
+
+Lengths in this file are relative: training runs in normalised coordinates in which the cameras stand about four units
+from what they look at (`normalization.py`), and iterations are for ``train.iterations`` = 6000 unless said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from ..errors import ConfigError
+
+REPRESENTATIONS = ("tracks",)
+BACKGROUNDS = ("auto", "learned", "white", "black")
+
+
+@dataclass(frozen=True)
+class TrainSection:
+    """What is trained and for how long.
+
+    Attributes:
+        iterations: Optimisation steps; one view each.
+        seed: Seed of all random draws.
+        representation: ``tracks`` (one SE(3) track per object).
+        background: ``learned`` sky, ``white`` or ``black``; ``auto`` is white where images carry alpha, else learned.
+        sh_degree: Degree of the view-dependent colour, 0 to 3.
+        threads: Threads of torch; the small arrays of this trainer gain nothing from more than one.
+        checkpoint_every: Steps between checkpoints.
+        log_every: Steps between log lines.
+        shading: Learn how colours change as objects turn in fixed light.
+        shadows: Learn shadow Gaussians that follow their caster on the plane that supports the objects.
+    """
+
+    iterations: int = 6000
+    seed: int = 0
+    representation: str = "tracks"
+    background: str = "auto"
+    sh_degree: int = 0
+    threads: int = 1
+    checkpoint_every: int = 500
+    log_every: int = 50
+    shading: bool = True
+    shadows: bool = True
+
+
+@dataclass(frozen=True)
+class InitSection:
+    """How Gaussians are placed before training.
+
+    Attributes:
+        object_points: Gaussians of each object.
+        background_points: Gaussians of the background.
+        shadow_points: Gaussians of each shadow.
+        sweep_depths: Depths tried per ray when the background is placed.
+        opacity: Initial opacity of bodies and background.
+        min_mask_pixels: Smaller masks do not vote on an object's place, as a share of the image.
+    """
+
+    object_points: int = 500
+    background_points: int = 5000
+    shadow_points: int = 60
+    sweep_depths: int = 96
+    opacity: float = 0.25
+    min_mask_pixels: float = 5e-4
+
+
+@dataclass(frozen=True)
+class RatesSection:
+    """Learning rates of Adam, in normalised units."""
+
+    means: float = 1e-3
+    log_scales: float = 1e-2
+    sh: float = 5e-3
+    sh_rest: float = 2.5e-4
+    opacity_logits: float = 0.05
+    quats: float = 2e-3
+    shading: float = 1e-2
+    light: float = 1e-2
+    translations: float = 3e-3
+    rotvecs: float = 6e-3
+    slope: float = 1e-2
+    background: float = 2e-3
+    decay: float = 0.02
+    decay_floor_appearance: float = 0.1
+    decay_from: float = 0.1
+
+
+@dataclass(frozen=True)
+class LossSection:
+    """Weights of the losses.
+
+    Attributes:
+        ssim: Share of 1 - SSIM in the photometric loss; the rest is L1.
+        roughness: Weight of the mean squared second difference of the tracks.
+    """
+
+    ssim: float = 0.2
+    roughness: float = 0.02
+
+
+@dataclass(frozen=True)
+class CurriculumSection:
+    """When observed times enter training, as steps.
+
+    Attributes:
+        first: Steps on the first time alone.
+        grow: Steps over which the other times enter, from the first one outwards.
+        newest: Share of draws on the newest times while they enter.
+    """
+
+    first: int = 200
+    grow: int = 400
+    newest: float = 0.4
+
+
+@dataclass(frozen=True)
+class DensifySection:
+    """When Gaussians are split, cloned and removed.
+
+    Attributes:
+        start: First step.
+        stop: Last step, as a share of the run.
+        every: Steps between two rounds.
+        share: Share of Gaussians that grow in a round, by mean screen gradient.
+        split_pixels: Larger ones (standard deviation in pixels) are split, smaller ones cloned.
+        max_gaussians: Cap; 0 chooses it from the image size (3/4 of an image's pixels, at most 60000).
+        prune_opacity: Fainter ones are removed.
+        prune_width: Wider ones are removed; standard deviation as a share of the image width.
+    """
+
+    start: int = 200
+    stop: float = 0.5
+    every: int = 100
+    share: float = 0.06
+    split_pixels: float = 1.0
+    max_gaussians: int = 0
+    prune_opacity: float = 0.01
+    prune_width: float = 0.16
+
+
+@dataclass(frozen=True)
+class IdentitySection:
+    """Identity encodings (Gaussian Grouping), trained on frozen geometry after the run.
+
+    Attributes:
+        iterations: Steps; 0 leaves encodings and classifier out.
+        dim: Length of an encoding.
+        rate: Learning rate of the encodings.
+        classifier_rate: Learning rate of the classifier.
+    """
+
+    iterations: int = 400
+    dim: int = 16
+    rate: float = 1e-2
+    classifier_rate: float = 5e-3
+
+
+@dataclass(frozen=True)
+class Config:
+    """All sections of a run's configuration."""
+
+    train: TrainSection = field(default_factory=TrainSection)
+    init: InitSection = field(default_factory=InitSection)
+    rates: RatesSection = field(default_factory=RatesSection)
+    losses: LossSection = field(default_factory=LossSection)
+    curriculum: CurriculumSection = field(default_factory=CurriculumSection)
+    densify: DensifySection = field(default_factory=DensifySection)
+    identity: IdentitySection = field(default_factory=IdentitySection)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionary, ready for JSON."""
+        return dataclasses.asdict(self)
+
+    def replace(self, **changes: Any) -> Config:
+        """A copy with some keys changed: ``replace(**{"train.iterations": 100})``."""
+        return from_dict(_merge(self.to_dict(), changes))
+
+
+def from_dict(values: dict[str, Any]) -> Config:
+    """Build a configuration from nested dictionaries; omitted keys keep their defaults.
+
+    Raises:
+        ConfigError: A section or key is unknown (the nearest name is suggested), or a value is of the wrong type.
+    """
+    sections = {f.name: f for f in dataclasses.fields(Config)}
+    hints = get_type_hints(Config)
+    built: dict[str, Any] = {}
+    for section, keys in values.items():
+        if section not in sections:
+            raise ConfigError(f"[{section}]: unknown section{_suggest(section, sections)}")
+        if not isinstance(keys, dict):
+            raise ConfigError(f"{section}: expected a section with keys, got {keys!r}")
+        kind = hints[section]
+        types = get_type_hints(kind)
+        known = {f.name for f in dataclasses.fields(kind)}
+        for key in keys:
+            if key not in known:
+                raise ConfigError(f"{section}.{key}: unknown key{_suggest(key, known)}")
+        built[section] = kind(**{key: _check(f"{section}.{key}", value, types[key]) for key, value in keys.items()})
+    config = Config(**built)
+    _validate(config)
+    return config
+
+
+def load(path: Path | None, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+    """Read a TOML file (or none) and apply ``section.key=value`` overrides, values written as in TOML.
+
+    Raises:
+        ConfigError: The file is missing or not TOML, or a key or value cannot be used.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise ConfigError(f"{path}: no such configuration file") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    return from_dict(_merge(values, dict(_parse_override(text) for text in overrides)))
+
+
+def _parse_override(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    if not separator or name.count(".") != 1:
+        raise ConfigError(f"--set {text}: expected SECTION.KEY=VALUE, for example losses.ssim=0.1")
+    try:
+        return name.strip(), tomllib.loads(f"x = {value}")["x"]
+    except tomllib.TOMLDecodeError:
+        return name.strip(), value.strip()
+
+
+def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    merged = json.loads(json.dumps(values))
+    for name, value in changes.items():
+        section, _, key = name.partition(".")
+        merged.setdefault(section, {})[key] = value
+    return merged
+
+
+def _suggest(name: str, known: Any) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(sorted(known))}"
+
+
+def _check(name: str, value: Any, kind: type) -> Any:
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ConfigError(f"{name}: expected {kind.__name__}, got {value!r}")
+    return value
+
+
+def _validate(config: Config) -> None:
+    train = config.train
+    rules = [
+        (train.iterations >= 1, "train.iterations", "at least 1", train.iterations),
+        (
+            train.representation in REPRESENTATIONS,
+            "train.representation",
+            " or ".join(REPRESENTATIONS),
+            train.representation,
+        ),
+        (train.background in BACKGROUNDS, "train.background", " or ".join(BACKGROUNDS), train.background),
+        (0 <= train.sh_degree <= 3, "train.sh_degree", "0 to 3", train.sh_degree),
+        (train.threads >= 1, "train.threads", "at least 1", train.threads),
+        (train.checkpoint_every >= 1, "train.checkpoint_every", "at least 1", train.checkpoint_every),
+        (train.log_every >= 1, "train.log_every", "at least 1", train.log_every),
+        (0 <= config.losses.ssim <= 1, "losses.ssim", "0 to 1", config.losses.ssim),
+        (0 < config.init.opacity < 1, "init.opacity", "between 0 and 1", config.init.opacity),
+        (config.densify.every >= 1, "densify.every", "at least 1", config.densify.every),
+        (config.identity.dim >= 2, "identity.dim", "at least 2", config.identity.dim),
+    ]
+    for good, name, expected, found in rules:
+        if not good:
+            raise ConfigError(f"{name}: expected {expected}, got {found!r}")

@@ -1,0 +1,83 @@
+"""Densification: Gaussians with large screen gradients are cloned or split, faint and oversized ones removed.
+
+The thresholds are relative: a fixed share grows in each round, and sizes are measured in pixels.
+
+Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2, with a fixed share instead of a gradient threshold and
+without opacity resets.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..model.gaussians import Gaussians
+from ..motion import rotations
+from .config import DensifySection
+
+
+class ScreenGradients:
+    """Running mean of the screen gradient of each Gaussian over the views that show it."""
+
+    def __init__(self, count: int):
+        self.total = torch.zeros(count)
+        self.views = torch.zeros(count)
+        self.pixel_sizes = torch.zeros(count)
+
+    def add(self, grad_norm: Tensor, visible: Tensor, radii: Tensor) -> None:
+        """Add one view: gradient norms [N], visibility [N], radii in pixels [N]."""
+        self.total += torch.where(visible, grad_norm, 0.0)
+        self.views += visible
+        self.pixel_sizes = torch.maximum(self.pixel_sizes, torch.where(visible, radii, 0.0))
+
+    def mean(self) -> Tensor:
+        """Mean screen gradient. [N]"""
+        return self.total / self.views.clamp(min=1)
+
+
+def densify(
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    gradients: ScreenGradients,
+    section: DensifySection,
+    cap: int,
+    pixel_size: float,
+    width_limit: float,
+    generator: torch.Generator,
+) -> None:
+    """One round: grow where the image asks for it, then prune.
+
+    Args:
+        gaussians: Changed in place, optimizer state included.
+        optimizer: The optimizer that holds their parameters.
+        gradients: Screen gradients since the last round.
+        section: Thresholds.
+        cap: Largest number of Gaussians.
+        pixel_size: Typical size of a pixel at the objects, normalised units.
+        width_limit: Standard deviation above which a Gaussian is removed, normalised units.
+        generator: Source of the draws.
+    """
+    n = len(gaussians)
+    room = cap - n
+    with torch.no_grad():
+        score = gradients.mean()
+        grow = int(min(section.share * n, room, int((score > 0).sum())))
+        remove = torch.zeros(n, dtype=torch.bool)
+        if grow > 0:
+            chosen = score.topk(grow).indices
+            big = gaussians.log_scales[chosen].exp().amax(1) > section.split_pixels * pixel_size
+            cloned, split = chosen[~big], chosen[big]
+            remove[split] = True
+            source = torch.cat([cloned, split, split])
+            new = {name: tensor[source].clone() for name, tensor in gaussians.params.items()}
+            first = len(cloned)
+            scales = new["log_scales"][first:].exp()
+            quats = rotations.normalize(new["quats"][first:])
+            noise = torch.randn(scales.shape, generator=generator) * scales
+            new["means"][first:] += rotations.rotate(quats, noise)
+            new["log_scales"][first:] -= torch.log(torch.tensor(1.6))
+            gaussians.extend(optimizer, new, gaussians.motion_ids[source])
+            remove = torch.cat([remove, torch.zeros(len(source), dtype=torch.bool)])
+        faint = torch.sigmoid(gaussians.opacity_logits) < section.prune_opacity
+        wide = gaussians.log_scales.exp().amax(1) > width_limit
+        gaussians.keep(optimizer, ~(remove | faint | wide))

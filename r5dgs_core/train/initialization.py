@@ -1,0 +1,212 @@
+"""The state that training starts from: Gaussians from hulls and the plane sweep, tracks from triangulated masks.
+
+Group numbering: 0 is the pinned background, 1..M the objects in the order of their ids, then one shadow per object.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from ..model import spherical_harmonics
+from ..model.gaussians import Gaussians
+from ..model.tracks import Tracks
+from . import hull, sweep, triangulation
+from .config import Config
+from .views import TrainView
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What training starts from.
+
+    Attributes:
+        gaussians: Canonical Gaussians; each body in its state at its reference time.
+        tracks: Tracks with triangulated translations and no rotation.
+        object_ids: Object id of each body; row 0 is the background. [B]
+        places: Where the masks put the objects.
+        first_time: Index of the time at which training begins.
+        plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
+    """
+
+    gaussians: Gaussians
+    tracks: Tracks
+    object_ids: np.ndarray
+    places: triangulation.Places
+    first_time: int
+    plane: tuple[np.ndarray, float] | None
+
+
+def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
+    """Knots of the tracks: the distinct observed times, or ``limit`` even ones where there are more."""
+    times = np.unique(np.round([v.t for v in views], 9))
+    return times if len(times) <= limit else np.linspace(times[0], times[-1], limit)
+
+
+def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) -> Start:
+    """Place Gaussians and tracks.
+
+    Args:
+        views: Training views in normalised coordinates.
+        config: Configuration of the run.
+        rng: Source of the draws.
+
+    Returns:
+        The start of the training.
+    """
+    init = config.init
+    times = observed_times(views)
+    places = triangulation.locate(views, times, init.min_mask_pixels)
+    first = _first_time(places, len(times))
+    bodies = len(places.object_ids) + 1
+    centers = np.zeros((bodies, 3))
+    translations = np.zeros((bodies, len(times), 3))
+    points, colors, labels = [], [], []
+    for row, object_id in enumerate(places.object_ids):
+        reference = _reference_time(places.visibility[row], places.measured[row], first)
+        centers[row + 1] = places.centers[row, reference]
+        translations[row + 1] = places.centers[row] - centers[row + 1]
+        then = [v for v in views if v.mask is not None and np.argmin(np.abs(times - v.t)) == reference]
+        where, shade = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], init.object_points, rng)
+        points.append(where)
+        colors.append(shade)
+        labels.append(np.full(len(where), row + 1))
+    scenes = sweep.backdrops(views)
+    search = sweep.Sweep(scenes, init.background_points, init.sweep_depths)
+    eyes = np.stack([v.camera.center for v in views])
+    plane = supporting_plane(search.distinct_points(), places, eyes, rng)
+    where, shade = search.points(init.background_points, plane, rng)
+    log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
+    opacities = [np.full(sum(map(len, points)) + len(where), init.opacity)]
+    scales = [_neighbour_scales(np.concatenate([*points, where]))] if points or len(where) else []
+    points.append(where)
+    colors.append(shade)
+    labels.append(np.zeros(len(where)))
+    casters = np.zeros(0, np.int64)
+    flat: list[np.ndarray] = [np.tile([1.0, 0, 0, 0], (len(opacities[0]), 1))]
+    if plane is not None and config.train.shadows and init.shadow_points > 0:
+        casters = np.arange(1, bodies)
+        normal, height = plane
+        for body in casters:
+            radius = places.radii[body - 1]
+            drop = centers[body] - (centers[body] @ normal - height) * normal
+            jitter = rng.normal(size=(init.shadow_points, 3)) * 0.6 * radius
+            lift = (0.02 + 0.01 * rng.random(init.shadow_points)) * 1.0
+            jitter += (lift - jitter @ normal)[:, None] * normal
+            points.append(drop + jitter)
+            colors.append(np.zeros((init.shadow_points, 3)))
+            labels.append(np.full(init.shadow_points, bodies + body - 1))
+            opacities.append(np.full(init.shadow_points, 0.03))
+            size = np.full((init.shadow_points, 3), 0.25 * radius)
+            size[:, 2] = 0.01
+            scales.append(np.log(size))
+            flat.append(np.tile(_quat_from_z(normal), (init.shadow_points, 1)))
+    everything = np.concatenate(points) if points else np.zeros((0, 3))
+    n = len(everything)
+    opacity = np.concatenate(opacities)
+    bases = (config.train.sh_degree + 1) ** 2
+    params = {
+        "means": everything,
+        "quats": np.concatenate(flat),
+        "log_scales": np.concatenate(scales) if scales else np.zeros((0, 3)),
+        "opacity_logits": np.log(opacity / (1 - opacity)),
+        "sh": spherical_harmonics.rgb_to_dc(np.concatenate(colors))[:, None, :],
+        "sh_rest": np.zeros((n, bases - 1, 3)),
+        "shading": np.zeros((n, 3)),
+    }
+    gaussians = Gaussians(
+        {name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in params.items()},
+        torch.from_numpy(np.concatenate(labels).astype(np.int64)),
+    )
+    base = torch.zeros(bodies, len(times), 4)
+    base[..., 0] = 1.0
+    tracks = Tracks(
+        times,
+        torch.from_numpy(centers.astype(np.float32)),
+        torch.from_numpy(translations.astype(np.float32)),
+        base,
+        torch.from_numpy(casters),
+        None if plane is None else torch.from_numpy(plane[0].astype(np.float32)),
+    )
+    return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane)
+
+
+def supporting_plane(
+    background: np.ndarray, places: triangulation.Places, eyes: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, float] | None:
+    """The plane that carries the objects: the one with most background points, objects and cameras on one side of it.
+
+    Args:
+        background: Background points. [P, 3]
+        places: Where the objects are.
+        eyes: Centres of the cameras. [V, 3]
+        rng: Source of the draws (RANSAC).
+
+    Returns:
+        Unit normal towards the cameras and offset h in n . x = h, or None where no plane holds a fifth of the points.
+    """
+    tolerance = 0.05
+    if len(background) < 50:
+        return None
+    inside = np.concatenate([places.centers[places.measured], eyes])
+    best: np.ndarray | None = None
+    for _ in range(500):
+        a, b, c = background[rng.choice(len(background), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-6:
+            continue
+        normal /= length
+        side = (inside - a) @ normal
+        if np.median(side) < 0:
+            normal, side = -normal, -side
+        if (side < -tolerance).mean() > 0.05:
+            continue
+        near = np.abs((background - a) @ normal) < tolerance
+        if best is None or near.sum() > best.sum():
+            best = near
+    if best is None or best.sum() < 0.2 * len(background):
+        return None
+    inliers = background[best]
+    middle = np.median(inliers, axis=0)
+    normal = np.linalg.svd(inliers - inliers.mean(0), full_matrices=False)[2][2]
+    normal = normal if np.median((inside - middle) @ normal) > 0 else -normal
+    return normal, float(np.median(inliers @ normal))
+
+
+def _first_time(places: triangulation.Places, count: int) -> int:
+    """The time at which most objects are well seen; of equal ones the middle one, so that drift is least."""
+    if len(places.object_ids) == 0:
+        return 0
+    total = np.where(places.measured, places.visibility, 0.0).sum(0)
+    good = np.flatnonzero(total >= 0.9 * total.max())
+    return int(good[np.argmin(np.abs(good - (count - 1) / 2))])
+
+
+def _reference_time(visibility: np.ndarray, measured: np.ndarray, first: int) -> int:
+    """The well-seen time of an object that is nearest to the first one."""
+    score = np.where(measured, visibility, 0.0)
+    good = np.flatnonzero(score >= 0.75 * score.max())
+    return int(good[np.argmin(np.abs(good - first))])
+
+
+def _neighbour_scales(points: np.ndarray) -> np.ndarray:
+    """Logarithm of the mean distance to the three nearest neighbours, bounded. [P, 3]"""
+    if len(points) < 4:
+        return np.full((len(points), 3), np.log(0.05))
+    distance, _ = cKDTree(points).query(points, k=4)
+    return np.repeat(np.log(np.clip(distance[:, 1:].mean(1), 0.005, 0.2))[:, None], 3, axis=1)
+
+
+def _quat_from_z(normal: np.ndarray) -> np.ndarray:
+    """Rotation that takes the z axis to ``normal``, wxyz."""
+    axis = np.cross([0.0, 0, 1], normal)
+    quat = np.array([1 + normal[2], *axis])
+    return np.array([0.0, 1, 0, 0]) if np.linalg.norm(quat) < 1e-6 else quat / np.linalg.norm(quat)

@@ -1,0 +1,71 @@
+"""What a scene does not need and therefore does not carry: the table of decisions, with the number behind each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..scene.scene import MotionGroup
+from .config import Config
+
+STILL = 0.0025  # displacement over the observed time, as a share of the group's diameter, below which it is static
+TURN = 0.002  # rotation in radians over the observed time below which a group only slides
+SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
+SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
+
+
+def decide(
+    groups: Sequence[MotionGroup],
+    track_poses: Sequence[np.ndarray],
+    motion_ids: np.ndarray,
+    shading: np.ndarray,
+    light: np.ndarray,
+    background_sh: np.ndarray,
+    bases: int,
+    config: Config,
+) -> tuple[dict[str, Any], ...]:
+    """The needs table of a baked scene.
+
+    Args:
+        groups: Motion groups.
+        track_poses: Their tracks relative to the bind state. G of [S, 7]
+        motion_ids: Group of each Gaussian. [N]
+        shading: Shading vectors in the bind state. [N, 3]
+        light: Light direction. [3]
+        background_sh: Sky coefficients that were kept. [Kb, 3]
+        bases: Spherical harmonics bases of the colours.
+        config: Configuration of the run.
+
+    Returns:
+        Rows with name, value, threshold, decision ("on" or "off") and reason.
+    """
+    bodies = [g for g in groups if g.role == "body"]
+    travel = [float(np.linalg.norm(track_poses[g.id][:, 4:], axis=1).max()) / (2 * g.model.radius) for g in bodies]
+    turns = [
+        float(2 * np.arcsin(np.clip(np.linalg.norm(track_poses[g.id][:, 1:4], axis=1).max(), 0, 1))) for g in bodies
+    ]
+    largest_travel, largest_turn = max(travel, default=0.0), max(turns, default=0.0)
+    moving = sum(a > STILL or b > TURN for a, b in zip(travel, turns, strict=True))
+    change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
+    shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
+    rows = [
+        ("tracks", largest_travel, STILL, moving > 0, f"{moving} of {len(bodies)} objects move or turn"),
+        ("rotation", largest_turn, TURN, largest_turn > TURN, "largest turn in the observed time, rad"),
+        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL and config.train.shading, "largest change of colour"),
+        ("shadows", shadow_members, 1, shadow_members > 0, "Gaussians that follow a caster on its support"),
+        ("view_dependent_colour", bases, 2, bases > 1, "spherical harmonics bases"),
+        ("sky_gradient", len(background_sh), 2, len(background_sh) > 1, "spherical harmonics bases of the sky"),
+        ("classifier", len(bodies), 1, len(bodies) > 0 and config.identity.iterations > 0, "objects with masks"),
+    ]
+    return tuple(
+        {
+            "name": name,
+            "value": float(value),
+            "threshold": float(threshold),
+            "decision": "on" if on else "off",
+            "reason": reason,
+        }
+        for name, value, threshold, on, reason in rows
+    )

@@ -1,0 +1,261 @@
+"""Initialisation of the static background: a plane sweep over what every camera sees behind the objects.
+
+Each camera's images are reduced to one picture without objects (median over time of the pixels that no mask covers).
+For a grid of its rays, a range of depths is tried; a depth is good where the other cameras see the same colour there.
+Rays on which infinity is as good as any depth show sky and place nothing: the learned background colour takes them.
+
+Notation: B backdrops, [h, w] a grid of rays, D depths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy import ndimage
+from scipy.spatial import Delaunay, cKDTree
+
+from ..scene import cameras
+from .views import TrainView
+
+MAX_BACKDROPS = 24
+MAX_NEIGHBOURS = 8
+NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
+INFINITE = 1e5
+SAME = 0.012  # colour difference that tells nothing
+GOOD = 0.12  # larger colour differences are no match
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """What one camera sees without the objects: image [H, W, 3] in [0, 1] and where it is known [H, W]."""
+
+    camera: cameras.Camera
+    image: np.ndarray
+    known: np.ndarray
+
+
+def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
+    """Median over time of the unmasked pixels, one per distinct camera."""
+    by_camera: dict[bytes, list[TrainView]] = {}
+    for view in views:
+        key = np.round(view.camera.T_cam_world, 5).tobytes() + np.round(view.camera.intrinsics, 3).tobytes()
+        by_camera.setdefault(key, []).append(view)
+    groups = list(by_camera.values())
+    if len(groups) > MAX_BACKDROPS:
+        groups = [groups[i] for i in np.linspace(0, len(groups) - 1, MAX_BACKDROPS).round().astype(int)]
+    result = []
+    for group in groups:
+        images = np.stack([v.image for v in group]).astype(np.float32) / 255
+        free = np.stack([_free(v) for v in group])
+        known = free.any(0)
+        images[~free] = np.nan
+        images[:, ~known] = 0.0
+        median = np.nanmedian(images, axis=0)
+        result.append(Backdrop(group[0].camera, median, known))
+    return result
+
+
+def _free(view: TrainView) -> np.ndarray:
+    free = np.ones(view.image.shape[:2], bool)
+    if view.mask is not None:
+        free &= ~ndimage.binary_dilation(view.mask > 0)
+    if view.alpha is not None:
+        free &= view.alpha > 127
+    return free
+
+
+@dataclass(frozen=True)
+class Rays:
+    """What the sweep found along the rays of one backdrop.
+
+    Attributes:
+        backdrop: Index of the backdrop.
+        directions: Ray directions scaled to depth 1, world. [h, w, 3]
+        colors: Colour of each ray. [h, w, 3]
+        depths: Best depth of each ray. [h, w]
+        costs: Its colour difference to the other cameras, infinite where nothing was comparable. [h, w]
+        flat: Whether most depths are about as good, as on sky and on plain surfaces. [h, w] bool
+        sky: Whether infinity is about as good. [h, w] bool
+        neighbours: Backdrops that it was compared with.
+    """
+
+    backdrop: int
+    directions: np.ndarray
+    colors: np.ndarray
+    depths: np.ndarray
+    costs: np.ndarray
+    flat: np.ndarray
+    sky: np.ndarray
+    neighbours: tuple[int, ...]
+
+
+class Sweep:
+    """A plane sweep over all backdrops.
+
+    Args:
+        scenes: Backdrops of the cameras.
+        count: Number of points that will be asked for; sets how many rays are tried.
+        depths: Depths tried per ray, evenly spaced in inverse depth.
+    """
+
+    def __init__(self, scenes: Sequence[Backdrop], count: int, depths: int):
+        self.scenes = scenes
+        self._images = [
+            torch.from_numpy(ndimage.gaussian_filter(b.image, (0.7, 0.7, 0))).permute(2, 0, 1)[None] for b in scenes
+        ]
+        self._known = [torch.from_numpy(b.known.astype(np.float32))[None, None] for b in scenes]
+        z = np.append(1 / np.linspace(1 / NEAREST, 1 / FARTHEST, depths), INFINITE)
+        each = max(256, 5 * count // max(1, len(scenes)))
+        self.rays = [r for i in range(len(scenes)) if (r := self._sweep(i, z, each)) is not None]
+
+    def _sweep(self, i: int, z: np.ndarray, rays_each: int) -> Rays | None:
+        reference = self.scenes[i]
+        centers = np.stack([b.camera.center for b in self.scenes])
+        ahead = np.stack([b.camera.forward for b in self.scenes]) @ reference.camera.forward
+        order = np.argsort(np.linalg.norm(centers - centers[i], axis=1) - 2 * ahead)
+        neighbours = tuple(int(j) for j in order if j != i and ahead[j] > -0.2)[:MAX_NEIGHBOURS]
+        if not neighbours:
+            return None
+        height, width = reference.image.shape[:2]
+        stride = max(1, int(np.sqrt(height * width / rays_each)))
+        rows, cols = np.meshgrid(
+            np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
+        )
+        directions = cameras.pixel_rays(reference.camera)[rows, cols]
+        directions = directions / (directions @ reference.camera.forward)[..., None]
+        colors = reference.image[rows, cols]
+        cost = _smooth(self._compare(i, directions[:, :, None] * z[:, None], colors, neighbours))
+        best, at = cost[..., :-1].min(-1)
+        low = cost <= best[..., None] + SAME
+        comparable = torch.isfinite(cost[..., :-1]).sum(-1)
+        flat = low[..., :-1].sum(-1) > 0.5 * comparable
+        known = reference.known[rows, cols]
+        costs = np.where(known, best.numpy(), np.inf)
+        return Rays(i, directions, colors, z[at.numpy()], costs, flat.numpy(), low[..., -1].numpy(), neighbours)
+
+    def _compare(self, i: int, offsets: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]) -> torch.Tensor:
+        world = torch.from_numpy(self.scenes[i].camera.center + offsets).float()
+        others = [(self.scenes[j].camera, self._images[j], self._known[j]) for j in neighbours]
+        return _cost(world, torch.from_numpy(colors), others)
+
+    def distinct_points(self) -> np.ndarray:
+        """Points on rays with one clear depth, for finding planes. [P, 3]"""
+        found = [
+            self.scenes[r.backdrop].camera.center + (r.directions * r.depths[..., None])[good]
+            for r in self.rays
+            if (good := (r.costs < GOOD) & ~r.flat & ~r.sky).any()
+        ]
+        return np.concatenate(found) if found else np.zeros((0, 3))
+
+    def points(
+        self, count: int, plane: tuple[np.ndarray, float] | None, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw background points.
+
+        Rays on which the supporting plane is as good as the best depth are placed on the plane, within the region in
+        which it was found. Of the others, those
+        with one clear depth are placed there, and those on which any depth will do are left to the sky.
+
+        Args:
+            count: Number of points wanted.
+            plane: Unit normal and offset of the supporting plane, or None.
+            rng: Source of the draws.
+
+        Returns:
+            Points [P, 3] and colours [P, 3] with P <= count; none where there is no parallax or nothing but sky.
+        """
+        points, colors, costs = [], [], []
+        on_support = _Support(self.distinct_points(), plane) if plane is not None else None
+        for r in self.rays:
+            depths, usable = r.depths.copy(), (r.costs < GOOD) & ~r.flat & ~r.sky
+            if plane is not None and on_support is not None:
+                on_plane, cost = self._on_plane(r, plane)
+                hits = self.scenes[r.backdrop].camera.center + r.directions * on_plane[..., None]
+                snapped = (cost <= np.minimum(r.costs + 2 * SAME, GOOD)) & np.isfinite(r.costs) & on_support(hits)
+                depths = np.where(snapped, on_plane, depths)
+                usable |= snapped
+            points.append(self.scenes[r.backdrop].camera.center + (r.directions * depths[..., None])[usable])
+            colors.append(r.colors[usable])
+            costs.append(r.costs[usable])
+        if not points or sum(map(len, points)) == 0:
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        everything, shades, badness = np.concatenate(points), np.concatenate(colors), np.concatenate(costs)
+        weights = 1 / (0.02 + badness)
+        chosen = rng.choice(len(everything), min(count, len(everything)), replace=False, p=weights / weights.sum())
+        return everything[chosen], shades[chosen]
+
+    def _on_plane(self, rays: Rays, plane: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Depth at which each ray meets a plane, and the colour difference there (infinite where it does not)."""
+        normal, height = plane
+        center = self.scenes[rays.backdrop].camera.center
+        slope = rays.directions @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (height - center @ normal) / slope
+        hits = np.isfinite(depth) & (depth > NEAREST) & (depth < FARTHEST)
+        depth = np.where(hits, depth, 1.0)
+        offsets = rays.directions[:, :, None] * depth[..., None, None]
+        cost = _smooth(self._compare(rays.backdrop, offsets, rays.colors, rays.neighbours))[..., 0].numpy()
+        return depth, np.where(hits, cost, np.inf)
+
+
+class _Support:
+    """The part of a plane that distinct points outline: their convex hull in the plane, stray ones left out."""
+
+    def __init__(self, points: np.ndarray, plane: tuple[np.ndarray, float]):
+        normal, height = plane
+        axis = np.eye(3)[np.argmin(np.abs(normal))]
+        u = np.cross(normal, axis)
+        self._axes = np.stack([u, np.cross(normal, u)]) / np.linalg.norm(u)
+        flat = points[np.abs(points @ normal - height) < 0.1] @ self._axes.T
+        if len(flat) > 4000:
+            flat = flat[:: len(flat) // 4000]
+        if len(flat) >= 10:
+            near = cKDTree(flat).query(flat, k=10)[0][:, -1]
+            flat = flat[near <= 3 * np.median(near)]
+        self._hull = Delaunay(flat) if len(flat) >= 10 else None
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [..., 3] near the plane lie in that part. [...]"""
+        if self._hull is None:
+            return np.zeros(points.shape[:-1], bool)
+        return self._hull.find_simplex(points @ self._axes.T) >= 0
+
+
+def _cost(world: torch.Tensor, color: torch.Tensor, others) -> torch.Tensor:
+    """Colour difference to the better half of the neighbours that see the point. [h, w, D]"""
+    gaps = []
+    for camera, image, known in others:
+        T = torch.from_numpy(camera.T_cam_world).float()
+        p_cam = world @ T[:3, :3].T + T[:3, 3]
+        depth = p_cam[..., 2]
+        k = camera.intrinsics
+        u = (k[0, 0] * p_cam[..., 0] / depth + k[0, 2]) / camera.width * 2 - 1
+        v = (k[1, 1] * p_cam[..., 1] / depth + k[1, 2]) / camera.height * 2 - 1
+        h, w, d = depth.shape
+        grid = torch.stack([u, v], -1).reshape(1, h, w * d, 2).clamp(-2, 2)
+        sample = F.grid_sample(image, grid, align_corners=False, padding_mode="border")[0].reshape(3, h, w, d)
+        free = F.grid_sample(known, grid, align_corners=False)[0, 0].reshape(h, w, d)
+        gap = (sample.permute(1, 2, 3, 0) - color[:, :, None]).abs().mean(-1)
+        seen = (depth > 1e-3) & (u.abs() < 1) & (v.abs() < 1) & (free > 0.5)
+        gaps.append(torch.where(seen, gap, torch.inf))
+    ranked = torch.stack(gaps).sort(0).values
+    seen = torch.isfinite(ranked)
+    counts = seen.sum(0)
+    half = torch.maximum((counts + 1) // 2, counts.clamp(max=2))
+    use = torch.arange(len(gaps))[:, None, None, None] < half
+    total = torch.where(use & seen, ranked, 0.0).sum(0) / half.clamp(min=1)
+    return torch.where(counts >= min(2, len(gaps)), total, torch.inf)
+
+
+def _smooth(cost: torch.Tensor) -> torch.Tensor:
+    """Mean of the finite costs in a 3 x 3 block of rays: a surface is smooth across neighbouring rays. [h, w, D]"""
+    finite = torch.isfinite(cost)
+    volume = torch.where(finite, cost, 0.0).permute(2, 0, 1)[:, None]
+    weight = finite.float().permute(2, 0, 1)[:, None]
+    box = torch.ones(1, 1, 3, 3)
+    mean = F.conv2d(volume, box, padding=1) / F.conv2d(weight, box, padding=1).clamp(min=1)
+    return torch.where(finite, mean[:, 0].permute(1, 2, 0), torch.inf)

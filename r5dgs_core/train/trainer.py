@@ -1,0 +1,347 @@
+"""Training of tracks: canonical Gaussians and one SE(3) track per object, from posed images with masks.
+
+One view per step: pose the Gaussians at the view's time, rasterize, compare, step. Times enter from a first, well-seen
+one outwards; Gaussians grow where the image asks for it. Everything that a step depends on is in `Trainer.state`, so a
+resumed run ends with the numbers of an unbroken one.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..data.dataset import Dataset
+from ..errors import TrainingError
+from ..model import posing, spherical_harmonics
+from ..model.gaussians import Gaussians
+from ..model.tracks import GroupPoses, Tracks
+from ..motion import rotations
+from ..raster import RasterStats, rasterize_splats
+from ..scene.cameras import Camera
+from . import background as backgrounds
+from . import densification, initialization, losses, normalization, views
+from .config import Config
+
+log = logging.getLogger(__name__)
+
+ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
+REBASE_EVERY = 100
+GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
+APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits")
+
+
+class Trainer:
+    """One run: data in normalised coordinates, parameters, optimizer and the draws' generator.
+
+    Args:
+        dataset: The data set.
+        config: The run's configuration.
+
+    Raises:
+        DatasetError: The training split is empty or cannot be read.
+    """
+
+    def __init__(self, dataset: Dataset, config: Config):
+        torch.set_num_threads(config.train.threads)
+        self.dataset = dataset
+        self.config = config
+        self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
+        behind = self._fixed_background()
+        self.views = views.load(dataset, self.normalization, behind)
+        start = initialization.start(self.views, config, np.random.default_rng(config.train.seed))
+        self.gaussians: Gaussians = start.gaussians
+        self.tracks: Tracks = start.tracks
+        self.object_ids = start.object_ids
+        self.places = start.places
+        self.first_time = start.first_time
+        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
+        self.background = backgrounds.fixed(behind) if behind is not None else backgrounds.learned(self._sky_color())
+        self.generator = torch.Generator().manual_seed(config.train.seed)
+        self.iteration = 0
+        self.entered = (self.first_time, self.first_time)
+        self.queue: list[int] = []
+        self.running_loss = math.nan
+        self._view_times = np.array([int(np.argmin(np.abs(self.tracks.times - v.t))) for v in self.views])
+        sizes = [v.camera.width * v.camera.height for v in self.views]
+        focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
+        self._pixel_size = normalization.TARGET_DISTANCE / focal
+        width = float(np.median([v.camera.width for v in self.views]))
+        self._width_limit = config.densify.prune_width * width * self._pixel_size
+        self.cap = config.densify.max_gaussians or int(min(60000, 0.75 * np.median(sizes)))
+        self.optimizer = self._make_optimizer()
+        self.gradients = densification.ScreenGradients(len(self.gaussians))
+        self._targets: dict[int, Tensor] = {}
+
+    def _fixed_background(self) -> np.ndarray | None:
+        kind = self.config.train.background
+        if kind == "auto":
+            kind = "white" if self.dataset.has_alpha else "learned"
+        return {"learned": None, "white": np.ones(3), "black": np.zeros(3)}[kind]
+
+    def _sky_color(self) -> np.ndarray:
+        """Median colour of what no object covers in the top rows, where sky is likeliest. [3]"""
+        rows = [v.image[: max(1, len(v.image) // 8)].reshape(-1, 3) for v in self.views]
+        return np.median(np.concatenate(rows), axis=0) / 255
+
+    def _make_optimizer(self) -> torch.optim.Adam:
+        rates = self.config.rates
+        groups = [
+            {"params": [p], "lr": getattr(rates, name), "name": name, "eps": 1e-15}
+            for name, p in self.gaussians.params.items()
+        ]
+        groups += [
+            {"params": [p], "lr": getattr(rates, name), "name": name, "eps": 1e-8}
+            for name, p in {**self.tracks.params, "light": self.light, **self.background.params}.items()
+            if p.requires_grad
+        ]
+        return torch.optim.Adam(groups, fused=True)
+
+    @property
+    def done(self) -> bool:
+        """Whether all steps are taken."""
+        return self.iteration >= self.config.train.iterations
+
+    def step(self) -> float:
+        """Take one step and return its loss.
+
+        Raises:
+            TrainingError: The loss is not finite; the message names step, view and parameter.
+        """
+        self._grow_times()
+        index = self._draw()
+        view = self.views[index]
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._rate(group["name"])
+        stats = RasterStats()
+        image = self.render(view.camera, view.t, stats)
+        loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
+        total = loss
+        if self.config.losses.roughness > 0 and self.iteration % ROUGHNESS_EVERY == 0:
+            total = total + ROUGHNESS_EVERY * self.config.losses.roughness * self.tracks.roughness()
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        value = float(loss.detach())
+        if not math.isfinite(value) or self.iteration % 50 == 0:
+            self._check_finite(value, view.name)
+        self.optimizer.step()
+        if stats.grad_norm is not None and stats.visible is not None and stats.radii is not None:
+            self.gradients.add(stats.grad_norm, stats.visible, stats.radii)
+        self.iteration += 1
+        self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
+        self._maintain()
+        return value
+
+    def render(self, camera: Camera, t: float, stats: RasterStats | None = None) -> Tensor:
+        """Image of a camera in normalised coordinates at a time. [H, W, 3]"""
+        splats = self.splats(camera, self.tracks.poses(t))
+        return rasterize_splats(
+            splats.means,
+            splats.quats,
+            splats.scales,
+            splats.opacities,
+            splats.colors,
+            camera,
+            self.background.image(camera),
+            stats=stats,
+        ).image
+
+    def splats(self, camera: Camera, poses: GroupPoses) -> posing.Splats:
+        """Activated Gaussians in normalised coordinates, as a camera sees them."""
+        g = self.gaussians
+        centers = self.tracks.group_centers()
+        colors = spherical_harmonics.dc_to_rgb(g.params["sh"][:, 0])
+        if self.config.train.sh_degree > 0:
+            colors = colors + self._view_dependent(camera, poses, centers)
+        return posing.pose(
+            g.params["means"],
+            g.params["quats"],
+            g.params["log_scales"],
+            g.params["opacity_logits"],
+            colors,
+            g.params["shading"],
+            self.light,
+            g.motion_ids,
+            poses,
+            centers,
+        )
+
+    def _view_dependent(self, camera: Camera, poses: GroupPoses, centers: Tensor) -> Tensor:
+        """Colour of the higher bands, evaluated in each group's own frame. [N, 3]"""
+        eye = torch.from_numpy(camera.center).float()
+        with torch.no_grad():
+            arm = centers + poses.displacements - eye
+            eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
+            towards = self.gaussians.params["means"] - eyes[self.gaussians.motion_ids]
+            directions = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+            basis = spherical_harmonics.basis(directions, self.config.train.sh_degree)[:, 1:]
+        return (basis[..., None] * self.gaussians.params["sh_rest"]).sum(-2)
+
+    def _target(self, index: int) -> Tensor:
+        if index not in self._targets:
+            if len(self._targets) >= 2000:
+                self._targets.clear()
+            self._targets[index] = torch.from_numpy(self.views[index].image).float() / 255
+        return self._targets[index]
+
+    def _rate(self, name: str) -> float:
+        rates = self.config.rates
+        base = getattr(rates, name)
+        if name == "shading" and not self.config.train.shading:
+            return 0.0
+        progress = self.iteration / self.config.train.iterations
+        if progress <= rates.decay_from or name not in GEOMETRY + APPEARANCE:
+            return base
+        factor = rates.decay ** ((progress - rates.decay_from) / (1 - rates.decay_from))
+        return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
+
+    def _curriculum(self) -> tuple[int, int]:
+        """Steps on the first time alone, and step at which all times have entered."""
+        scale = min(1.0, self.config.train.iterations / 2000)
+        section = self.config.curriculum
+        return int(section.first * scale), int((section.first + section.grow) * scale)
+
+    def _grow_times(self) -> None:
+        first, full = self._curriculum()
+        count = len(self.tracks.times)
+        reach = max(self.first_time, count - 1 - self.first_time)
+        if self.iteration < first or reach == 0:
+            return
+        stage = reach if self.iteration >= full else 1 + (self.iteration - first) * reach // max(1, full - first)
+        stage = min(stage, reach)
+        while self.entered[0] > max(0, self.first_time - stage):
+            self._enter(self.entered[0] - 1, +1)
+            self.entered = (self.entered[0] - 1, self.entered[1])
+        while self.entered[1] < min(count - 1, self.first_time + stage):
+            self._enter(self.entered[1] + 1, -1)
+            self.entered = (self.entered[0], self.entered[1] + 1)
+
+    @torch.no_grad()
+    def _enter(self, s: int, towards: int) -> None:
+        """Start the poses of a new knot from its entered neighbours: steady rotation, triangulated translation."""
+        self.tracks.rebase()
+        near, next_near = s + towards, s + 2 * towards
+        quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
+        steady = self.entered[0] <= next_near <= self.entered[1]
+        turn = rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near])) if steady else None
+        quats[:, s] = quats[:, near] if turn is None else rotations.multiply(turn, quats[:, near])
+        for row in range(1, self.tracks.bodies):
+            if self.places.measured[row - 1, s] and self.places.measured[row - 1, near]:
+                here, there = (self.places.centers[row - 1, k] for k in (s, near))
+                shifts[row, s] = shifts[row, near] + torch.from_numpy(here - there).float()
+            elif steady:
+                shifts[row, s] = 2 * shifts[row, near] - shifts[row, next_near]
+
+    def _draw(self) -> int:
+        _, full = self._curriculum()
+        if self.iteration >= full:
+            if not self.queue:
+                self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()
+            return self.queue.pop()
+        low, high = self.entered
+        inside = (self._view_times >= low) & (self._view_times <= high)
+        newest = (self._view_times == low) | (self._view_times == high)
+        chance, pick = torch.rand(2, generator=self.generator).tolist()
+        pool = np.flatnonzero(newest if chance < self.config.curriculum.newest and newest.any() else inside)
+        if len(pool) == 0:
+            pool = np.arange(len(self.views))
+        return int(pool[min(int(pick * len(pool)), len(pool) - 1)])
+
+    def _maintain(self) -> None:
+        section = self.config.densify
+        stop = section.stop * self.config.train.iterations
+        if self.iteration % REBASE_EVERY == 0:
+            self.tracks.rebase()
+        if self.iteration % section.every == 0 and section.start <= self.iteration <= stop:
+            densification.densify(
+                self.gaussians,
+                self.optimizer,
+                self.gradients,
+                section,
+                self.cap,
+                self._pixel_size,
+                self._width_limit,
+                self.generator,
+            )
+            self.gradients = densification.ScreenGradients(len(self.gaussians))
+
+    def _check_finite(self, value: float, view: str) -> None:
+        named = {**self.gaussians.params, **self.tracks.params, "light": self.light, **self.background.params}
+        bad = [n for n, p in named.items() if p.grad is not None and not bool(torch.isfinite(p.grad).all())]
+        if bad or not math.isfinite(value):
+            what = f"gradient of {', '.join(bad)}" if bad else "loss"
+            raise TrainingError(
+                f"step {self.iteration}, view {view}: {what} is not finite; the last checkpoint is kept. "
+                "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
+            )
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next step depends on: named tensors, numbers and text."""
+        tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
+        tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
+        tensors |= {f"tracks.{n}": p.detach() for n, p in self.tracks.params.items()}
+        tensors["tracks.times"] = torch.from_numpy(self.tracks.times)
+        tensors["tracks.centers"] = self.tracks.centers
+        tensors["tracks.base_quats"] = self.tracks.base_quats
+        tensors["tracks.casters"] = self.tracks.casters
+        tensors["tracks.plane_normal"] = self.tracks.plane_normal
+        tensors["light"] = self.light.detach()
+        tensors["background"] = self.background.params["background"].detach()
+        tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
+        tensors["generator"] = self.generator.get_state()
+        tensors |= {f"gradients.{n}": getattr(self.gradients, n) for n in ("total", "views", "pixel_sizes")}
+        for group in self.optimizer.param_groups:
+            moments = self.optimizer.state.get(group["params"][0], {})
+            tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
+        return {
+            "tensors": {n: t.detach().clone() for n, t in tensors.items()},
+            "iteration": self.iteration,
+            "entered": list(self.entered),
+            "first_time": self.first_time,
+            "queue": list(self.queue),
+            "running_loss": self.running_loss,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
+        tensors = state["tensors"]
+        g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
+        self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
+        self.tracks = tracks_of(tensors)
+        self.light = tensors["light"].clone().requires_grad_(True)
+        self.background = backgrounds.Background(tensors["background"], self.background.learned)
+        self.object_ids = tensors["object_ids"].numpy()
+        self.generator.set_state(tensors["generator"])
+        self.gradients = densification.ScreenGradients(len(self.gaussians))
+        for name in ("total", "views", "pixel_sizes"):
+            setattr(self.gradients, name, tensors[f"gradients.{name}"])
+        self.optimizer = self._make_optimizer()
+        for group in self.optimizer.param_groups:
+            prefix = f"adam.{group['name']}."
+            moments = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+            if moments:
+                self.optimizer.state[group["params"][0]] = moments
+        self.iteration = state["iteration"]
+        self.entered = (state["entered"][0], state["entered"][1])
+        self.first_time = state["first_time"]
+        self.queue = list(state["queue"])
+        self.running_loss = state["running_loss"]
+
+
+def tracks_of(tensors: dict[str, Tensor]) -> Tracks:
+    """The tracks in a checkpoint's named tensors."""
+    tracks = Tracks(
+        tensors["tracks.times"].numpy(),
+        tensors["tracks.centers"],
+        tensors["tracks.translations"],
+        tensors["tracks.base_quats"],
+        tensors["tracks.casters"],
+        tensors["tracks.plane_normal"],
+    )
+    for name in ("rotvecs", "slope"):
+        tracks.params[name] = tensors[f"tracks.{name}"].clone().requires_grad_(True)
+    return tracks

@@ -1,0 +1,58 @@
+"""Training views in memory: normalised camera, time, 8-bit image and mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..errors import DatasetError
+from ..scene.cameras import Camera
+from .normalization import Normalization
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One image of the training split.
+
+    Attributes:
+        name: Name in the data set.
+        camera: Camera in normalised coordinates.
+        t: Scene time.
+        image: sRGB. [H, W, 3] uint8
+        mask: Object ids, or None. [H, W] int32
+        alpha: Opacity of the pixels, or None where the image has none. [H, W] uint8
+    """
+
+    name: str
+    camera: Camera
+    t: float
+    image: np.ndarray
+    mask: np.ndarray | None
+    alpha: np.ndarray | None
+
+
+def load(dataset: datasets.Dataset, normalization: Normalization, background: np.ndarray | None) -> list[TrainView]:
+    """Load the training split.
+
+    Args:
+        dataset: The data set.
+        normalization: From world to training coordinates.
+        background: Colour behind transparent pixels, or None where images are opaque. [3]
+
+    Raises:
+        DatasetError: There is no training view.
+    """
+    if not dataset.train:
+        raise DatasetError(f"{dataset.root}: transforms_train.json lists no frames; nothing to train on")
+    views = []
+    for view in dataset.train:
+        alpha = None
+        if dataset.has_alpha:
+            rgba = datasets.load_rgba(view)
+            alpha = np.round(rgba[..., 3] * 255).astype(np.uint8)
+        image = np.round(datasets.load_image(view, background) * 255).astype(np.uint8)
+        camera = normalization.camera(view.camera)
+        views.append(TrainView(view.name, camera, view.t, image, datasets.load_mask(view), alpha))
+    return views
