@@ -33,7 +33,6 @@ class _Pass:
     slot_starts: np.ndarray
     geometry: np.ndarray
     values: np.ndarray
-    background: np.ndarray
     image: np.ndarray
     alpha: np.ndarray
     depth: np.ndarray
@@ -160,7 +159,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple
     )  # fmt: skip
     state = _Pass(
         camera, view, limits, order, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values,
-        background, image, alpha, depth, transmittance,
+        image, alpha, depth, transmittance,
     )  # fmt: skip
     return state, ids
 
@@ -173,8 +172,7 @@ def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_ranks, state.pair_slots, state.geometry, state.values,
-        state.background, state.limits, state.image, state.alpha, state.depth, state.transmittance, d_image, d_alpha,
-        d_depth, slots,
+        state.limits, state.image, state.alpha, state.depth, state.transmittance, d_image, d_alpha, d_depth, slots,
     )  # fmt: skip
     gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
     gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]

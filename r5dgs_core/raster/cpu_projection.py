@@ -33,12 +33,12 @@ _WHITEN = 0.5 / math.log(2.0)  # squares of the scaled (u, v) are this times tho
 
 
 @kernel
-def _linearise(x, y, z, view):
-    """The Jacobian of the projection at p: j00, j01, j02, j11, j12 and the clamped slopes."""
-    u = min(max(x / z, view[U_LOW]), view[U_HIGH])
-    v = min(max(y / z, view[V_LOW]), view[V_HIGH])
-    fx, skew, fy = view[FX], view[SKEW], view[FY]
-    return fx / z, skew / z, -(fx * u + skew * v) / z, fy / z, -fy * v / z, u, v
+def _linearise(u, v, inverse_z, view):
+    """The Jacobian of the projection at slopes u, v: j00, j01, j02, j11, j12; and the clamped slopes."""
+    u = min(max(u, view[U_LOW]), view[U_HIGH])
+    v = min(max(v, view[V_LOW]), view[V_HIGH])
+    j00, j01, j11 = view[FX] * inverse_z, view[SKEW] * inverse_z, view[FY] * inverse_z
+    return j00, j01, -(j00 * u + j01 * v), j11, -j11 * v, u, v
 
 
 @kernel
@@ -56,18 +56,19 @@ def _rotate(view, w, x, y, z, rotation):
 
 
 @kernel
-def _to_camera(view, mean):
-    """Centre in the camera frame."""
-    x = view[TRANSLATION] + view[ROTATION] * mean[0] + view[ROTATION + 1] * mean[1] + view[ROTATION + 2] * mean[2]
-    y = view[TRANSLATION + 1] + view[ROTATION + 3] * mean[0] + view[ROTATION + 4] * mean[1] + view[ROTATION + 5] * mean[2]
-    z = view[TRANSLATION + 2] + view[ROTATION + 6] * mean[0] + view[ROTATION + 7] * mean[1] + view[ROTATION + 8] * mean[2]
+def _to_camera(view, means, i):
+    """Centre i in the camera frame."""
+    a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+    x = view[TRANSLATION] + view[ROTATION] * a + view[ROTATION + 1] * b + view[ROTATION + 2] * c
+    y = view[TRANSLATION + 1] + view[ROTATION + 3] * a + view[ROTATION + 4] * b + view[ROTATION + 5] * c
+    z = view[TRANSLATION + 2] + view[ROTATION + 6] * a + view[ROTATION + 7] * b + view[ROTATION + 8] * c
     return x, y, z
 
 
 @kernel
-def _unit(quat):
-    """Quaternion of length one, and one over its length; the zero quaternion counts as no rotation, with 0."""
-    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+def _unit(quats, i):
+    """Quaternion i made one long, and one over its length; the zero quaternion counts as no rotation, with 0."""
+    w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
     square = w * w + x * x + y * y + z * z
     if square == 0:
         return 1.0, 0.0, 0.0, 0.0, 0.0
@@ -76,7 +77,7 @@ def _unit(quat):
 
 
 @kernel
-def _covariance(j00, j01, j02, j11, j12, rotation, scale, dilation, axes):
+def _covariance(j00, j01, j02, j11, j12, rotation, scales, i, dilation, axes):
     """Write P (2 x 3, flat) and return c_xx, c_xy, c_yy with dilation, and the determinant.
 
     det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, and det(P P^T) is the sum of the squared minors of P (Cauchy and
@@ -84,8 +85,8 @@ def _covariance(j00, j01, j02, j11, j12, rotation, scale, dilation, axes):
     """
     xx, xy, yy = 0.0, 0.0, 0.0
     for k in range(3):
-        a = (j00 * rotation[k] + j01 * rotation[3 + k] + j02 * rotation[6 + k]) * scale[k]
-        b = (j11 * rotation[3 + k] + j12 * rotation[6 + k]) * scale[k]
+        a = (j00 * rotation[k] + j01 * rotation[3 + k] + j02 * rotation[6 + k]) * np.float64(scales[i, k])
+        b = (j11 * rotation[3 + k] + j12 * rotation[6 + k]) * np.float64(scales[i, k])
         axes[k], axes[3 + k] = a, b
         xx += a * a
         xy += a * b
@@ -107,15 +108,16 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         opacity = np.float64(opacities[i])
         if opacity < view[ALPHA_MIN]:
             continue
-        x, y, z = _to_camera(view, means[i])
+        x, y, z = _to_camera(view, means, i)
         if z <= view[NEAR]:
             continue
-        w, qx, qy, qz, _ = _unit(quats[i])
+        w, qx, qy, qz, _ = _unit(quats, i)
         _rotate(view, w, qx, qy, qz, rotation)
-        j00, j01, j02, j11, j12, _, _ = _linearise(x, y, z, view)
-        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales[i], view[DILATION], axes)
-        mean_x = (view[FX] * x + view[SKEW] * y) / z + view[CX]
-        mean_y = view[FY] * y / z + view[CY]
+        u, v = x / z, y / z
+        j00, j01, j02, j11, j12, _, _ = _linearise(u, v, 1 / z, view)
+        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales, i, view[DILATION], axes)
+        mean_x = view[FX] * u + view[SKEW] * v + view[CX]
+        mean_y = view[FY] * v + view[CY]
         reach = 2 * math.log(opacity / view[ALPHA_MIN])
         extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
         if not (
@@ -169,11 +171,13 @@ def project_backward(
             d_channels[i, c] = sums[MOMENTS + c]
         d_opacities[i] = sums[0] / opacities[i]
 
-        x, y, z = _to_camera(view, means[i])
-        w, qx, qy, qz, inverse_length = _unit(quats[i])
+        x, y, z = _to_camera(view, means, i)
+        w, qx, qy, qz, inverse_length = _unit(quats, i)
         _rotate(view, w, qx, qy, qz, rotation)
-        j00, j01, j02, j11, j12, u_clamped, v_clamped = _linearise(x, y, z, view)
-        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales[i], view[DILATION], axes)
+        inverse_z = 1 / z
+        u, v = x * inverse_z, y * inverse_z
+        j00, j01, j02, j11, j12, u_clamped, v_clamped = _linearise(u, v, inverse_z, view)
+        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales, i, view[DILATION], axes)
         l11, l22, shift = math.sqrt(yy / determinant), math.sqrt(1 / yy), xy / yy
 
         # To the centre: L^T (sum A u, sum A v). To the covariance: L^T (sums of squares) L / 2.
@@ -201,16 +205,14 @@ def project_backward(
             d_j12 += d_b * r2 * s
             d_axes[k] = s
 
-        fx, skew, fy, u, v = view[FX], view[SKEW], view[FY], x / z, y / z
         d_z = sums[width - 1]  # the depth channel
-        d_z -= (j00 * d_j00 + j01 * d_j01 + j02 * d_j02 + j11 * d_j11 + j12 * d_j12) / z
-        d_u, d_v = fx * d_x2d, skew * d_x2d + fy * d_y2d
+        d_z -= (j00 * d_j00 + j01 * d_j01 + j02 * d_j02 + j11 * d_j11 + j12 * d_j12) * inverse_z
+        d_x, d_y = j00 * d_x2d, j01 * d_x2d + j11 * d_y2d  # d_u / z and d_v / z
         if u == u_clamped:
-            d_u -= fx / z * d_j02
+            d_x -= j00 * d_j02 * inverse_z
         if v == v_clamped:
-            d_v -= (skew * d_j02 + fy * d_j12) / z
-        d_x, d_y = d_u / z, d_v / z
-        d_z -= (d_u * u + d_v * v) / z
+            d_y -= (j01 * d_j02 + j11 * d_j12) * inverse_z
+        d_z -= d_x * u + d_y * v
         for k in range(3):
             d_means[i, k] = (
                 view[ROTATION + k] * d_x + view[ROTATION + 3 + k] * d_y + view[ROTATION + 6 + k] * d_z

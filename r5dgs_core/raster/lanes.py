@@ -112,6 +112,17 @@ def load(typingctx, array, index):
 
 
 @intrinsic
+def broadcast(typingctx, array, index):
+    """Lanes that all hold one element of a float32 array, at flat index ``index``; nothing is checked."""
+
+    def emit(context, builder, sig, args):
+        struct = context.make_array(sig.args[0])(context, builder, args[0])
+        return _splat(builder, builder.load(builder.gep(struct.data, [args[1]])))
+
+    return lanes(array, types.intp), emit
+
+
+@intrinsic
 def store(typingctx, array, index, value):
     """Write lanes to a float32 array, from flat index ``index`` on; nothing is checked."""
 
@@ -135,6 +146,14 @@ def smaller(typingctx, a, b):
     """Lane by lane the smaller of two."""
     return lanes(lanes, lanes), lambda context, builder, sig, args: builder.select(
         builder.fcmp_ordered("<", *args), *args
+    )
+
+
+@intrinsic
+def larger(typingctx, a, b):
+    """Lane by lane the larger of two."""
+    return lanes(lanes, lanes), lambda context, builder, sig, args: builder.select(
+        builder.fcmp_ordered(">", *args), *args
     )
 
 
