@@ -214,9 +214,10 @@ def _cloud(
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
     cloud.color = (*color, 1.0)
     cloud.parent = anchor
-    cloud.matrix_parent_inverse = Matrix.Translation(-Vector(anchor.location))
+    pivot = Vector(anchor.r5dgs.pivot)  # not the anchor's location, which its keys have moved by now
+    cloud.matrix_parent_inverse = Matrix.Translation(-pivot)
     state = cloud.r5dgs
-    state.role, state.object_id, state.motion_id, state.pivot = "CLOUD", part.object_id, part.motion_id, anchor.location
+    state.role, state.object_id, state.motion_id, state.pivot = "CLOUD", part.object_id, part.motion_id, pivot
     state.start, state.count = part.start, part.count
     return cloud
 
