@@ -1,0 +1,320 @@
+"""Choose how a group moves past t_max from its poses in the observed time.
+
+A family of motions (`candidates`) is fitted to the noisy poses; the simplest whose error on held-out last poses is near
+the best is taken, unless the body has come to rest. Notation: S poses, tau = t - t_max <= 0, radius the size that
+rotations are weighed with.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from . import candidates as families
+from . import models, rotations
+from .candidates import Candidate, Solution, Track
+
+logger = logging.getLogger(__name__)
+
+HELD_OUT = 0.2
+WITHIN = 1.5
+FADE_PER_SPAN = 0.1 / 0.75
+_SIGMA_FLOOR = 1e-7  # radii and radians: below this noise means rounding
+_RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
+_FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
+_LARGEST = families.BY_NAME["full, free centre"]
+_STATIC = families.BY_NAME["static"]
+_TAIL = 5
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of the score table.
+
+    Attributes:
+        name: Candidate.
+        parameters: Its free parameters, six of the pose included.
+        held_out: Root mean square of the held-out residuals in units of the noise; infinite where not fitted.
+        fit: The same over all poses after the final fit, NaN where that was not made.
+    """
+
+    name: str
+    parameters: int
+    held_out: float
+    fit: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A chosen motion model with the evidence for it.
+
+    Attributes:
+        model: The motion past t_max.
+        scores: The score table, in the order of the candidates.
+        chosen: Name of the candidate in `model`.
+        rested: Whether the body was found to have come to rest, so that `chosen` is "static" for that reason.
+        sigma_t: Noise of the displacements, per component, world units.
+        sigma_r: Noise of the rotations, per component, rad.
+        band_tau: Times past t_max of `band`. [H]
+        band: Two standard deviations of the position of a point of the body, world units. [H]
+    """
+
+    model: models.MotionModel
+    scores: tuple[Score, ...]
+    chosen: str
+    rested: bool
+    sigma_t: float
+    sigma_r: float
+    band_tau: np.ndarray
+    band: np.ndarray
+
+
+def fit(
+    times: np.ndarray,  # [S]
+    quats: np.ndarray,  # [S, 4]
+    displacements: np.ndarray,  # [S, 3]
+    *,
+    radius: float,
+    weights: np.ndarray | None = None,  # [S]
+    candidates: Sequence[str] | None = None,
+) -> Fit:
+    """Fit the family to a pose track and choose.
+
+    Args:
+        times: Increasing, any spacing; the last is t_max. [S]
+        quats: Rotations relative to the bind state, unit wxyz, any sign. [S, 4]
+        displacements: Of the pivot, relative to the bind state, world units. [S, 3]
+        radius: Of the group, world units, > 0.
+        weights: How well each pose was seen, >= 0; 0 leaves a pose out. None for equal ones. [S]
+        candidates: Names out of `candidates.BY_NAME` to choose from; None for `candidates.FAMILY`.
+
+    Returns:
+        The fit. With fewer than four poses of positive weight it is at most a velocity and a spin; with one, static.
+
+    Source: selection by held-out error with the simplest within 1.5 of the best, rest test, band from the covariance
+        inflated for correlated residuals and from the spread of the candidates that are about as good.
+    """
+    times = np.asarray(times, np.float64)
+    quats = np.asarray(quats, np.float64)
+    displacements = np.asarray(displacements, np.float64)
+    weights = np.ones(len(times)) if weights is None else np.asarray(weights, np.float64)
+    _check(times, quats, displacements, weights, radius)
+    family = families.FAMILY if candidates is None else tuple(_named(name) for name in candidates)
+    used = weights > 0
+    if used.sum() < 2 or times[used][-1] == times[used][0]:
+        return _static(radius)
+    span = float(times[-1] - times[used][0])
+    track = Track(
+        (times[used] - times[-1]) / span,
+        rotations.make_continuous(rotations.normalize(quats[used])),
+        displacements[used] / radius,
+        weights[used] / weights[used].mean(),
+    )
+    family = tuple(replace(c, tau_mid=float(0.5 * (track.tau[0] + track.tau[-1]))) for c in family)
+    if len(track.tau) < 4:
+        return _few(track, family, radius, span)
+
+    sigmas, outliers = _noise(track, family)
+    scores = [_held_out(c, track, sigmas, outliers) for c in family]
+    finite = [s for s in scores if np.isfinite(s)]
+    best = max(min(finite), 1e-3) if finite else math.inf
+    near = [c for c, s in zip(family, scores, strict=True) if s <= WITHIN * best] or [family[0]]
+    solutions = {c.name: families.solve(c, track, sigmas) for c in near}
+    chosen = min(near, key=lambda c: c.parameters)
+    rested = _rests(solutions[chosen.name], track, sigmas)
+    solution, evidence = solutions[chosen.name], track
+    if rested:
+        evidence = track.rows(slice(-_TAIL, None))
+        solution = families.solve(_STATIC, evidence, sigmas)
+    table = tuple(
+        Score(c.name, c.parameters, float(s), math.sqrt(solutions[c.name].chi2) if c.name in solutions else math.nan)
+        for c, s in zip(family, scores, strict=True)
+    )
+    model = _to_model(solution, radius, span, evidence, sigmas)
+    near_solutions = [] if rested else list(solutions.values())
+    band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
+    return Fit(model, table, solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weights: np.ndarray, radius: float) -> None:
+    count = len(times)
+    shapes = (times.shape, quats.shape, displacements.shape, weights.shape)
+    if count == 0 or shapes != ((count,), (count, 4), (count, 3), (count,)):
+        raise ValueError(f"expected times (S,), quats (S, 4), displacements (S, 3), weights (S,), got {shapes}")
+    if not all(np.isfinite(x).all() for x in (times, quats, displacements, weights)):
+        raise ValueError("times, quats, displacements, weights: expected finite numbers")
+    if not (np.diff(times) > 0).all():
+        raise ValueError("times: expected strictly increasing")
+    if not (weights >= 0).all():
+        raise ValueError("weights: expected >= 0")
+    if not (math.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius: expected > 0, got {radius}")
+
+
+def _named(name: str) -> Candidate:
+    if name not in families.BY_NAME:
+        raise ValueError(f"candidates: {name!r} is none of {', '.join(families.BY_NAME)}")
+    return families.BY_NAME[name]
+
+
+def _static(radius: float) -> Fit:
+    model = models.MotionModel(radius=radius)
+    scores = (Score("static", 6, math.nan, math.nan),)
+    return Fit(model, scores, "static", False, 0.0, 0.0, np.zeros(1), np.zeros(1))
+
+
+def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float) -> Fit:
+    """Two or three poses: the plainest of static, translation, spin and both that explains them to a hundredth."""
+    sigmas = (1e-2, 1e-2)
+    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [_STATIC]
+    solutions = [families.solve(c, track, sigmas) for c in allowed]
+    roots = [math.sqrt(s.chi2) for s in solutions]
+    index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
+    chosen = solutions[index]
+    table = tuple(Score(c.name, c.parameters, math.inf, r) for c, r in zip(allowed, roots, strict=True))
+    model = _to_model(chosen, radius, span, track, sigmas)
+    band_tau, band = _band(chosen, solutions, track, sigmas, radius, span)
+    return Fit(model, table, chosen.candidate.name, False, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, float], np.ndarray]:
+    """Noise of displacements and rotations from the residuals of the largest models, and their weights per pose. [S]
+
+    Errors common to the members of a group do not show in its own rigid fit, so that fit's spread would be too small.
+    """
+    wide = [c for c in (_FREE_AXIS, _LARGEST) if c.parameters <= 6 * len(track.tau) - 6] or [
+        max((c for c in family if c.parameters < 6 * len(track.tau)), key=lambda c: c.parameters, default=_STATIC)
+    ]
+    best: tuple[float, Solution, np.ndarray] | None = None
+    sigmas = (1.0, 1.0)
+    for _ in range(2):
+        best = None
+        for candidate in wide:
+            solution = families.solve(candidate, track, sigmas)
+            values = families.residuals(candidate, solution.theta[None], track, (1.0, 1.0))[0]
+            dof = max(6 * len(track.tau) - candidate.parameters, 1) / (6 * len(track.tau))
+            level = solution.chi2 / dof
+            if best is None or level < best[0]:
+                best = (level, solution, values)
+        assert best is not None
+        _, solution, values = best
+        weights = (track.weights * solution.robust)[:, None]
+        dof = max(6 * len(track.tau) - solution.candidate.parameters, 1) / (6 * len(track.tau))
+        variances = (weights * values**2).sum(0) / (weights.sum() * dof)
+        sigma_t, sigma_r = np.sqrt([variances[:3].mean(), variances[3:].mean()]).tolist()
+        sigmas = (max(sigma_t, _SIGMA_FLOOR), max(sigma_r, _SIGMA_FLOOR))
+    assert best is not None
+    return sigmas, best[1].robust
+
+
+def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], outliers: np.ndarray) -> float:
+    """Root mean square of the residuals on the last poses of a fit to the first ones, in units of the noise."""
+    count = len(track.tau)
+    held = max(3, math.ceil(HELD_OUT * count)) if count >= 8 else max(1, count // 4)
+    if candidate.parameters > 6 * (count - held) - 2:
+        return math.inf
+    solution = families.solve(candidate, track.rows(slice(0, count - held)), sigmas)
+    tail = track.rows(slice(count - held, count))
+    values = families.residuals(candidate, solution.theta[None], tail, sigmas)[0]
+    weights = (tail.weights * np.maximum(outliers[count - held :], 1e-6))[:, None]
+    score = math.sqrt(float((weights * values**2).sum() / (6 * weights.sum())))
+    return score if math.isfinite(score) else math.inf
+
+
+def _tail_chi2(values: np.ndarray, parameters: int) -> float:
+    return float((values**2).sum()) / max(values.size - parameters, 1)
+
+
+def _rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
+    """Whether a constant pose explains the last poses and the picked motion misses the whole window.
+
+    Without the second condition slow movers would be frozen.
+    """
+    if picked.candidate.name == "static" or len(track.tau) < 2 * _TAIL:
+        return False
+    tail = track.rows(slice(-_TAIL, None))
+    still = families.residuals(_STATIC, families.solve(_STATIC, tail, sigmas).theta[None], tail, sigmas)[0]
+    moving = families.residuals(picked.candidate, picked.theta[None], tail, sigmas)[0]
+    still_chi2 = _tail_chi2(still, 6)
+    moving_chi2 = max(_tail_chi2(moving, 0), 0.25)
+    whole = families.residuals(picked.candidate, picked.theta[None], track, sigmas)[0]
+    whole_chi2 = _tail_chi2(whole, picked.candidate.parameters)
+    return still_chi2 <= 1.5 * moving_chi2 and whole_chi2 > 2 * max(still_chi2, 0.25)
+
+
+def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
+    """Parameters in world units and units of time. [..., P] -> [..., 3] each"""
+    p = solution.candidate.unpack(theta)
+    return {
+        "velocity": p["v"] * radius / span,
+        "acceleration": p["a"] * radius / span**2,
+        "angular_velocity": p["w"] / span,
+        "angular_acceleration": p["eps"] / span**2,
+        "center_offset": p["u"] * radius,
+        "offset_rotvec": p["r"],
+        "offset_displacement": p["e"] * radius,
+    }
+
+
+def _to_model(
+    solution: Solution, radius: float, span: float, track: Track, sigmas: tuple[float, float]
+) -> models.MotionModel:
+    rates = _rates(solution, solution.theta, radius, span)
+    step = 1e-6
+    shifted = solution.theta + step * np.eye(len(solution.theta))
+    moved = _rates(solution, shifted, radius, span)
+    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in _RATES], axis=-1).T
+    covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T
+    return models.MotionModel(
+        kind=solution.candidate.kind,
+        **rates,
+        fade_time=FADE_PER_SPAN * span,
+        radius=radius,
+        covariance=0.5 * (covariance + covariance.T),
+        covariance_names=tuple(f"{name}.{axis}" for name in _RATES for axis in "xyz"),
+    )
+
+
+def _covariance(solution: Solution, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
+    """Covariance of the parameters, inflated for residuals that are correlated in time (AR(1)). [P, P]"""
+    size, count = len(solution.theta), len(track.tau)
+    values = families.residuals(solution.candidate, solution.theta[None], track, sigmas)[0]
+    s2 = max(solution.chi2 * 6 * count / max(6 * count - size, 1), 1e-12)
+    energy = float((values**2).sum())
+    lag = float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
+    rho = min(max(lag + (size / 6 + 1) / count, 0.0), 0.9)
+    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.jacobian.T @ solution.jacobian, hermitian=True)
+
+
+def _band(
+    chosen: Solution,
+    near: list[Solution],
+    track: Track,
+    sigmas: tuple[float, float],
+    radius: float,
+    span: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two standard deviations of the position of a surface point, up to one observed span past t_max."""
+    tau = np.linspace(0.0, 1.0, 17)
+    candidate, theta = chosen.candidate, chosen.theta
+    quats, displacements = (x[0] for x in candidate.poses(theta[None], tau))
+    step = 1e-5
+    moved_quats, moved = candidate.poses(theta + step * np.eye(len(theta)), tau)
+    turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
+    slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
+    covariance = _covariance(chosen, track, sigmas)
+    spread = np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
+    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2.
+    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1)
+    others = [s for s in near if s.candidate.name != candidate.name]
+    total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0
+    for other in others:
+        other_quats, other_displacements = (x[0] for x in other.candidate.poses(other.theta[None], tau))
+        angle = rotations.angle_between(other_quats, quats)
+        distance2 = ((other_displacements - displacements) ** 2).sum(-1) + 2 / 3 * angle**2
+        variance = variance + distance2 / (other.candidate.parameters**2 * total)
+    return tau * span, 2 * radius * np.sqrt(variance)
