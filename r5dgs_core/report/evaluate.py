@@ -89,7 +89,7 @@ def evaluate(
         result["splits"][split] = {}
         views = dataset.views(split)
         for mode in modes:
-            tally = _Tally([item.id for item in scene.objects if item.id > 0] or sorted(dataset.object_names))
+            tally = _Tally([item.id for item in scene.objects if item.id > 0])
             if views:
                 render(scene, views[0].camera, views[0].t, mode, backend=backend)  # compiles; not timed
             for view in views:
@@ -211,7 +211,7 @@ def _matrix(group: MotionGroup, quat: np.ndarray, displacement: np.ndarray) -> n
 class _Tally:
     """Collects the errors of a split's images and averages them."""
 
-    def __init__(self, ids: Sequence[int]) -> None:
+    def __init__(self, ids: list[int]) -> None:
         self.ids = ids
         self.values: dict[str, list[float]] = {name: [] for name in METRICS}
         self.errors: list[float] = []
@@ -228,6 +228,10 @@ class _Tally:
         if mask is not None:
             self.masked = True
             self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, mask > 0))
+            for object_id in sorted(set(np.unique(mask[mask > 0]).tolist()) - set(self.ids)):
+                # An object that the scene lacks counts as missed; so far it was in no truth and in no prediction.
+                self.counts = np.insert(np.insert(self.counts, len(self.ids), 0, axis=0), len(self.ids), 0, axis=1)
+                self.ids = [*self.ids, object_id]
             self.counts += metrics.confusion(rendering.ids, mask, self.ids)
         self.values["ms_motion"].append(rendering.ms_motion)
         self.values["ms_raster"].append(rendering.ms_raster)
