@@ -19,7 +19,7 @@ from . import capture_files, capture_objects, capture_render, capture_views
 from .capture_overrides import Overrides
 
 SPLITS = ("train", "val", "test")
-MAX_OBJECTS = 65535  # what a 16-bit mask can tell apart
+MAX_OBJECTS = 32767  # the highest pass index that Blender has
 
 
 @dataclass(frozen=True)
@@ -249,8 +249,8 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Cap
         highest = max(o.id for o in objects)
         if highest > MAX_OBJECTS:
             raise errors.ConfigError(
-                f"capture: a mask tells {MAX_OBJECTS} objects apart, found {len(objects)} with ids up to {highest}; "
-                "join some, or choose fewer by collection"
+                f"capture: expected ids up to {MAX_OBJECTS}, Blender's highest pass index, found up to {highest}; "
+                "join objects, or choose fewer by collection"
             )
         capture_objects.assign_ids(objects, overrides)
         views = capture_views.choose(context, settings, capture_objects.bounds(survey, objects), overrides)

@@ -27,6 +27,14 @@ def require_openimageio() -> Any:
     return OpenImageIO
 
 
+def _images() -> Any:
+    """The core's image files, which need OpenImageIO; so they are imported when the first one is read or written."""
+    require_openimageio()
+    from ..r5dgs_core.data import images
+
+    return images
+
+
 @contextmanager
 def new_folder(directory: Path) -> Iterator[Path]:
     """A temporary folder beside ``directory`` that takes its name at the end; after an error nothing is left of it."""
@@ -64,38 +72,14 @@ def write_view(folder: Path, stem: str, image: np.ndarray, ids: np.ndarray, *, w
         ids: Object of each pixel, 0 for the background. [H, W]
         wide: Write the mask in 16 bits.
     """
-    write_png(folder / f"{stem}.png", image)
-    write_png(folder / "object_mask" / f"{stem}.png", ids.astype(np.uint16 if wide else np.uint8)[..., None])
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write a PNG of one, three or four channels, as small as zlib makes it. [H, W, C] uint8 or uint16"""
-    oiio = require_openimageio()
-    height, width, channels = pixels.shape
-    spec = oiio.ImageSpec(width, height, channels, "uint16" if pixels.dtype == np.uint16 else "uint8")
-    spec.attribute("png:compressionLevel", 9)
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec):
-        raise errors.DatasetError(f"{path}: cannot be written: {output.geterror() if output else oiio.geterror()}")
-    written = output.write_image(np.ascontiguousarray(pixels))
-    closed = output.close()
-    if not (written and closed):
-        raise errors.DatasetError(f"{path}: cannot be written: {output.geterror()}")
+    images = _images()
+    images.write_png(folder / f"{stem}.png", image)
+    images.write_png(folder / "object_mask" / f"{stem}.png", ids.astype(np.uint16 if wide else np.uint8))
 
 
 def read_png(path: Path) -> np.ndarray:
-    """Read an 8-bit PNG with straight alpha. [H, W, C] uint8"""
-    oiio = require_openimageio()
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise errors.DatasetError(f"{path}: cannot be read: {oiio.geterror()}")
-    pixels = source.read_image("uint8")
-    source.close()
-    return pixels
+    """Read a PNG's stored integers, alpha straight. [H, W, C] uint8 or uint16"""
+    return _images().read_png(path)
 
 
 def read_exr_channel(path: Path, endings: tuple[str, ...]) -> np.ndarray:
