@@ -28,7 +28,9 @@ ALLOWED = {
     "train": {"motion", "scene", "data", "model", "raster"},
     "report": {"motion", "scene", "data", "model", "raster", "semantics"},
     "serve": {"motion", "scene", "model", "raster", "semantics"},
-    "cli": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve"},
+    "progress": set(),
+    "demo": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
+    "cli": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress", "demo"},
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}

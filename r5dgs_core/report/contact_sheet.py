@@ -15,7 +15,7 @@ from ..data import dataset as datasets
 from ..data import images
 from ..scene.scene import Scene
 from . import metrics
-from .evaluate import Rendering, render
+from .evaluate import Rendering, render, truth_background
 
 COLUMNS = 4
 GAIN = 4.0
@@ -62,7 +62,7 @@ def write(
         path: PNG file to write.
         views: Its columns, `choose_views` where None.
         mode: Way to move past t_max.
-        background: Colour behind transparent pixels of the true images, sRGB, white where None. [3]
+        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
         backend: Rasterizer.
 
     Returns:
@@ -70,6 +70,7 @@ def write(
     """
     views = choose_views(dataset) if views is None else views
     renderings = [render(scene, view.camera, view.t, mode, backend=backend) for view in views]
+    background = truth_background(scene) if background is None else background
     truths = [datasets.load_image(view, background) for view in views]
     masks = [datasets.load_mask(view) for view in views]
     images.write_png(path, draw(scene, views, renderings, truths, masks))

@@ -73,7 +73,7 @@ def evaluate(
         dataset: The data set.
         modes: Ways to move past t_max, of `playback.MODES`.
         splits: Splits to measure.
-        background: Colour behind transparent pixels of the true images, sRGB, white where None. [3]
+        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
         backend: Rasterizer.
         train: What the training took: "seconds", "iterations", "gaussians".
         progress: Called with images measured and their number.
@@ -82,6 +82,7 @@ def evaluate(
         ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types; what could
         not be computed is None.
     """
+    background = truth_background(scene) if background is None else background
     total = sum(len(dataset.views(split)) for split in splits) * len(modes)
     done = 0
     result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
@@ -129,6 +130,13 @@ def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backe
         ids = np.maximum(scene_render.to_numpy(output.ids, np.int32), 0)
     rounded = images.to_uint8(color).astype(np.float32) / np.float32(255.0)
     return Rendering(rounded, ids, 1e3 * (moved - start), 1e3 * (rendered - moved))
+
+
+def truth_background(scene: Scene) -> np.ndarray:
+    """Colour that a scene was trained to show where its images are transparent: black if its configuration says so,
+    else white. [3] float32"""
+    train = scene.provenance.get("config", {}).get("train", {})
+    return np.zeros(3, np.float32) if train.get("background") == "black" else np.ones(3, np.float32)
 
 
 def classify(scene: Scene, features: np.ndarray) -> np.ndarray:

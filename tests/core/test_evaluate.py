@@ -141,6 +141,20 @@ def test_the_classifier_decides_the_id_map_where_there_is_one(scene):
     np.testing.assert_array_equal(again, (by_codes + 1) % 4)
 
 
+def test_transparent_pixels_are_compared_on_the_background_of_the_training(scene, data, tmp_path):
+    shutil.copytree(data.root, tmp_path / "clear")
+    for path in (tmp_path / "clear" / "val").iterdir():
+        images.write_png(path, np.zeros((pictures.HEIGHT, pictures.WIDTH, 4), np.uint8))
+    clear = dataset.read(tmp_path / "clear")
+    empty = dataclasses.replace(scene, opacity_logits=np.full_like(scene.opacity_logits, -20))
+    for name, level in (("white", 1.0), ("black", 0.0)):
+        sky = np.full((1, 3), (level - 0.5) / 0.28209479177387814, np.float32)
+        provenance = {"config": {"train": {"background": name}}}
+        shown = dataclasses.replace(empty, background_sh=sky, provenance=provenance)
+        result = evaluate.evaluate(shown, clear, splits=("val",), backend=BACKEND)
+        assert result["splits"]["val"]["rigid"]["psnr"] == 100.0
+
+
 def test_progress_counts_every_image(scene, data):
     seen = []
     evaluate.evaluate(scene, data, backend=BACKEND, progress=lambda done, total: seen.append((done, total)))
