@@ -25,7 +25,6 @@ class _Pass:
     camera: Camera
     view: np.ndarray
     limits: np.ndarray
-    order: np.ndarray
     tile_starts: np.ndarray
     tile_ends: np.ndarray
     pair_ranks: np.ndarray
@@ -139,7 +138,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple
         cpu_projection.gather, len(order) // _WORTH_A_THREAD,
         order, geometry, depths, channels, ranked, values,
     )  # fmt: skip
-    tile_starts, pair_ranks, pair_slots, slot_starts = cpu_tiles.assign_tiles(ranked, width, height)
+    tile_starts, pair_ranks, pair_slots, slot_starts = cpu_tiles.assign_tiles(order, n, ranked, width, height)
     votes, planes = np.zeros(0, np.int32), 0
     if labels is not None and len(order):
         votes = labels.detach().cpu().numpy()[order].clip(-1).astype(np.int32) + np.int32(1)
@@ -158,7 +157,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple
         ids, tile_ends,
     )  # fmt: skip
     state = _Pass(
-        camera, view, limits, order, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values,
+        camera, view, limits, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values,
         image, alpha, depth, transmittance,
     )  # fmt: skip
     return state, ids
@@ -178,7 +177,7 @@ def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
     gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]
     grad_norm = np.zeros(n, np.float32)
     run(
-        cpu_projection.project_backward, len(state.order) // _WORTH_A_THREAD,
-        state.view, means, quats, scales, opacities, state.order, state.slot_starts, slots, *gradients, grad_norm,
+        cpu_projection.project_backward, n // _WORTH_A_THREAD,
+        state.view, means, quats, scales, opacities, state.slot_starts, slots, *gradients, grad_norm,
     )  # fmt: skip
     return gradients, grad_norm

@@ -30,6 +30,7 @@ VIEW = 26
 MOMENTS = 6
 
 _WHITEN = 0.5 / math.log(2.0)  # squares of the scaled (u, v) are this times those of L d
+_UNWHITEN, _UNWHITEN_ROOT = 1 / _WHITEN, 1 / math.sqrt(_WHITEN)
 
 
 @kernel
@@ -142,29 +143,28 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
 
 @kernel
 def project_backward(
-    worker, workers, view, means, quats, scales, opacities, order, slot_starts, slots, d_means, d_quats, d_scales,
+    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, d_means, d_quats, d_scales,
     d_opacities, d_channels, grad_norm,
 ):  # fmt: skip
-    """Gather the pair slots of each visible Gaussian and write its gradients; all other rows stay as they are.
+    """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay as they are.
 
     Args:
         view: See `cpu.pack_view`. [26]
         means, quats, scales, opacities: The inputs, one row per Gaussian.
-        order: Row of each visible Gaussian, near to far. [V]
-        slot_starts: Slots of rank r are slot_starts[r] : slot_starts[r + 1]. [V + 1]
+        slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
         slots: Moments and channel gradients of each pair of Gaussian and tile, depth after the channels. [S, 6 + B]
         d_means, d_quats, d_scales, d_opacities, d_channels: Gradients. [N, ...]
         grad_norm: Norm of the gradient with respect to the projected centre in px. [N]
     """
-    visible = len(order)
-    n_channels = d_channels.shape[1]
+    n, n_channels = d_channels.shape
     width = MOMENTS + n_channels + 1
     sums, rotation, axes = np.empty(width), np.empty(9), np.empty(6)
     d_axes, d_m, d_r = np.empty(6), np.empty(9), np.empty(9)
-    for rank in range(visible * worker // workers, visible * (worker + 1) // workers):
-        i = order[rank]
+    for i in range(n * worker // workers, n * (worker + 1) // workers):
+        if slot_starts[i] == slot_starts[i + 1]:
+            continue
         sums[:] = 0
-        for slot in range(slot_starts[rank], slot_starts[rank + 1]):
+        for slot in range(slot_starts[i], slot_starts[i + 1]):
             for c in range(width):
                 sums[c] += slots[slot, c]
         for c in range(n_channels):
@@ -181,8 +181,8 @@ def project_backward(
         l11, l22, shift = math.sqrt(yy / determinant), math.sqrt(1 / yy), xy / yy
 
         # To the centre: L^T (sum A u, sum A v). To the covariance: L^T (sums of squares) L / 2.
-        su, sv = sums[1] / math.sqrt(_WHITEN), sums[2] / math.sqrt(_WHITEN)
-        suu, suv, svv = sums[3] / _WHITEN, sums[4] / _WHITEN, sums[5] / _WHITEN
+        su, sv = sums[1] * _UNWHITEN_ROOT, sums[2] * _UNWHITEN_ROOT
+        suu, suv, svv = sums[3] * _UNWHITEN, sums[4] * _UNWHITEN, sums[5] * _UNWHITEN
         d_x2d = l11 * su
         d_y2d = l22 * sv - shift * d_x2d
         grad_norm[i] = math.sqrt(d_x2d * d_x2d + d_y2d * d_y2d)
