@@ -234,20 +234,17 @@ def _levenberg(
         right = -jacobian.T @ np.concatenate([(root * batch[0]).reshape(-1), precision * theta])
         normal = jacobian.T @ jacobian
         diagonal = np.diag(normal) + 1e-12 * max(float(np.trace(normal)), 1e-300)
-        improved = False
+        gain, size = -1.0, 0.0
         for _ in range(8):
             step = np.linalg.solve(normal + np.diag(damping * diagonal), right)
             trial = residuals(candidate, (theta + step)[None], track, sigmas)[0]
             trial_cost = float(((root * trial) ** 2).sum() + ((precision * (theta + step)) ** 2).sum())
             if np.isfinite(trial_cost) and trial_cost <= cost:
-                improved = True
+                gain, size = cost - trial_cost, float(np.abs(step).max())
+                theta, values, cost = theta + step, trial, trial_cost
                 break
             damping = min(damping * 10, 1e12)
-        if not improved:
-            break
-        gain = cost - trial_cost
-        theta, values, cost = theta + step, trial, trial_cost
         damping = max(damping * 0.1, 1e-12)
-        if gain <= 1e-9 * cost or np.abs(step).max() < 1e-12:
+        if gain <= 1e-9 * cost or size < 1e-12:
             break
     return theta, values, jacobian

@@ -1,0 +1,181 @@
+"""Find objects by words, without any network: names and aliases, and stored embeddings of words that have them.
+
+A query is cut into wishes at "and", "," and the like; each wish is compared with every name and alias of the table.
+Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .scene import Scene
+
+THRESHOLD = 0.5
+EMBEDDING_THRESHOLD = 0.25  # cosine; encoders put unrelated words of one scene below it
+_TYPO_RATIO = 0.75
+_FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
+_HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
+_SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Match:
+    """One object that a query found.
+
+    Attributes:
+        object_id: Id in the table.
+        score: In (0, 1], 1 for its exact name.
+        why: In words, such as "name 'mug'" or "alias 'cup', spelled 'cupp'".
+    """
+
+    object_id: int
+    score: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Label:
+    """What an object answers to. `search_labels` needs no more, so it works without the scene file."""
+
+    object_id: int
+    name: str
+    aliases: tuple[str, ...] = ()
+
+
+def search(scene: Scene, text: str, threshold: float = THRESHOLD) -> list[Match]:
+    """Objects that a text names, best first.
+
+    Args:
+        scene: The scene; its stored embeddings are used for words that its vocabulary holds.
+        text: One or several names: "red mug", "mugs and lemon".
+        threshold: Least score that counts as a match.
+
+    Returns:
+        Matches with score >= threshold, ranked by score, then by id; empty where nothing matches.
+    """
+    labels = [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
+    found = {match.object_id: match for match in search_labels(labels, text, threshold)}
+    for match in _by_embedding(scene, text):
+        known = found.get(match.object_id)
+        if match.score >= threshold and (known is None or match.score > known.score):
+            found[match.object_id] = match
+    return _ranked(found.values())
+
+
+def search_labels(labels: Sequence[Label], text: str, threshold: float = THRESHOLD) -> list[Match]:
+    """As `search`, on names and aliases alone."""
+    best: dict[int, Match] = {}
+    for wish in wishes(text):
+        for label in labels:
+            match = _match(label, wish)
+            known = best.get(label.object_id)
+            if match is not None and match.score >= threshold and (known is None or match.score > known.score):
+                best[label.object_id] = match
+    return _ranked(best.values())
+
+
+def explain_nothing(labels: Iterable[Label], text: str) -> str:
+    """A sentence for the user when nothing matched, with the names that would."""
+    names = ", ".join(label.name for label in labels)
+    return f"nothing matches {text.strip()!r}; the scene has: {names or 'no objects'}"
+
+
+def wishes(text: str) -> list[list[str]]:
+    """Words of each thing that a text asks for, normalised, fillers left out."""
+    result = []
+    for part in _SPLIT.split(text):
+        words = words_of(part)
+        kept = [word for word in words if word not in _FILLER] or words
+        if kept:
+            result.append(kept)
+    return result
+
+
+def words_of(text: str) -> list[str]:
+    """Words in lower case without accents, in the singular; digits are words."""
+    plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
+    return [singular(word) for word in re.findall(r"[^\W_]+", plain.casefold())]
+
+
+def singular(word: str) -> str:
+    """The word without a regular English plural ending."""
+    if len(word) > 4 and word.endswith("ies"):
+        return word[:-3] + "y"
+    if len(word) > 4 and word.endswith(("ches", "shes", "xes", "sses", "zes")):
+        return word[:-2]
+    if len(word) > 3 and word.endswith("ves"):
+        return word[:-3] + "f"
+    if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")):
+        return word[:-1]
+    return word
+
+
+def _ranked(matches: Iterable[Match]) -> list[Match]:
+    return sorted(matches, key=lambda match: (-round(match.score, 6), match.object_id))
+
+
+def _match(label: Label, wish: list[str]) -> Match | None:
+    """Best of the object's name and aliases for one wish; an alias counts a little less than a name."""
+    best: Match | None = None
+    for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
+        words = words_of(text)
+        if not words:
+            continue
+        table = [[_similarity(word, present) for present in words] for word in wish]
+        whole = "".join(words)
+        said = [max(*row, _similarity(word, whole)) for word, row in zip(wish, table, strict=True)]
+        covered = said[0] if len(said) == 1 else _HEAD_WEIGHT * said[-1] + (1 - _HEAD_WEIGHT) * _mean(said[:-1])
+        named = _mean([max(column) for column in zip(*table, strict=True)])
+        # Words of the name that were not said cost little; words that the name does not have cost much.
+        score = weight * covered * (0.85 + 0.15 * named)
+        if score > 0 and (best is None or score > best.score):
+            spelled = "" if max(said) == 1 else f", near {' '.join(wish)!r}"
+            best = Match(label.object_id, score, f"{kind} {text!r}{spelled}")
+    return best
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _similarity(word: str, present: str) -> float:
+    """Of a word asked for to a word of a name: 1 for equal ones, 0.6 to 0.95 for a part or a typo, else 0.
+
+    A part of the name's word counts ("glob" of "globe"), a word with the name's inside does not ("cupboard" is no cup).
+    """
+    if word == present:
+        return 1.0
+    if len(word) >= 3 and present.startswith(word):
+        return 0.75 + 0.2 * len(word) / len(present)
+    if len(word) >= 3 and word in present:
+        return 0.6 + 0.2 * len(word) / len(present)
+    if min(len(word), len(present)) < 4:
+        return 0.0
+    ratio = difflib.SequenceMatcher(None, word, present, autojunk=False).ratio()
+    if sorted(word) == sorted(present):
+        ratio = max(ratio, 0.85)  # letters exchanged
+    return 0.9 * ratio if ratio >= _TYPO_RATIO else 0.0
+
+
+def _by_embedding(scene: Scene, text: str) -> list[Match]:
+    """Cosine between the stored embedding of a known word and those of the objects, rescaled to a score."""
+    if scene.embeddings is None or scene.vocabulary_embeddings is None:
+        return []
+    rows = {tuple(words_of(word)): i for i, word in enumerate(scene.vocabulary)}
+    matches = []
+    for wish in wishes(text):
+        row = rows.get(tuple(wish))
+        if row is None:
+            continue
+        cosines = np.asarray(scene.embeddings, np.float64) @ np.asarray(scene.vocabulary_embeddings[row], np.float64)
+        for item, cosine in zip(scene.objects, cosines, strict=True):
+            if item.id >= 0 and cosine >= EMBEDDING_THRESHOLD:
+                score = 0.5 + 0.45 * (float(min(cosine, 1.0)) - EMBEDDING_THRESHOLD) / (1 - EMBEDDING_THRESHOLD)
+                matches.append(Match(item.id, score, f"meaning of {scene.vocabulary[row]!r} ({cosine:.2f})"))
+    return matches

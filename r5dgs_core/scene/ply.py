@@ -1,0 +1,229 @@
+"""Gaussians in the PLY files of 3D Gaussian Splatting and Gaussian Grouping.
+
+Columns are looked up by name, because tools order them differently: x y z, f_dc_0..2, f_rest_* (all red, then green,
+then blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (wxyz, normalised here), obj_dc_0..15 (identity
+encoding) and obj_id. Other columns and elements are passed over.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from .. import errors
+from ..motion import rotations
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_HEADER_LIMIT = 1 << 16
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians without objects or motion.
+
+    Attributes:
+        means: Centres, in the file's world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: Natural logarithm of the standard deviations. [N, 3] float32
+        opacity_logits: Before the sigmoid. [N] float32
+        sh: Coefficients, 3DGS convention. [N, K, 3] float32
+        identities: Identity encodings or None. [N, 16] float32
+        object_ids: From obj_id, or None. [N] int32
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    identities: np.ndarray | None = None
+    object_ids: np.ndarray | None = None
+
+
+def write(splats: Splats, path: str | Path, *, plain: bool = False) -> Path:
+    """Write binary little endian, atomically.
+
+    Args:
+        splats: The Gaussians.
+        path: Where to.
+        plain: Leave identities and ids out, for viewers that refuse columns they do not know.
+
+    Returns:
+        The path written.
+    """
+    path = Path(path)
+    columns = _columns(splats, plain)
+    data = np.empty(len(splats.means), [(name, kind) for name, kind, _ in columns])
+    for name, _, values in columns:
+        data[name] = values
+    kinds = {"<f4": "float", "<i4": "int"}
+    header = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default"]
+    header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        try:
+            with open(temporary, "xb") as stream:
+                stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+                stream.write(data.tobytes())
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
+    return path
+
+
+def read(path: str | Path) -> Splats:
+    """Read a PLY of Gaussians; ascii and both byte orders. Raises `SceneFileError` naming what is missing."""
+    path = Path(path)
+    try:
+        with open(path, "rb") as stream:
+            table = _read_vertices(stream, str(path))
+    except OSError as error:
+        raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
+    return _to_splats(table, str(path))
+
+
+def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
+    """Name, type and values in the order of 3DGS."""
+    zeros = np.zeros(len(splats.means), np.float32)
+    columns = [(name, "<f4", splats.means[:, i]) for i, name in enumerate("xyz")]
+    columns += [(name, "<f4", zeros) for name in ("nx", "ny", "nz")]
+    columns += [(f"f_dc_{c}", "<f4", splats.sh[:, 0, c]) for c in range(3)]
+    rest = splats.sh.shape[1] - 1
+    columns += [(f"f_rest_{c * rest + k}", "<f4", splats.sh[:, 1 + k, c]) for c in range(3) for k in range(rest)]
+    columns += [("opacity", "<f4", splats.opacity_logits)]
+    columns += [(f"scale_{i}", "<f4", splats.log_scales[:, i]) for i in range(3)]
+    columns += [(f"rot_{i}", "<f4", splats.quats[:, i]) for i in range(4)]
+    if splats.identities is not None and not plain:
+        columns += [(f"obj_dc_{i}", "<f4", splats.identities[:, i]) for i in range(splats.identities.shape[1])]
+    if splats.object_ids is not None and not plain:
+        columns += [("obj_id", "<i4", splats.object_ids)]
+    return columns
+
+
+def _read_header(stream: BinaryIO, place: str) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]]]:
+    """Format, and per element its name, count and properties (name, numpy type; "list" for lists)."""
+    if stream.readline(8).strip() != b"ply":
+        raise errors.SceneFileError(f"{place}: expected a PLY file, found another kind (no 'ply' in the first line)")
+    layout, elements = "", []
+    while True:
+        raw = stream.readline(_HEADER_LIMIT)
+        if not raw.endswith(b"\n") or stream.tell() > 1 << 22:
+            raise errors.SceneFileError(f"{place}: expected 'end_header', found the end of the file; it is truncated")
+        words = raw.decode("ascii", "replace").split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "end_header":
+            break
+        if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
+            layout = words[1]
+        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
+            elements.append((words[1], int(words[2]), []))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            elements[-1][2].append((words[2], _TYPES[words[1]]))
+        elif words[0] == "property" and elements and words[1:2] == ["list"] and len(words) == 5:
+            elements[-1][2].append((words[4], "list"))
+        else:
+            raise errors.SceneFileError(f"{place}: header: expected a PLY statement, found {' '.join(words)!r}")
+    if not layout:
+        raise errors.SceneFileError(f"{place}: header: expected one of the formats {', '.join(_ORDERS)}, found none")
+    return layout, elements
+
+
+def _read_vertices(stream: BinaryIO, place: str) -> np.ndarray:
+    """The vertex element as a structured array."""
+    layout, elements = _read_header(stream, place)
+    for name, count, properties in elements:
+        if any(kind == "list" for _, kind in properties):
+            raise errors.SceneFileError(f"{place}: expected the vertices first and without lists, found {name!r}")
+        if len({column for column, _ in properties}) != len(properties):
+            raise errors.SceneFileError(f"{place}: element {name}: expected unique property names")
+        dtype = np.dtype([(column, _ORDERS[layout] + kind) for column, kind in properties])
+        if layout == "ascii":
+            table = _read_ascii(stream, count, dtype, f"{place}: element {name}")
+        else:
+            data = stream.read(count * dtype.itemsize)
+            if len(data) != count * dtype.itemsize:
+                raise errors.SceneFileError(
+                    f"{place}: element {name}: expected {count} rows of {dtype.itemsize} bytes, "
+                    f"found {len(data)} bytes; the file is truncated"
+                )
+            table = np.frombuffer(data, dtype)
+        if name == "vertex":
+            return table
+    raise errors.SceneFileError(f"{place}: expected an element 'vertex', found {[e[0] for e in elements]}")
+
+
+def _read_ascii(stream: BinaryIO, count: int, dtype: np.dtype, place: str) -> np.ndarray:
+    table = np.empty(count, dtype)
+    names = dtype.names or ()
+    for row in range(count):
+        words = stream.readline().split()
+        if len(words) != len(names):
+            raise errors.SceneFileError(f"{place}: row {row}: expected {len(names)} numbers, found {len(words)}")
+        try:
+            table[row] = tuple(float(word) for word in words)
+        except (ValueError, OverflowError) as error:
+            raise errors.SceneFileError(f"{place}: row {row}: expected numbers, found {words[:4]}") from error
+    return table
+
+
+def _to_splats(table: np.ndarray, place: str) -> Splats:
+    names = table.dtype.names or ()
+
+    def stack(columns: list[str]) -> np.ndarray:
+        missing = [column for column in columns if column not in names]
+        if missing:
+            raise errors.SceneFileError(
+                f"{place}: expected the columns of a Gaussian splat, not found: {', '.join(missing)}"
+            )
+        values = np.stack([table[column].astype(np.float32) for column in columns], axis=-1)
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
+            raise errors.SceneFileError(f"{place}: row {row}: expected finite {columns[0]}.., found NaN or infinity")
+        return values
+
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in (0, 9, 24, 45):
+        raise errors.SceneFileError(f"{place}: expected 0, 9, 24 or 45 columns f_rest_*, found {rest}")
+    sh = stack([f"f_dc_{c}" for c in range(3)])[:, None]
+    if rest:
+        channels = stack([f"f_rest_{i}" for i in range(rest)]).reshape(len(table), 3, rest // 3)
+        sh = np.concatenate([sh, channels.transpose(0, 2, 1)], axis=1)
+    encoding = sum(name.startswith("obj_dc_") for name in names)
+    quats = stack([f"rot_{i}" for i in range(4)]).astype(np.float64)
+    return Splats(
+        means=stack(list("xyz")),
+        quats=rotations.normalize(quats).astype(np.float32),
+        log_scales=stack([f"scale_{i}" for i in range(3)]),
+        opacity_logits=stack(["opacity"])[:, 0],
+        sh=np.ascontiguousarray(sh),
+        identities=stack([f"obj_dc_{i}" for i in range(encoding)]) if encoding else None,
+        object_ids=table["obj_id"].astype(np.int32) if "obj_id" in names else None,
+    )
