@@ -95,6 +95,8 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         )
         shift = c + group.displacements + rotations.rotate(relative, pivot - c - d) - pivot
         relative[last], shift[last] = [1.0, 0, 0, 0], 0.0
+        if group.role == "pinned":
+            shift[:] = 0.0
         track_poses.append(np.concatenate([relative, shift], axis=1))
         rows.append(_motion_group(index, group, tensors, pivot, relative, shift, means[members], opacities[members]))
     order = np.lexsort((motion_ids, object_ids))

@@ -16,9 +16,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..model.posing import Splats
 from ..raster import rasterize_splats
 from .config import IdentitySection
+from .posing import Splats
 from .views import TrainView
 
 VOTE_VIEWS = 80

@@ -8,10 +8,11 @@ G*(dS/dmu1) + 2 x G*(dS/ds1) + y G*(dS/ds12), taken at fixed raw moments.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
+
+from ..raster import compile as kernels
 
 _OFFSETS = np.arange(11) - 5
 _WINDOW = np.exp(-(_OFFSETS**2) / (2 * 1.5**2))
@@ -40,108 +41,114 @@ class _Photometric(torch.autograd.Function):
     def forward(ctx, image, target, ssim_weight):
         x = image.detach().contiguous().numpy()
         y = target.contiguous().numpy()
-        gradient = np.empty_like(x)
-        value = _loss(x, y, np.float32(ssim_weight), WINDOW, gradient)
-        ctx.gradient = torch.from_numpy(gradient)
-        return image.new_tensor(value)
+        height, width, _ = x.shape
+        shape = (height, 3 * width)
+        x, y = x.reshape(shape), y.reshape(shape)
+        moments = np.empty((5, *shape), np.float32)
+        slopes = np.empty((3, *shape), np.float32)
+        sums = np.empty((height, 2), np.float64)
+        gradient = np.empty(shape, np.float32)
+        kernels.run(_moments, height, x, y, WINDOW, moments)
+        kernels.run(_compare, height, x, y, WINDOW, moments, slopes, sums)
+        kernels.run(_gather, height, x, y, WINDOW, slopes, np.float32(ssim_weight), gradient)
+        similarity, difference = sums.sum(0) / x.size
+        ctx.gradient = torch.from_numpy(gradient.reshape(height, width, 3))
+        return image.new_tensor((1 - ssim_weight) * difference + ssim_weight * (1 - similarity))
 
     @staticmethod
     def backward(ctx, upstream):
         return ctx.gradient * upstream, None, None
 
 
-@numba.njit(cache=True, fastmath=True)
-def _blur_rows(source, window, out):
-    """Zero-padded 11-tap blur along axis 1 of [H, L] where neighbours lie ``3`` floats apart (interleaved channels)."""
-    height, length = source.shape
-    for r in range(height):
+@kernels.kernel
+def _moments(worker, workers, x, y, window, moments):
+    """x, y, x^2, y^2 and xy blurred along their rows; channels are interleaved, so neighbours lie 3 floats apart."""
+    height, length = x.shape
+    raw = np.empty((5, length), np.float32)
+    for r in range(worker * height // workers, (worker + 1) * height // workers):
+        for j in range(np.uint64(length)):
+            raw[0, j] = x[r, j]
+            raw[1, j] = y[r, j]
+            raw[2, j] = x[r, j] * x[r, j]
+            raw[3, j] = y[r, j] * y[r, j]
+            raw[4, j] = x[r, j] * y[r, j]
+        for m in range(5):
+            _blur_row(raw[m], window, moments[m, r])
+
+
+@kernels.kernel
+def _compare(worker, workers, x, y, window, moments, slopes, sums):
+    """SSIM of each pixel from the moments blurred both ways, and its slopes by them, blurred along the rows."""
+    height, length = x.shape
+    full = np.empty((5, length), np.float32)
+    raw = np.empty((3, length), np.float32)
+    one, two = np.float32(1.0), np.float32(2.0)
+    for r in range(worker * height // workers, (worker + 1) * height // workers):
+        for m in range(5):
+            _blur_column(moments[m], r, window, full[m])
+        similarity = 0.0
+        difference = 0.0
         for j in range(length):
-            out[r, j] = 0.0
-        for k in range(11):
-            shift = 3 * (k - 5)
-            w = window[k]
-            first = max(0, -shift)
-            last = min(length, length - shift)
-            for j in range(np.uint64(last - first)):
-                out[r, j + np.uint64(first)] += w * source[r, j + np.uint64(first + shift)]
-
-
-@numba.njit(cache=True, fastmath=True)
-def _blur_columns(source, window, out):
-    height, length = source.shape
-    for r in range(height):
-        for j in range(length):
-            out[r, j] = 0.0
-        for k in range(11):
-            q = r + k - 5
-            if 0 <= q < height:
-                w = window[k]
-                for j in range(np.uint64(length)):
-                    out[r, j] += w * source[q, j]
-
-
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _loss(image, target, weight, window, gradient):
-    height, width, _ = image.shape
-    length = width * 3
-    n = np.float32(height * length)
-    x = image.reshape(height, length)
-    y = target.reshape(height, length)
-    g = gradient.reshape(height, length)
-    maps = np.empty((5, height, length), np.float32)
-    for m in numba.prange(5):
-        raw = np.empty((height, length), np.float32)
-        rows = np.empty((height, length), np.float32)
-        for r in range(height):
-            for j in range(length):
-                if m == 0:
-                    raw[r, j] = x[r, j]
-                elif m == 1:
-                    raw[r, j] = y[r, j]
-                elif m == 2:
-                    raw[r, j] = x[r, j] * x[r, j]
-                elif m == 3:
-                    raw[r, j] = y[r, j] * y[r, j]
-                else:
-                    raw[r, j] = x[r, j] * y[r, j]
-        _blur_rows(raw, window, rows)
-        _blur_columns(rows, window, maps[m])
-    partial = np.zeros((height, 2), np.float64)
-    for r in numba.prange(height):
-        for j in range(length):
-            mu1 = maps[0, r, j]
-            mu2 = maps[1, r, j]
-            a = 2 * mu1 * mu2 + C1
-            b = 2 * (maps[4, r, j] - mu1 * mu2) + C2
+            mu1, mu2 = full[0, j], full[1, j]
+            a = two * mu1 * mu2 + C1
+            b = two * (full[4, j] - mu1 * mu2) + C2
             c = mu1 * mu1 + mu2 * mu2 + C1
-            d = maps[2, r, j] - mu1 * mu1 + maps[3, r, j] - mu2 * mu2 + C2
-            inverse = np.float32(1.0) / (c * d)
+            d = full[2, j] - mu1 * mu1 + full[3, j] - mu2 * mu2 + C2
+            inverse = one / (c * d)
             s = a * b * inverse
-            partial[r, 0] += s
-            partial[r, 1] += abs(x[r, j] - y[r, j])
-            # Partial derivatives by the raw moments E[x], E[x^2], E[xy].
-            maps[0, r, j] = 2 * mu2 * (b - a) * inverse - 2 * mu1 * s * (1 / c - 1 / d)
-            maps[2, r, j] = -s / d
-            maps[4, r, j] = 2 * a * inverse
-    for which in numba.prange(3):
-        m = 2 * which
-        rows = np.empty((height, length), np.float32)
-        _blur_rows(maps[m], window, rows)
-        _blur_columns(rows, window, maps[m])
+            similarity += s
+            difference += abs(x[r, j] - y[r, j])
+            raw[0, j] = two * mu2 * (b - a) * inverse - two * mu1 * s * (one / c - one / d)
+            raw[1, j] = -s / d
+            raw[2, j] = two * a * inverse
+        sums[r, 0] = similarity
+        sums[r, 1] = difference
+        for m in range(3):
+            _blur_row(raw[m], window, slopes[m, r])
+
+
+@kernels.kernel
+def _gather(worker, workers, x, y, window, slopes, weight, gradient):
+    """Gradient of the loss by x from the slopes, blurred along the columns."""
+    height, length = x.shape
+    full = np.empty((3, length), np.float32)
+    n = np.float32(height * length)
     l1 = (np.float32(1.0) - weight) / n
-    ds = -weight / n
-    for r in numba.prange(height):
-        for j in range(length):
+    share = -weight / n
+    for r in range(worker * height // workers, (worker + 1) * height // workers):
+        for m in range(3):
+            _blur_column(slopes[m], r, window, full[m])
+        for j in range(np.uint64(length)):
             difference = x[r, j] - y[r, j]
-            slope = np.float32(0.0)
-            if difference > 0:
-                slope = l1
-            elif difference < 0:
-                slope = -l1
-            g[r, j] = slope + ds * (maps[0, r, j] + 2 * x[r, j] * maps[2, r, j] + y[r, j] * maps[4, r, j])
-    total_s = 0.0
-    total_l = 0.0
-    for r in range(height):
-        total_s += partial[r, 0]
-        total_l += partial[r, 1]
-    return (1.0 - weight) * total_l / n + weight * (1.0 - total_s / n)
+            sign = np.float32(difference > 0) - np.float32(difference < 0)
+            chain = full[0, j] + np.float32(2.0) * x[r, j] * full[1, j] + y[r, j] * full[2, j]
+            gradient[r, j] = l1 * sign + share * chain
+
+
+@kernels.kernel
+def _blur_row(source, window, out):
+    length = len(source)
+    for j in range(np.uint64(length)):
+        out[j] = np.float32(0.0)
+    for k in range(11):
+        shift = 3 * (k - 5)
+        w = window[k]
+        first, last = max(0, -shift), min(length, length - shift)
+        if last > first:
+            target, neighbours = out[first:last], source[first + shift : last + shift]
+            for j in range(np.uint64(last - first)):
+                target[j] += w * neighbours[j]
+
+
+@kernels.kernel
+def _blur_column(source, r, window, out):
+    height, length = source.shape
+    for j in range(np.uint64(length)):
+        out[j] = np.float32(0.0)
+    for k in range(11):
+        q = r + k - 5
+        if 0 <= q < height:
+            w = window[k]
+            row = source[q]
+            for j in range(np.uint64(length)):
+                out[j] += w * row[j]

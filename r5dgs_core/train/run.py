@@ -14,9 +14,9 @@ import torch
 
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted
-from ..model.posing import Splats
 from . import checkpoint, identity
 from .config import Config
+from .posing import Splats
 from .trainer import Trainer
 from .views import TrainView
 

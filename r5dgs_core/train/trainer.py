@@ -17,14 +17,14 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..errors import TrainingError
-from ..model import posing, spherical_harmonics
+from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import GroupPoses, Tracks
 from ..motion import rotations
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, normalization, views
+from . import densification, initialization, losses, normalization, posing, views
 from .config import Config
 
 log = logging.getLogger(__name__)

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from .tracks import GroupPoses
+from ..model.tracks import GroupPoses
+from ..raster import compile as kernels
 
 CHUNKS = 16
 
@@ -94,7 +94,7 @@ class _Pose(torch.autograd.Function):
         n = len(arrays[0])
         out = [np.empty((n, 3), np.float32), np.empty((n, 4), np.float32), np.empty((n, 3), np.float32)]
         out += [np.empty(n, np.float32), np.empty((n, 3), np.float32)]
-        _forward(*arrays, ids_array, centers_array, *out)
+        kernels.run(_forward, CHUNKS, *arrays, ids_array, centers_array, *out)
         ctx.saved = (arrays, ids_array, centers_array, out)
         return tuple(torch.from_numpy(a) for a in out)
 
@@ -102,11 +102,12 @@ class _Pose(torch.autograd.Function):
     def backward(ctx, *grads):
         arrays, ids, centers, out = ctx.saved
         upstream = [np.zeros_like(o) if g is None else g.contiguous().numpy() for g, o in zip(grads, out, strict=True)]
-        n, groups = len(ids), len(centers)
+        groups = len(centers)
         result = [np.empty_like(a) for a in arrays[:6]]
         group_grads = np.zeros((CHUNKS, groups, 16), np.float64)
         light_grad = np.zeros((CHUNKS, 3), np.float64)
-        _backward(*arrays, ids, centers, out[2], out[3], *upstream, *result, group_grads, light_grad, n)
+        inputs = (*arrays, ids, centers, out[2], out[3], *upstream)
+        kernels.run(_backward, CHUNKS, *inputs, *result, group_grads, light_grad)
         total = group_grads.sum(0)
         tensors = [torch.from_numpy(a) for a in result]
         return (
@@ -120,10 +121,30 @@ class _Pose(torch.autograd.Function):
         )
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
-def _forward(means, quats, log_scales, logits, colors, shading, light, gq, gr, gd, ids, centers, om, oq, os, oo, oc):
+@kernels.kernel
+def _forward(
+    worker,
+    workers,
+    means,
+    quats,
+    log_scales,
+    logits,
+    colors,
+    shading,
+    light,
+    gq,
+    gr,
+    gd,
+    ids,
+    centers,
+    om,
+    oq,
+    os,
+    oo,
+    oc,
+):
     n = len(ids)
-    for chunk in numba.prange(CHUNKS):
+    for chunk in range(worker, CHUNKS, workers):
         for i in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             g = ids[i]
             x0 = means[i, 0] - centers[g, 0]
@@ -147,12 +168,13 @@ def _forward(means, quats, log_scales, logits, colors, shading, light, gq, gr, g
                 oc[i, a] = max(colors[i, a], np.float32(0.0)) * turn
 
 
-@numba.njit(cache=True, parallel=True, fastmath=True)
+@kernels.kernel
 def _backward(
-    means, quats, log_scales, logits, colors, shading, light, gq, gr, gd, ids, centers, scales, opacities,
-    dm, dq, ds, do, dc, rm, rq, rs, ro, rc, rg, group_grads, light_grad, n,
+    worker, workers, means, quats, log_scales, logits, colors, shading, light, gq, gr, gd, ids, centers,
+    scales, opacities, dm, dq, ds, do, dc, rm, rq, rs, ro, rc, rg, group_grads, light_grad,
 ):  # fmt: skip
-    for chunk in numba.prange(CHUNKS):
+    n = len(ids)
+    for chunk in range(worker, CHUNKS, workers):
         for i in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
             g = ids[i]
             acc = group_grads[chunk, g]
@@ -178,7 +200,7 @@ def _backward(
                     acc[3 * a + b] += dm[i, a] * (means[i, b] - centers[g, b]) + dturn * light[a] * shading[i, b]
                 acc[9 + a] += dm[i, a]
             ro[i] = do[i] * opacities[i] * (np.float32(1.0) - opacities[i])
-            # quat' = q_g * quat is linear in both factors; the transpose of a product is the product with the conjugate.
+            # quat' = q_g * quat is linear in both factors; a product's transpose is the product with the conjugate.
             uw, ux, uy, uz = dq[i, 0], dq[i, 1], dq[i, 2], dq[i, 3]
             aw, ax, ay, az = gq[g, 0], -gq[g, 1], -gq[g, 2], -gq[g, 3]
             rq[i, 0] = aw * uw - ax * ux - ay * uy - az * uz
