@@ -1,0 +1,89 @@
+"""What the project's files say about each other: versions, licence, pins, commands, links."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+import r5dgs_core
+from r5dgs_core import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MANIFEST = tomllib.loads((ROOT / "blender_manifest.toml").read_text())
+# Extras that this project does not test; what they bring is not pinned.
+UNTESTED_EXTRAS = {"encoders", "cuda"}
+
+
+def pins() -> dict[str, Version]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    found = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    return {normal(pin.name): Version(next(iter(pin.specifier)).version) for pin in found}
+
+
+def normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def requirements() -> list[Requirement]:
+    extras = PROJECT["project"]["optional-dependencies"]
+    tested = [line for name, lines in extras.items() if name not in UNTESTED_EXTRAS for line in lines]
+    return [Requirement(line) for line in PROJECT["project"]["dependencies"] + tested]
+
+
+def test_the_extension_and_the_package_have_one_version_and_licence():
+    assert Version(MANIFEST["version"]) == Version(r5dgs_core.__version__)
+    assert MANIFEST["license"] == [f"SPDX:{PROJECT['project']['license']}"]
+    text = (ROOT / "LICENSE").read_text()
+    assert "GNU GENERAL PUBLIC LICENSE" in text and "Version 3, 29 June 2007" in text
+    assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_what_was_tested_lies_in_the_ranges_and_everything_needed_is_pinned():
+    tested = pins()
+    for requirement in requirements():
+        assert normal(requirement.name) in tested, f"{requirement.name} is not in constraints.txt"
+        assert requirement.specifier.contains(tested[normal(requirement.name)]), requirement
+
+
+def test_every_package_that_the_core_imports_is_a_dependency():
+    declared = {normal(Requirement(line).name) for line in PROJECT["project"]["dependencies"]}
+    imported = set()
+    for path in (ROOT / "r5dgs_core").rglob("*.py"):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                imported.add((node.module or "").split(".")[0])
+    packages = {normal(name) for name in imported - sys.stdlib_module_names}
+    assert packages <= declared, f"imported at the top of a module of the core: {sorted(packages - declared)}"
+
+
+def test_the_commands_of_the_readme_exist():
+    text = (ROOT / "README.md").read_text()
+    commands = set(re.findall(r"^ {4}(?:.*&& )?r5dgs (\w+)", text, re.MULTILINE))
+    known = set(next(a for a in cli.parser()._actions if a.dest == "command").choices)
+    assert {"demo", "train", "bake", "evaluate"} <= commands <= known
+
+
+def test_links_between_documents_lead_somewhere():
+    documents = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    for document in documents:
+        for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text()):
+            assert (document.parent / target).exists(), f"{document.relative_to(ROOT)}: {target}"
+
+
+def test_tracked_text_names_no_home_folder():
+    for path in [
+        *ROOT.glob("*.toml"),
+        *ROOT.glob("*.md"),
+        *(ROOT / "docs").glob("*.md"),
+        *ROOT.rglob("r5dgs_*/**/*.py"),
+    ]:
+        assert not re.search(r"(?<![\w.])/(?:home|root|Users)/\w", path.read_text()), path
