@@ -1,8 +1,8 @@
 """How the kernels of the `cpu` backend are compiled, cached and run on several threads.
 
-A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work and releases the interpreter lock.
-Plain Python threads run the shares: compiling takes a fraction of what numba's own parallel loops take, calls from several
-threads at once are safe, and results cannot depend on a threading layer.
+A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work and releases the interpreter
+lock. Plain Python threads run the shares: compiling takes a fraction of what numba's own parallel loops take, calls
+from several threads at once are safe, and results cannot depend on a threading layer.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Kernels that blend the pairs of each tile, and take the gradient of that.
 
 A tile is worked on in strips of eight pixels of one row (`lanes`), numbered column of strips by column of strips. Tile
-buffers keep what belongs to a strip together. Channels come in fours: the D channels, then depth, then zeros. A finished
-pixel keeps its transmittance T with the sign turned. Pairs are copied to a small tile-local table a batch at a time: the
-copies are independent of each other, so that their cache misses overlap, and what follows finds all it needs close by.
+buffers keep what belongs to a strip together. Channels come in fours: the D channels, then depth, then zeros. A
+finished pixel keeps its transmittance T with the sign turned. Pairs are copied to a small tile-local table a batch at a
+time: the copies do not wait for each other, so that their cache misses overlap, and what follows has it all close by.
 """
 
 from __future__ import annotations
@@ -165,9 +165,9 @@ def blend_backward(
 ):  # fmt: skip
     """Write the gradient slot of every pair of every workers-th tile: moments, then channels, depth and zeros.
 
-    Goes near to far like `blend`. With s_i the inner product of channels and gradient, w_i the weight and h the gradient
-    of what lies behind, dL/d(alpha_i) = T_i s_i - rest_i / (1 - alpha_i), where rest_i = sum_{j > i} w_j s_j + T_end h is
-    the known total minus the terms passed so far: one number per pixel serves all channels.
+    Goes near to far like `blend`. With s_i the inner product of channels and gradient, w_i the weight and h the
+    gradient of what lies behind, dL/d(alpha_i) = T_i s_i - rest_i / (1 - alpha_i), where the rest, the sum of w_j s_j
+    over j > i plus T_end h, is the known total minus the terms passed so far: one number per pixel serves all channels.
 
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the

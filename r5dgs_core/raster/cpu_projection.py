@@ -214,9 +214,7 @@ def project_backward(
             d_y -= (j01 * d_j02 + j11 * d_j12) * inverse_z
         d_z -= d_x * u + d_y * v
         for k in range(3):
-            d_means[i, k] = (
-                view[ROTATION + k] * d_x + view[ROTATION + 3 + k] * d_y + view[ROTATION + 6 + k] * d_z
-            )
+            d_means[i, k] = view[ROTATION + k] * d_x + view[ROTATION + 3 + k] * d_y + view[ROTATION + 6 + k] * d_z
 
         # R = W^T (W R); then through the normalisation of the quaternion.
         for row in range(3):
@@ -242,7 +240,7 @@ def project_backward(
 
 @kernel
 def gather(worker, workers, order, geometry, depths, channels, ranked_geometry, ranked_values):
-    """Copy the visible Gaussians in depth order: geometry [V, 8]; channels, depth and zeros up to a multiple of 4 [V, B]."""
+    """Copy the visible Gaussians in depth order: geometry [V, 8]; channels, depth, zeros to a multiple of 4 [V, B]."""
     n, n_channels, width = len(order), channels.shape[1], ranked_values.shape[1]
     for rank in range(n * worker // workers, n * (worker + 1) // workers):
         i = order[rank]

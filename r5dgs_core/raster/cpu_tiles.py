@@ -13,10 +13,10 @@ import numpy as np
 from .compile import kernel
 from .cpu_projection import EXTENT_X, EXTENT_Y, L11, L22, MEAN_X, MEAN_Y, SHIFT
 
-TILE = 32  # px; wider tiles make fewer pairs, narrower ones finish earlier in opaque scenes
+TILE = 32  # px; larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
 
 _DIGIT = 11  # bits per pass of the radix sort
-_MARGIN = 0.01  # px added to the extents, far more than rounding takes away; which pixels count is decided exactly later
+_MARGIN = 0.01  # px added to the extents, far more than rounding takes away; exact decisions come later
 
 
 @kernel

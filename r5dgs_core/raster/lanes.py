@@ -1,9 +1,9 @@
 """Eight floats at once, inside numba kernels.
 
-Numba vectorizes loops only when it can prove enough about them, and short rows of pixels never qualify. These types make
-the vector explicit: ``Lanes`` is eight float32, ``Mask`` eight booleans, and every operation is one vector instruction
-(or two where the machine's vectors are shorter). Sums of products are fused only where `fma` is written, so that the
-forward and the backward pass decide alike, to the bit.
+Numba vectorizes loops only when it can prove enough about them, and short rows of pixels never qualify. These types
+make the vector explicit: ``lanes`` are eight float32, a ``mask`` is eight booleans, and every operation is one vector
+instruction (or two where the machine's vectors are shorter). Sums of products are fused only where `fma` is written, so
+that the forward and the backward pass decide alike, to the bit.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ def _constant(value):
 
 def _call(builder, name, result, arguments, fastmath=()):
     function_type = ir.FunctionType(result, [a.type for a in arguments])
-    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), arguments, fastmath=fastmath)
+    function = cgutils.get_or_insert_function(builder.module, function_type, name)
+    return builder.call(function, arguments, fastmath=fastmath)
 
 
 def _address(context, builder, array_type, array, index):
