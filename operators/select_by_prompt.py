@@ -4,6 +4,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ..r5dgs_addon import objects, prompt
+from ..r5dgs_core.scene import lookup
 
 MODES = (
     ("SET", "Set", "Select these objects only", "SELECT_SET", 0),
@@ -42,8 +43,8 @@ class R5DGS_OT_select_by_prompt(bpy.types.Operator):
         matches = prompt.search(collection, text)
         prompt.show(session, text, matches)
         if not matches:
-            known = ", ".join(entry.name for entry in collection.r5dgs.table if entry.object_id > 0)
-            self.report({"WARNING"}, f"Nothing matches '{text}'; known are: {known}")
+            said = lookup.explain_nothing(prompt.remembered(collection), text)
+            self.report({"WARNING"}, said[0].upper() + said[1:])
             return {"CANCELLED"}
         missed = prompt.select(context, collection, [match.object_id for match in matches], self.mode)
         said = ", ".join(f"{match.name} ({match.score:.2f})" for match in matches)

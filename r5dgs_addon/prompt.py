@@ -1,12 +1,10 @@
 """Words to objects, from the table that the .blend file keeps: neither the scene file nor torch is needed."""
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import bpy
 
 from ..r5dgs_core.scene import lookup
-from ..r5dgs_core.scene.scene import SceneObject
 from . import objects
 
 
@@ -22,17 +20,19 @@ class Match:
 
 def search(collection: bpy.types.Collection, text: str) -> list[Match]:
     """Objects of a loaded scene that words name, best first; empty where nothing matches."""
-    table = collection.r5dgs.table
-    rows, start = [], 0
-    for entry in table:
-        aliases = tuple(word.strip() for word in entry.aliases.split(",") if word.strip())
-        rows.append(
-            SceneObject(entry.object_id, entry.name, aliases, entry.caption, (0.5, 0.5, 0.5), start, entry.count)
-        )
-        start += entry.count
-    remembered = SimpleNamespace(objects=tuple(rows), embeddings=None, vocabulary=(), vocabulary_embeddings=None)
-    names = {row.id: row.name for row in rows}
-    return [Match(i, names[i], float(score), why) for i, score, why in lookup.search(remembered, text)]
+    labels = remembered(collection)
+    names = {label.object_id: label.name for label in labels}
+    found = lookup.search_labels(labels, text)
+    return [Match(match.object_id, names[match.object_id], match.score, match.why) for match in found]
+
+
+def remembered(collection: bpy.types.Collection) -> list[lookup.Label]:
+    """What the objects of a loaded scene answer to; the unassigned Gaussians answer to nothing."""
+    return [
+        lookup.Label(entry.object_id, entry.name, tuple(a.strip() for a in entry.aliases.split(",") if a.strip()))
+        for entry in collection.r5dgs.table
+        if entry.object_id >= 0
+    ]
 
 
 def show(session: bpy.types.PropertyGroup, text: str, matches: list[Match]) -> None:

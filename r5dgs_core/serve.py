@@ -121,7 +121,7 @@ class Server:
     def _query(self, request: dict[str, Any]) -> Answer:
         """``text``: ranked objects of the loaded scene."""
         found = lookup.search(self._loaded(), _need(request, "text", str))
-        return {"matches": [{"object_id": int(i), "score": float(s), "why": str(w)} for i, s, w in found]}, {}
+        return {"matches": [{"object_id": m.object_id, "score": m.score, "why": m.why} for m in found]}, {}
 
     def _loaded(self) -> Scene:
         if self._scene is None:

@@ -1,0 +1,267 @@
+"""The preview is the core's picture of what Blender shows, and a worker in trouble says so."""
+
+import importlib
+import os
+import signal
+import stat
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import cameras, playback, scene_file
+from tests import scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+from mathutils import Matrix, Vector  # noqa: E402  (bpy brings it)
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    scene = scenes.make_scene(n=400, objects=3, sh_degree=2, seed=4, world_convention="colmap")
+    return scene_file.write(scene, tmp_path / "scene.r5dgs")
+
+
+@pytest.fixture
+def worker(blender, monkeypatch):
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    module = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    yield module
+    module.stop()
+
+
+@pytest.fixture
+def loaded(blender, worker, scene_path):
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    scene = scene_file.read(scene_path)
+    place_camera(blender, collection, scene.cameras[0])
+    return collection
+
+
+def place_camera(bpy, collection, camera):
+    data = bpy.data.cameras.new("view")
+    data.sensor_fit = "HORIZONTAL"
+    data.lens = camera.intrinsics[0, 0] * data.sensor_width / camera.width
+    obj = bpy.data.objects.new("view", data)
+    bpy.context.scene.collection.objects.link(obj)
+    world = np.eye(4)
+    world[:3, :3] = cameras.WORLD_TO_BLENDER["colmap"]
+    obj.matrix_world = Matrix((world @ cameras.cam_world_to_opengl(camera.T_cam_world)).tolist())
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = camera.width, camera.height, 100
+    bpy.context.scene.camera = obj
+    return obj
+
+
+def go_to(bpy, t):
+    frame = 1 + 60 * t
+    bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
+
+
+def preview(bpy):
+    assert bpy.ops.r5dgs.preview() == {"FINISHED"}
+    return pixels_of(bpy.data.images["R5DGS Preview"])
+
+
+def pixels_of(image):
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+
+
+def core_picture(scene, pose):
+    return np.clip(scene_render.render_frame(scene, pose, scene.cameras[0]).color.numpy(), 0, 1)
+
+
+def psnr(a, b):
+    return -10 * np.log10(max(float(np.square(a.astype(np.float64) - b).mean()), 1e-12))
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3334, 0.9071])
+def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
+    scene = scene_file.read(scene_path)
+    go_to(blender, t)
+    assert psnr(preview(blender), core_picture(scene, playback.frame(scene, t))) > 45
+
+
+def test_saved_bytes_are_the_pictures_bytes(blender, loaded, scene_path, tmp_path):
+    images = importlib.import_module("r5dgs_core.data.images")
+    scene = scene_file.read(scene_path)
+    go_to(blender, 0.5)
+    preview(blender)
+    image = blender.data.images["R5DGS Preview"]
+    assert image.colorspace_settings.name == "sRGB" and not image.is_float
+    image.filepath_raw, image.file_format = str(tmp_path / "saved.png"), "PNG"
+    image.save()
+    expected = np.round(255 * core_picture(scene, playback.frame(scene, 0.5)))
+    saved = 255 * images.read(tmp_path / "saved.png")[..., :3].astype(np.float64)
+    assert np.abs(saved - expected).max() <= 1.001
+
+
+def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, scene_path):
+    scene = scene_file.read(scene_path)
+    go_to(blender, scene.t_max)
+    by_name = {obj.name: obj for obj in loaded.all_objects}
+    by_name["mug"].hide_set(True)
+    by_name["background"].hide_viewport = True
+    by_name["red apple"].matrix_basis = Matrix.Translation((0.1, 0.2, -0.3)) @ Matrix.Rotation(0.7, 4, "X")
+    instances = []
+    for obj in by_name.values():
+        if obj.r5dgs.role == "CLOUD" and obj.name not in ("mug", "background"):
+            # At t_max anchor and parent inverse cancel: what is left is the cloud's own matrix.
+            instances.append(scene_render.Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
+    expected = core_picture(scene, scene_render.pose_instances(scene, instances))
+    everything = core_picture(scene, playback.frame(scene, scene.t_max))
+    shown = preview(blender)
+    assert psnr(shown, expected) > 45 and psnr(everything, expected) < 30
+
+
+def test_a_duplicate_is_seen_twice_and_a_deleted_cloud_not_at_all(blender, loaded, scene_path):
+    scene = scene_file.read(scene_path)
+    go_to(blender, scene.t_max)
+    apple = loaded.all_objects["red apple"]
+    copy = apple.copy()
+    apple.users_collection[0].objects.link(copy)
+    copy.matrix_basis = Matrix.Translation((0.0, 0.0, 0.6))
+    blender.data.objects.remove(loaded.all_objects["mug"])
+    instances = [
+        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_basis))
+        for o in loaded.all_objects
+        if o.r5dgs.role == "CLOUD"
+    ]
+    assert psnr(preview(blender), core_picture(scene, scene_render.pose_instances(scene, instances))) > 45
+
+
+def test_moving_the_whole_scene_with_its_camera_changes_nothing(blender, loaded):
+    go_to(blender, 0.4)
+    before = preview(blender)
+    camera = blender.context.scene.camera
+    change = Matrix.Translation((3, 1, -2)) @ Matrix.Rotation(1.1, 4, "Z") @ Matrix.Scale(2.5, 4)
+    root = loaded.r5dgs.root
+    camera.matrix_world = change @ camera.matrix_world
+    root.matrix_world = change @ root.matrix_world
+    assert psnr(preview(blender), before) > 45
+
+
+@pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
+@pytest.mark.parametrize("size", [(64, 48, 100), (48, 64, 100), (120, 90, 50)])
+def test_the_camera_projects_as_blenders_own(blender, loaded, fit, size):
+    from bpy_extras.object_utils import world_to_camera_view
+
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    scene = blender.context.scene
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = size
+    data = scene.camera.data
+    data.sensor_fit, data.sensor_height, data.shift_x, data.shift_y = fit, 20.0, 0.13, -0.21
+    seen = picture.shown(blender.context, loaded)
+    width, height = seen.camera.width, seen.camera.height
+    assert (width, height) == (size[0] * size[2] // 100, size[1] * size[2] // 100)
+    world = np.array(loaded.r5dgs.root.matrix_world)[:3, :3]
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    pixels, depth = cameras.project(seen.camera, points)
+    for point, pixel, z in zip(points, pixels, depth, strict=True):
+        x, y, distance = world_to_camera_view(scene, scene.camera, Vector(world @ point))
+        np.testing.assert_allclose(pixel, [x * width, (1 - y) * height], atol=2e-3)
+        assert z == pytest.approx(distance, abs=1e-4)
+
+
+def test_pixel_aspect_is_part_of_the_camera(blender, loaded):
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    square = picture.shown(blender.context, loaded).camera.intrinsics
+    blender.context.scene.render.pixel_aspect_x = 2.0
+    wide = picture.shown(blender.context, loaded).camera.intrinsics
+    assert wide[0, 0] / wide[1, 1] == pytest.approx(0.5 * square[0, 0] / square[1, 1], rel=1e-5)
+
+
+def test_what_cannot_be_rendered_is_refused_with_the_remedy(blender, loaded):
+    blender.context.scene.camera.data.type = "ORTHO"
+    with pytest.raises(RuntimeError, match="Perspective"):
+        blender.ops.r5dgs.preview()
+    blender.context.scene.camera.data.type = "PERSP"
+    loaded.r5dgs.root.scale = (1, 2, 1)
+    with pytest.raises(RuntimeError, match="scale"):
+        blender.ops.r5dgs.preview()
+
+
+def test_a_moved_scene_file_is_found_beside_the_blend_or_missed_by_name(blender, loaded, scene_path, tmp_path):
+    folder = tmp_path / "project"
+    folder.mkdir()
+    blender.ops.wm.save_as_mainfile(filepath=str(folder / "saved.blend"))
+    scene_path.rename(folder / scene_path.name)
+    preview(blender)
+    (folder / scene_path.name).unlink()
+    with pytest.raises(RuntimeError, match="scene.r5dgs.*Scene File"):
+        blender.ops.r5dgs.preview()
+
+
+def test_a_worker_that_died_is_started_again_by_the_next_preview(blender, loaded, worker):
+    preview(blender)
+    first = worker.current()
+    os.kill(first.pid, signal.SIGKILL)
+    while first.alive:
+        time.sleep(0.01)
+    preview(blender)
+    assert worker.current().pid != first.pid
+
+
+def test_a_worker_that_dies_in_a_request_is_an_error_with_its_last_words(worker):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGKILL)
+    with pytest.raises(errors.BackendError, match="ended unexpectedly.*starts it again"):
+        running.request("hello", timeout_s=20)
+    assert worker.current().pid != running.pid
+
+
+def test_a_worker_that_hangs_is_stopped(worker):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    with pytest.raises(errors.BackendError, match="no answer to 'hello' within"):
+        running.request("hello", timeout_s=0.2)
+    assert not running.alive
+
+
+def fake_python(path, script):
+    path.write_text(f"#!{sys.executable}\n{script}")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+def test_a_python_without_torch_is_named_with_the_remedy(blender, loaded, monkeypatch, tmp_path):
+    script = (
+        "import importlib.util, os, runpy, sys\n"
+        "sys.path.insert(0, os.environ['PYTHONPATH'].split(os.pathsep)[0])\n"
+        "find = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name, *a: None if name == 'torch' else find(name, *a)\n"
+        "runpy.run_module('r5dgs_core.serve', run_name='__main__')\n"
+    )
+    monkeypatch.setenv("R5DGS_PYTHON", fake_python(tmp_path / "python", script))
+    with pytest.raises(RuntimeError, match="lacks torch.*pip install r5dgs"):
+        blender.ops.r5dgs.preview()
+    with pytest.raises(RuntimeError, match="lacks torch"):
+        blender.ops.r5dgs.check_worker()
+
+
+@pytest.mark.parametrize("kind", ["absent", "no python", "babbling"])
+def test_a_wrong_python_is_named(blender, loaded, monkeypatch, tmp_path, kind):
+    path = str(tmp_path / "nowhere" / "python")
+    if kind == "no python":
+        path = fake_python(tmp_path / "python", "raise SystemExit('I am not what you think')\n")
+    elif kind == "babbling":
+        path = fake_python(tmp_path / "python", "print('hello there', flush=True)\nimport time; time.sleep(60)\n")
+    monkeypatch.setenv("R5DGS_PYTHON", path)
+    with pytest.raises(RuntimeError, match="worker: .*python"):
+        blender.ops.r5dgs.preview()
+
+
+def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blender, worker):
+    assert blender.ops.r5dgs.check_worker() == {"FINISHED"}
+    running = worker.current()
+    worker.unregister()
+    assert not running.alive
+    worker.register()

@@ -1,0 +1,142 @@
+"""The worker's protocol, in process and as a process."""
+
+import io
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from r5dgs_core import serve  # noqa: E402
+from r5dgs_core.raster import scene_render  # noqa: E402
+from r5dgs_core.scene import playback, scene_file  # noqa: E402
+from tests import scenes  # noqa: E402
+
+CAMERA = scenes.orbit_camera(0.2, 32, 24)
+CAMERA_JSON = {
+    "width": 32,
+    "height": 24,
+    "intrinsics": CAMERA.intrinsics.tolist(),
+    "T_cam_world": CAMERA.T_cam_world.tolist(),
+}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    scene = scenes.make_scene(n=200, sh_degree=1)
+    return scene_file.write(scene, tmp_path_factory.mktemp("serve") / "scene.r5dgs")
+
+
+def talk(*requests):
+    """Answers to requests (bytes are sent as they are): (header, arrays) each."""
+    lines = [r if isinstance(r, bytes) else json.dumps({"id": i, **r}).encode() for i, r in enumerate(requests)]
+    out = io.BytesIO()
+    serve.serve(io.BytesIO(b"\n".join(lines) + b"\n"), out)
+    return parse(out.getvalue())
+
+
+def parse(data):
+    stream, answers = io.BytesIO(data), []
+    while line := stream.readline():
+        header = json.loads(line)
+        arrays = {}
+        for entry in header["arrays"]:
+            count = int(np.prod(entry["shape"]))
+            dtype = np.dtype(entry["dtype"])
+            arrays[entry["name"]] = np.frombuffer(stream.read(count * dtype.itemsize), dtype).reshape(entry["shape"])
+        answers.append((header, arrays))
+    return answers
+
+
+def load(path):
+    return {"command": "load", "path": str(path)}
+
+
+def test_hello_says_what_is_missing_and_which_protocol():
+    (header, _), *_ = talk({"command": "hello"})
+    assert header["ok"] and header["result"]["protocol"] == serve.PROTOCOL and header["result"]["missing"] == []
+
+
+def test_a_rendered_time_is_the_cores_picture(path):
+    scene = scene_file.read(path)
+    expected = scene_render.render_frame(scene, playback.frame(scene, 0.9), CAMERA)
+    request = {"command": "render", "camera": CAMERA_JSON, "t": 0.9, "want": ["depth", "alpha", "ids"]}
+    _, (header, arrays) = talk(load(path), request)
+    assert header["ok"] and header["result"]["gaussians"] == len(scene.means)
+    for name in ("color", "depth", "alpha", "ids"):
+        np.testing.assert_array_equal(arrays[name], getattr(expected, name).numpy())
+
+
+def test_instances_are_moved_and_the_rest_is_not_seen(path):
+    scene = scene_file.read(path)
+    body = scene.object(2)
+    matrix = np.eye(4)
+    matrix[:3, 3] = [0.2, 0, 0.3]
+    posed = scene_render.pose_instances(scene, [scene_render.Instance(body.start, body.count, matrix)])
+    expected = scene_render.render_frame(scene, posed, CAMERA, background=None)
+    instances = [{"start": body.start, "count": body.count, "matrix": matrix.tolist()}]
+    request = {"command": "render", "camera": CAMERA_JSON, "instances": instances, "background": False}
+    _, (header, arrays) = talk(load(path), request)
+    assert header["ok"]
+    np.testing.assert_array_equal(arrays["color"], expected.color.numpy())
+
+
+@pytest.mark.parametrize(
+    ("request_", "kind", "message"),
+    [
+        ({"command": "dance"}, "ConfigError", "unknown command"),
+        ({"command": "render", "camera": CAMERA_JSON}, "ConfigError", "'t'"),
+        ({"command": "render", "t": 0.1}, "ConfigError", "'camera'"),
+        ({"command": "render", "camera": {**CAMERA_JSON, "width": 0}, "t": 0.1}, "ConfigError", "width"),
+        ({"command": "render", "camera": {**CAMERA_JSON, "intrinsics": [1, 2]}, "t": 0.1}, "ConfigError", "3 x 3"),
+        ({"command": "render", "camera": CAMERA_JSON, "t": 0.1, "want": ["smell"]}, "ConfigError", "smell"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [{"start": 0}]}, "ConfigError", "instance"),
+        ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "SceneFileError", "at all.r5dgs"),
+    ],
+)
+def test_impossible_requests_are_answered_by_name_and_the_worker_goes_on(path, request_, kind, message):
+    _, (header, arrays), (after, _) = talk(load(path), request_, {"command": "hello"})
+    assert not header["ok"] and header["error"]["kind"] == kind and message in header["error"]["message"]
+    assert not arrays and after["ok"]
+
+
+def test_rendering_without_a_scene_and_lines_that_are_no_requests_are_errors():
+    (first, _), (second, _), (third, _) = talk(
+        {"command": "render", "camera": CAMERA_JSON, "t": 0.0}, b"not json", b"[1, 2]"
+    )
+    assert "no scene is loaded" in first["error"]["message"]
+    assert "not JSON" in second["error"]["message"] and "JSON object" in third["error"]["message"]
+
+
+def test_a_failed_load_forgets_the_scene_before(path, tmp_path):
+    broken = tmp_path / "broken.r5dgs"
+    broken.write_bytes(path.read_bytes()[:300])
+    _, (failed, _), (render, _) = talk(load(path), load(broken), {"command": "render", "camera": CAMERA_JSON, "t": 0.0})
+    assert failed["error"]["kind"] == "SceneFileError"
+    assert "no scene is loaded" in render["error"]["message"]
+
+
+def test_a_changed_file_is_read_again(path, tmp_path):
+    copy = tmp_path / "scene.r5dgs"
+    copy.write_bytes(path.read_bytes())
+    server = serve.Server()
+    assert server.answer(load(copy))[0]["gaussians"] == 200
+    scene_file.write(scenes.make_scene(n=120), copy)
+    assert server.answer(load(copy))[0]["gaussians"] == 120
+
+
+def test_words_find_objects(path):
+    _, (header, _) = talk(load(path), {"command": "query", "text": "mug"})
+    assert header["result"]["matches"][0]["object_id"] == 1
+
+
+def test_the_process_keeps_its_output_clean_and_ends_with_its_input(path):
+    lines = [load(path), {"command": "render", "camera": CAMERA_JSON, "t": 0.3}, {"command": "shutdown"}]
+    data = b"".join(json.dumps({"id": i, **line}).encode() + b"\n" for i, line in enumerate(lines))
+    done = subprocess.run([sys.executable, "-m", "r5dgs_core.serve"], input=data, capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr.decode()
+    (_, _), (rendered, arrays), (ended, _) = parse(done.stdout)
+    assert rendered["ok"] and ended["ok"] and arrays["color"].shape == (24, 32, 3)
