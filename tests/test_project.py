@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import sys
 import tomllib
@@ -87,3 +88,18 @@ def test_tracked_text_names_no_home_folder():
         *ROOT.rglob("r5dgs_*/**/*.py"),
     ]:
         assert not re.search(r"(?<![\w.])/(?:home|root|Users)/\w", path.read_text()), path
+
+
+def test_every_function_of_the_method_document_exists():
+    names = re.findall(
+        r"`((?:motion|scene|data|model|raster|train|report)\.[\w.]+)`", (ROOT / "docs/method.md").read_text()
+    )
+    assert len(names) > 25
+    for name in names:
+        parts = name.split(".")
+        found = r5dgs_core
+        for i, part in enumerate(parts):
+            if not hasattr(found, part):
+                importlib.import_module(".".join(["r5dgs_core", *parts[: i + 1]]))
+            found = getattr(found, part)
+        assert found.__doc__, name

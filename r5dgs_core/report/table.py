@@ -20,7 +20,7 @@ _ROWS = (
     ("ms_raster", "rasterization, per frame (ms)", "{:.1f}"),
     ("images", "images", "{:d}"),
 )
-_MEANING = {"val": "observed time", "test": "past t_max", "train": "trained on"}
+_CAPTION = "val: held-out views in the observed time; test: later times (as the data set splits them)"
 ABSENT = "not computed"
 
 
@@ -35,11 +35,10 @@ def make(evaluation: dict[str, Any]) -> Table:
     """
     columns = [(split, mode, values) for split, modes in evaluation["splits"].items() for mode, values in modes.items()]
     several = len({mode for _, mode, _ in columns}) > 1
-    table = Table(title=_title(evaluation), title_justify="left")
+    table = Table(title=_title(evaluation), title_justify="left", caption=_CAPTION, caption_justify="left")
     table.add_column("")
     for split, mode, _ in columns:
-        meaning = f"\n{_MEANING[split]}" if split in _MEANING else ""
-        table.add_column(f"{split} {mode}{meaning}" if several else f"{split}{meaning}", justify="right")
+        table.add_column(f"{split} {mode}" if several else split, justify="right")
     padding = [""] * max(0, 2 - len(columns))
     for _ in padding:
         table.add_column("")
