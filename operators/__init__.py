@@ -34,4 +34,3 @@ def unregister():
     for module in reversed(MODULES):
         for cls in reversed(module.CLASSES):
             bpy.utils.unregister_class(cls)
-

@@ -1,8 +1,9 @@
 """The motion of a group as F-curves of its anchor.
 
-In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and the
-knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys are
-taken from the motion model under the same tolerance; they are of another key type, and the key at t_max may have a kink.
+In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and
+the knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys
+are taken from the motion model under the same tolerance; they are of another key type, and at t_max there may be a
+kink.
 """
 
 import bpy
@@ -15,7 +16,7 @@ from ..r5dgs_core.scene import playback
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, timeline
 
-# Of the scene's size. Blender may differ from playback by 1e-5: float32 evaluation and a second curve take their shares.
+# Of the scene's size. Blender may differ from playback by 1e-5: its float32 evaluation takes a share too.
 TOLERANCE = 3e-6
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 

@@ -1,8 +1,8 @@
 """A scene as Blender objects: a collection, a root empty, and per object a collection with anchors and point clouds.
 
 Notation: the root carries the world convention W; the anchor of motion group g stands at the group's pivot p and turns
-and moves by the group's pose (R, d). A point x of the bind state is shown at W T(p + d) R T(-p) x, the last factor being
-the cloud's parent inverse, so that the point cloud holds the file's own coordinates.
+and moves by the group's pose (R, d). A point x of the bind state is shown at W T(p + d) R T(-p) x, where T(-p) is the
+cloud's parent inverse, so that the point cloud holds the file's own coordinates.
 """
 
 import contextlib
@@ -180,9 +180,7 @@ def _anchor_name(scene: Scene, part: Range) -> str:
     return f"{object_name(scene, part.object_id if part.motion_id == 0 else group.object_id)} anchor"
 
 
-def _anchor(
-    collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range
-) -> bpy.types.Object:
+def _anchor(collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range) -> bpy.types.Object:
     anchor = bpy.data.objects.new(_name(_anchor_name(scene, part)), None)
     pivot = _pivot(scene, part)
     anchor.empty_display_type = "ARROWS"
@@ -245,4 +243,3 @@ def _describe(
         entry.name, entry.object_id = item.name, item.id
         entry.aliases = ", ".join(item.aliases)
         entry.caption, entry.count = item.caption, item.count
-

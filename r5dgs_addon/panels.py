@@ -31,7 +31,9 @@ class R5DGS_PT_scene(_Sidebar, bpy.types.Panel):
         t = times.time(context.scene.frame_current_final)
         column = layout.column(align=True)
         named = sum(entry.object_id > 0 for entry in state.table)
-        column.label(text=f"{state.scene_name}: {named} objects, {state.gaussians:,} Gaussians", icon="OUTLINER_COLLECTION")
+        column.label(
+            text=f"{state.scene_name}: {named} objects, {state.gaussians:,} Gaussians", icon="OUTLINER_COLLECTION"
+        )
         column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
         if t > times.t_max + 1e-6:
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")

@@ -44,9 +44,7 @@ def show(session: bpy.types.PropertyGroup, text: str, matches: list[Match]) -> N
         item.name, item.object_id, item.score, item.why = match.name, match.object_id, match.score, match.why
 
 
-def select(
-    context: bpy.types.Context, collection: bpy.types.Collection, object_ids: list[int], mode: str
-) -> list[str]:
+def select(context: bpy.types.Context, collection: bpy.types.Collection, object_ids: list[int], mode: str) -> list[str]:
     """Change the selection by the clouds and anchors of some objects; the best one's anchor becomes active.
 
     Args:

@@ -51,7 +51,7 @@ def of_collection(collection: bpy.types.Collection) -> Times:
 
 
 def default_end(scene: Scene) -> float:
-    """How far motion is extrapolated unless the user says otherwise: a third of the observed span, and at least to 1."""
+    """End of the extrapolation unless the user says otherwise: a third of the observed span later, and at least 1."""
     start = float(scene.track_times[0])
     return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
 

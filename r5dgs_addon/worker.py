@@ -6,6 +6,7 @@ announces. A worker that dies, hangs or talks nonsense is dropped with a clear e
 
 import atexit
 import collections
+import contextlib
 import json
 import os
 import queue
@@ -133,10 +134,8 @@ class Worker:
         """Stop the process and wait until it is gone."""
         process = self._process
         if process.stdin is not None:
-            try:
+            with contextlib.suppress(OSError):
                 process.stdin.close()  # the worker ends by itself when its input ends
-            except OSError:
-                pass
         if process.poll() is None:
             process.terminate()
             try:
@@ -182,11 +181,9 @@ class Worker:
     def _read_stderr(self) -> None:
         stream = self._process.stderr
         assert stream is not None
-        try:
+        with contextlib.suppress(OSError, ValueError):
             for line in stream:
                 self._stderr.append(line.decode(errors="replace").rstrip())
-        except (OSError, ValueError):
-            pass
 
 
 def _error_of(header: dict[str, Any]) -> errors.R5dgsError:

@@ -1,10 +1,11 @@
 """Check a scene inside Blender against the core: every point at every kind of time, and the preview.
 
-    blender -b --python-exit-code 1 --python tests/blender/check_playback.py -- SCENE.r5dgs [--worker PYTHON] [--no-preview]
+    blender -b --python-exit-code 1 --python tests/blender/check_playback.py -- SCENE.r5dgs
 
-runs it in a Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module. Where the extension is not
-enabled, the one that this file lies in is registered. The core's own pictures come from the worker's Python, in a
-process of its own, straight from the scene file. Ends with exit code 1 where anything differs by more than it may.
+runs it in a Blender, ``python tests/blender/check_playback.py SCENE.r5dgs`` in the bpy module; ``--worker PYTHON`` and
+``--no-preview`` are options. Where the extension is not enabled, the one that this file lies in is registered. The
+core's own pictures come from the worker's Python, in a process of its own, straight from the scene file. Ends with exit
+code 1 where anything differs by more than it may.
 """
 
 import argparse
@@ -58,7 +59,8 @@ def times_to_check(scene) -> list[float]:
     inside = first + span * np.array([0.0, 0.137, 0.31, 0.5, 0.763, 0.9])
     past = last + (end - last) * np.array([0.03, 0.21, 0.5, 0.777, 1.0])
     beside = [last - 0.37 * frame, last, min(last + 0.41 * frame, end)]
-    return sorted({*inside.tolist(), *scene.track_times[:: max(len(scene.track_times) // 3, 1)].tolist(), *past, *beside})
+    knots = scene.track_times[:: max(len(scene.track_times) // 3, 1)]
+    return sorted({float(t) for t in (*inside, *knots, *beside, *past)})
 
 
 def set_time(collection, t: float) -> None:

@@ -123,7 +123,8 @@ def test_a_range_left_out_is_not_seen_and_a_range_given_twice_is_seen_twice(scen
     assert set(np.unique(ids.numpy())) <= {-1, 1}
     twice = scene_render.pose_instances(scene, [Instance(body.start, body.count, m) for m in (here, there)])
     assert len(twice.means) == 2 * body.count
-    np.testing.assert_allclose(twice.means[body.count :] - twice.means[: body.count], [[0, 0, 0.5]] * body.count, atol=1e-6)
+    moved = twice.means[body.count :] - twice.means[: body.count]
+    np.testing.assert_allclose(moved, [[0, 0, 0.5]] * body.count, atol=1e-6)
 
 
 def test_black_and_given_backgrounds(scene):
