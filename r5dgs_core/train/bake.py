@@ -24,7 +24,7 @@ from ..motion.models import MotionModel
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from . import checkpoint, needs
 from .normalization import Normalization
-from .trainer import tracks_of
+from .representation import tracks_of
 
 MIN_BIND_FACTOR = 0.1
 

@@ -68,6 +68,7 @@ def train(
     if resume and (run.folder / checkpoint.CHECKPOINT_FILE).exists():
         state = checkpoint.load(folder)
         trainer.restore(state)
+        _trim_log(run.folder / checkpoint.LOG_FILE, trainer.iteration)
         spent = state["seconds"]
         finished = state["finished"]
     if not finished:
@@ -111,18 +112,26 @@ def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, progress: Pro
                 )
 
 
+def _trim_log(path: Path, iteration: int) -> None:
+    """Drop the lines of steps that were taken after the checkpoint and will be taken again."""
+    if path.exists():
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+        kept = [line for line in lines if json.loads(line)["iteration"] <= iteration]
+        checkpoint.write_atomic(path, "".join(line + "\n" for line in kept).encode())
+
+
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
     """Labels and identity encodings on the finished geometry, then the last checkpoint."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
     g = trainer.gaussians
-    bodies = trainer.tracks.bodies
+    bodies = len(trainer.object_ids)
     fallback = torch.where(g.motion_ids < bodies, g.motion_ids, 0)
     extra: dict[str, torch.Tensor] = {"labels": fallback}
     if any(v.mask is not None for v in trainer.views):
 
         @torch.no_grad()
         def pose(view: TrainView) -> Splats:
-            return trainer.splats(view.camera, trainer.tracks.poses(view.t))
+            return trainer.splats(view.camera, view.t)
 
         extra["labels"] = identity.vote(trainer.views, pose, classes, fallback)
         section = trainer.config.identity

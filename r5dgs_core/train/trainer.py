@@ -1,4 +1,4 @@
-"""Training of tracks: canonical Gaussians and one SE(3) track per object, from posed images with masks.
+"""Training: canonical Gaussians and their motion, from posed images with masks.
 
 One view per step: pose the Gaussians at the view's time, rasterize, compare, step. Times enter from a first, well-seen
 one outwards; Gaussians grow where the image asks for it. Everything that a step depends on is in `Trainer.state`, so a
@@ -17,20 +17,17 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..errors import TrainingError
-from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
-from ..model.tracks import GroupPoses, Tracks
-from ..motion import rotations
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import densification, initialization, losses, normalization, posing, views
 from .config import Config
+from .representation import Representation, TracksRepresentation
 
 log = logging.getLogger(__name__)
 
-ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
-REBASE_EVERY = 100
+TARGET_BYTES = 1 << 30
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits")
 
@@ -55,18 +52,18 @@ class Trainer:
         self.views = views.load(dataset, self.normalization, behind)
         start = initialization.start(self.views, config, np.random.default_rng(config.train.seed))
         self.gaussians: Gaussians = start.gaussians
-        self.tracks: Tracks = start.tracks
+        self.motion: Representation = TracksRepresentation(start.tracks, start.places, config)
+        self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
-        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self.background = backgrounds.fixed(behind) if behind is not None else backgrounds.learned(self._sky_color())
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.iteration = 0
         self.entered = (self.first_time, self.first_time)
         self.queue: list[int] = []
         self.running_loss = math.nan
-        self._view_times = np.array([int(np.argmin(np.abs(self.tracks.times - v.t))) for v in self.views])
+        self._view_times = np.array([int(np.argmin(np.abs(self.times - v.t))) for v in self.views])
         sizes = [v.camera.width * v.camera.height for v in self.views]
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
         self._pixel_size = normalization.TARGET_DISTANCE / focal
@@ -96,7 +93,7 @@ class Trainer:
         ]
         groups += [
             {"params": [p], "lr": getattr(rates, name), "name": name, "eps": 1e-8}
-            for name, p in {**self.tracks.params, "light": self.light, **self.background.params}.items()
+            for name, p in {**self.motion.params, **self.background.params}.items()
             if p.requires_grad
         ]
         return torch.optim.Adam(groups, fused=True)
@@ -120,9 +117,8 @@ class Trainer:
         stats = RasterStats()
         image = self.render(view.camera, view.t, stats)
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        total = loss
-        if self.config.losses.roughness > 0 and self.iteration % ROUGHNESS_EVERY == 0:
-            total = total + ROUGHNESS_EVERY * self.config.losses.roughness * self.tracks.roughness()
+        penalty = self.motion.penalty(self.iteration)
+        total = loss if penalty is None else loss + penalty
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         value = float(loss.detach())
@@ -138,7 +134,7 @@ class Trainer:
 
     def render(self, camera: Camera, t: float, stats: RasterStats | None = None) -> Tensor:
         """Image of a camera in normalised coordinates at a time. [H, W, 3]"""
-        splats = self.splats(camera, self.tracks.poses(t))
+        splats = self.splats(camera, t)
         return rasterize_splats(
             splats.means,
             splats.quats,
@@ -150,43 +146,18 @@ class Trainer:
             stats=stats,
         ).image
 
-    def splats(self, camera: Camera, poses: GroupPoses) -> posing.Splats:
-        """Activated Gaussians in normalised coordinates, as a camera sees them."""
-        g = self.gaussians
-        centers = self.tracks.group_centers()
-        colors = spherical_harmonics.dc_to_rgb(g.params["sh"][:, 0])
-        if self.config.train.sh_degree > 0:
-            colors = colors + self._view_dependent(camera, poses, centers)
-        return posing.pose(
-            g.params["means"],
-            g.params["quats"],
-            g.params["log_scales"],
-            g.params["opacity_logits"],
-            colors,
-            g.params["shading"],
-            self.light,
-            g.motion_ids,
-            poses,
-            centers,
-        )
-
-    def _view_dependent(self, camera: Camera, poses: GroupPoses, centers: Tensor) -> Tensor:
-        """Colour of the higher bands, evaluated in each group's own frame. [N, 3]"""
-        eye = torch.from_numpy(camera.center).float()
-        with torch.no_grad():
-            arm = centers + poses.displacements - eye
-            eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
-            towards = self.gaussians.params["means"] - eyes[self.gaussians.motion_ids]
-            directions = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-9)
-            basis = spherical_harmonics.basis(directions, self.config.train.sh_degree)[:, 1:]
-        return (basis[..., None] * self.gaussians.params["sh_rest"]).sum(-2)
+    def splats(self, camera: Camera, t: float) -> posing.Splats:
+        """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
+        return self.motion.splats(self.gaussians, camera, t)
 
     def _target(self, index: int) -> Tensor:
-        if index not in self._targets:
-            if len(self._targets) >= 2000:
-                self._targets.clear()
-            self._targets[index] = torch.from_numpy(self.views[index].image).float() / 255
-        return self._targets[index]
+        """The view's image in [0, 1]; kept as long as all of them fit, converted each time where they do not."""
+        if index in self._targets:
+            return self._targets[index]
+        target = torch.from_numpy(self.views[index].image).float() / 255
+        if sum(v.image.size for v in self.views) * 4 <= TARGET_BYTES:
+            self._targets[index] = target
+        return target
 
     def _rate(self, name: str) -> float:
         rates = self.config.rates
@@ -207,34 +178,18 @@ class Trainer:
 
     def _grow_times(self) -> None:
         first, full = self._curriculum()
-        count = len(self.tracks.times)
+        count = len(self.times)
         reach = max(self.first_time, count - 1 - self.first_time)
         if self.iteration < first or reach == 0:
             return
         stage = reach if self.iteration >= full else 1 + (self.iteration - first) * reach // max(1, full - first)
         stage = min(stage, reach)
         while self.entered[0] > max(0, self.first_time - stage):
-            self._enter(self.entered[0] - 1, +1)
+            self.motion.enter(self.entered[0] - 1, +1, self.entered)
             self.entered = (self.entered[0] - 1, self.entered[1])
         while self.entered[1] < min(count - 1, self.first_time + stage):
-            self._enter(self.entered[1] + 1, -1)
+            self.motion.enter(self.entered[1] + 1, -1, self.entered)
             self.entered = (self.entered[0], self.entered[1] + 1)
-
-    @torch.no_grad()
-    def _enter(self, s: int, towards: int) -> None:
-        """Start the poses of a new knot from its entered neighbours: steady rotation, triangulated translation."""
-        self.tracks.rebase()
-        near, next_near = s + towards, s + 2 * towards
-        quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
-        steady = self.entered[0] <= next_near <= self.entered[1]
-        turn = rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near])) if steady else None
-        quats[:, s] = quats[:, near] if turn is None else rotations.multiply(turn, quats[:, near])
-        for row in range(1, self.tracks.bodies):
-            if self.places.measured[row - 1, s] and self.places.measured[row - 1, near]:
-                here, there = (self.places.centers[row - 1, k] for k in (s, near))
-                shifts[row, s] = shifts[row, near] + torch.from_numpy(here - there).float()
-            elif steady:
-                shifts[row, s] = 2 * shifts[row, near] - shifts[row, next_near]
 
     def _draw(self) -> int:
         _, full = self._curriculum()
@@ -254,8 +209,7 @@ class Trainer:
     def _maintain(self) -> None:
         section = self.config.densify
         stop = section.stop * self.config.train.iterations
-        if self.iteration % REBASE_EVERY == 0:
-            self.tracks.rebase()
+        self.motion.after_step(self.iteration)
         if self.iteration % section.every == 0 and section.start <= self.iteration <= stop:
             densification.densify(
                 self.gaussians,
@@ -270,7 +224,7 @@ class Trainer:
             self.gradients = densification.ScreenGradients(len(self.gaussians))
 
     def _check_finite(self, value: float, view: str) -> None:
-        named = {**self.gaussians.params, **self.tracks.params, "light": self.light, **self.background.params}
+        named = {**self.gaussians.params, **self.motion.params, **self.background.params}
         bad = [n for n, p in named.items() if p.grad is not None and not bool(torch.isfinite(p.grad).all())]
         if bad or not math.isfinite(value):
             what = f"gradient of {', '.join(bad)}" if bad else "loss"
@@ -283,13 +237,7 @@ class Trainer:
         """Everything that the next step depends on: named tensors, numbers and text."""
         tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
         tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
-        tensors |= {f"tracks.{n}": p.detach() for n, p in self.tracks.params.items()}
-        tensors["tracks.times"] = torch.from_numpy(self.tracks.times)
-        tensors["tracks.centers"] = self.tracks.centers
-        tensors["tracks.base_quats"] = self.tracks.base_quats
-        tensors["tracks.casters"] = self.tracks.casters
-        tensors["tracks.plane_normal"] = self.tracks.plane_normal
-        tensors["light"] = self.light.detach()
+        tensors |= self.motion.tensors()
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
@@ -299,6 +247,7 @@ class Trainer:
             tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
         return {
             "tensors": {n: t.detach().clone() for n, t in tensors.items()},
+            "representation": self.motion.name,
             "iteration": self.iteration,
             "entered": list(self.entered),
             "first_time": self.first_time,
@@ -311,8 +260,7 @@ class Trainer:
         tensors = state["tensors"]
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
-        self.tracks = tracks_of(tensors)
-        self.light = tensors["light"].clone().requires_grad_(True)
+        self.motion.restore(tensors)
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
         self.object_ids = tensors["object_ids"].numpy()
         self.generator.set_state(tensors["generator"])
@@ -330,18 +278,3 @@ class Trainer:
         self.first_time = state["first_time"]
         self.queue = list(state["queue"])
         self.running_loss = state["running_loss"]
-
-
-def tracks_of(tensors: dict[str, Tensor]) -> Tracks:
-    """The tracks in a checkpoint's named tensors."""
-    tracks = Tracks(
-        tensors["tracks.times"].numpy(),
-        tensors["tracks.centers"],
-        tensors["tracks.translations"],
-        tensors["tracks.base_quats"],
-        tensors["tracks.casters"],
-        tensors["tracks.plane_normal"],
-    )
-    for name in ("rotvecs", "slope"):
-        tracks.params[name] = tensors[f"tracks.{name}"].clone().requires_grad_(True)
-    return tracks
