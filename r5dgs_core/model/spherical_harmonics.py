@@ -63,16 +63,16 @@ def basis(directions: Array, degree: int) -> Array:
             -C2_XY * x * z,
             C2_XX_YY * (xx - yy),
         ]
-    if degree >= 3:
-        values += [
-            -C3_3 * y * (3 * xx - yy),
-            C3_2 * x * y * z,
-            -C3_1 * y * (4 * zz - xx - yy),
-            C3_0 * z * (2 * zz - 3 * xx - 3 * yy),
-            -C3_1 * x * (4 * zz - xx - yy),
-            C3_2_DIFFERENCE * z * (xx - yy),
-            -C3_3 * x * (xx - 3 * yy),
-        ]
+        if degree >= 3:
+            values += [
+                -C3_3 * y * (3 * xx - yy),
+                C3_2 * x * y * z,
+                -C3_1 * y * (4 * zz - xx - yy),
+                C3_0 * z * (2 * zz - 3 * xx - 3 * yy),
+                -C3_1 * x * (4 * zz - xx - yy),
+                C3_2_DIFFERENCE * z * (xx - yy),
+                -C3_3 * x * (xx - 3 * yy),
+            ]
     return _library(directions).stack(values, -1)
 
 

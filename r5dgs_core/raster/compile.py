@@ -13,6 +13,7 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numba
 
@@ -21,7 +22,7 @@ _pool: ThreadPoolExecutor | None = None
 _threads = max(1, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
-def kernel(function):
+def kernel(function) -> Any:
     """Compile at the first call, without the interpreter lock, and keep the machine code for the next process."""
     with _lock:
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
@@ -88,12 +89,13 @@ if hasattr(os, "register_at_fork"):
 
 
 def _cache_folder(chosen: str) -> str:
-    """Folder for machine code: under the user's choice or the user's cache, apart for each state of these sources.
+    """Folder for machine code: under the user's choice or the user's cache, apart for each state of the kernels.
 
     Numba looks only at the file of the compiled function, not at those of the functions it calls, hence the digest.
     """
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    folder = Path(__file__).parent
+    for source in sorted([*folder.glob("cpu_*.py"), folder / "lanes.py"]):
         digest.update(source.read_bytes())
     return str((Path(chosen) if chosen else _user_cache()) / f"r5dgs-{digest.hexdigest()[:12]}")
 

@@ -9,13 +9,13 @@ that the forward and the backward pass decide alike, to the bit.
 from __future__ import annotations
 
 import operator
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
-from numba.core.typing import signature
-from numba.core.typing.templates import ConcreteTemplate, infer_global
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
 
 LANES = 8
@@ -51,9 +51,15 @@ class MaskModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, _BITS)
 
 
+def _operation(emitter) -> Any:
+    """Make a function of the kernels from one that is called by the compiler: signature and emitter of instructions."""
+    return intrinsic(emitter)
+
+
 def _define_operator(key, operands, result, emit):
     """Let ``key`` (from the module ``operator``) work on vector types by emitting one instruction."""
-    infer_global(key)(type(f"Lanes_{key.__name__}", (ConcreteTemplate,), {"cases": [signature(result, *operands)]}))
+    register: Any = infer_global(key)
+    register(type(f"Lanes_{key.__name__}", (ConcreteTemplate,), {"cases": [signature(result, *operands)]}))
     lower_builtin(key, *operands)(lambda context, builder, sig, args: emit(builder, *args))
 
 
@@ -90,19 +96,19 @@ def _address(context, builder, array_type, array, index):
     return builder.bitcast(builder.gep(struct.data, [index]), _FLOATS.as_pointer())
 
 
-@intrinsic
+@_operation
 def splat(typingctx, scalar):
     """Lanes that all hold ``scalar``."""
     return lanes(types.float32), lambda context, builder, sig, args: _splat(builder, args[0])
 
 
-@intrinsic
+@_operation
 def iota(typingctx):
     """Lanes 0, 1, ... 7."""
     return lanes(), lambda context, builder, sig, args: ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
 
 
-@intrinsic
+@_operation
 def load(typingctx, array, index):
     """Lanes from a float32 array, from flat index ``index`` on; nothing is checked."""
 
@@ -112,7 +118,7 @@ def load(typingctx, array, index):
     return lanes(array, types.intp), emit
 
 
-@intrinsic
+@_operation
 def broadcast(typingctx, array, index):
     """Lanes that all hold one element of a float32 array, at flat index ``index``; nothing is checked."""
 
@@ -123,7 +129,7 @@ def broadcast(typingctx, array, index):
     return lanes(array, types.intp), emit
 
 
-@intrinsic
+@_operation
 def store(typingctx, array, index, value):
     """Write lanes to a float32 array, from flat index ``index`` on; nothing is checked."""
 
@@ -134,7 +140,7 @@ def store(typingctx, array, index, value):
     return types.void(array, types.intp, lanes), emit
 
 
-@intrinsic
+@_operation
 def fma(typingctx, a, b, c):
     """a * b + c, rounded once."""
     return lanes(lanes, lanes, lanes), lambda context, builder, sig, args: _call(
@@ -142,7 +148,7 @@ def fma(typingctx, a, b, c):
     )
 
 
-@intrinsic
+@_operation
 def smaller(typingctx, a, b):
     """Lane by lane the smaller of two."""
     return lanes(lanes, lanes), lambda context, builder, sig, args: builder.select(
@@ -150,7 +156,7 @@ def smaller(typingctx, a, b):
     )
 
 
-@intrinsic
+@_operation
 def larger(typingctx, a, b):
     """Lane by lane the larger of two."""
     return lanes(lanes, lanes), lambda context, builder, sig, args: builder.select(
@@ -158,13 +164,13 @@ def larger(typingctx, a, b):
     )
 
 
-@intrinsic
+@_operation
 def select(typingctx, condition, a, b):
     """Lane by lane a where the condition holds, else b."""
     return lanes(mask, lanes, lanes), lambda context, builder, sig, args: builder.select(*args)
 
 
-@intrinsic
+@_operation
 def any_of(typingctx, condition):
     """Whether any lane holds."""
 
@@ -175,7 +181,7 @@ def any_of(typingctx, condition):
     return types.boolean(mask), emit
 
 
-@intrinsic
+@_operation
 def total(typingctx, a):
     """Sum of the lanes, in a fixed order of halving."""
     return types.float32(lanes), lambda context, builder, sig, args: _call(
@@ -191,7 +197,7 @@ def total(typingctx, a):
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472730307149)
 
 
-@intrinsic
+@_operation
 def exp2(typingctx, a):
     """2 to the power of each lane, for lanes in [-30, 30]: relative error below 2e-7, never subnormal."""
 
