@@ -19,6 +19,7 @@ _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3}
 _PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0}
 _DIFFERENCE = 1e-5
 _STEPS = 30
+_STEPS_AGAIN = 4  # per round of reweighting, which starts near its end
 _ROUNDS = 8
 
 
@@ -63,11 +64,11 @@ class Candidate:
         p = {name: part[..., None, :] for name, part in self.unpack(theta).items()}
         span = tau[:, None]
         if self.kind == "constant_twist":
-            quats, d, _, _ = models.twist_curve(p["v"], p["w"], span)
+            quats, d = models.twist_poses(p["v"], p["w"], span)
         elif self.kind == "world_twist":
             quats, d = _world_twist(p, tau)
         else:
-            quats, d, _, _ = models.spin_curve(p["v"], p["a"], p["w"], p["eps"], p["u"], span)
+            quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], span)
         return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
 
 
@@ -188,7 +189,7 @@ def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first
     theta = start(candidate, track) if first is None else first
     precision = _prior_precision(candidate)
     robust = np.ones(len(track.tau))
-    theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision)
+    theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS)
     for _ in range(_ROUNDS):
         size = np.sqrt((values**2).mean(-1))
         scale = 2 * 1.4826 * float(np.median(size))
@@ -197,7 +198,7 @@ def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first
         updated = 1 / (1 + (size / max(scale, 1e-9)) ** 2)
         settled = np.abs(updated - robust).max() < 1e-3
         robust = updated
-        theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision)
+        theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS_AGAIN)
         if settled:
             break
     weights = track.weights * robust
@@ -218,6 +219,7 @@ def _levenberg(
     theta: np.ndarray,
     robust: np.ndarray,
     precision: np.ndarray,
+    steps: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Minimise for fixed weights; returns parameters [P], unweighted residuals [S, 6] and the Jacobian."""
     count = len(theta)
@@ -227,7 +229,7 @@ def _levenberg(
     values = residuals(candidate, theta[None], track, sigmas)[0]
     cost = float(((root * values) ** 2).sum() + ((precision * theta) ** 2).sum())
     jacobian = np.zeros((values.size + count, count))
-    for _ in range(_STEPS):
+    for _ in range(steps):
         batch = residuals(candidate, theta + offsets, track, sigmas)
         slopes = (batch[1 : count + 1] - batch[count + 1 :]) / (2 * _DIFFERENCE)
         jacobian = np.concatenate([(slopes * root).reshape(count, -1).T, np.diag(precision)])
@@ -245,6 +247,6 @@ def _levenberg(
                 break
             damping = min(damping * 10, 1e12)
         damping = max(damping * 0.1, 1e-12)
-        if gain <= 1e-9 * cost or size < 1e-12:
+        if gain <= 1e-6 * cost or size < 1e-12:
             break
     return theta, values, jacobian

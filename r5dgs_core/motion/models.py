@@ -78,7 +78,10 @@ class MotionModel:
             raise ValueError(f"kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
         for name in _VECTORS:
             value = getattr(self, name)
-            vector = np.array(value, np.float64)
+            try:
+                vector = np.array(value, np.float64)
+            except (TypeError, ValueError):
+                vector = np.zeros(0)
             if vector.shape != (3,) or not np.isfinite(vector).all():
                 raise ValueError(f"{name}: expected three finite numbers, got {value!r}")
             vector.flags.writeable = False
@@ -201,37 +204,32 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
     if model.kind == "translation":
         return rotations.identity(*tau.shape), v * span + 0.5 * a * span**2, zero, v + a * span
     if model.kind == "ballistic_spin":
-        return spin_curve(v, a, w, eps, model.center_offset, span)
+        u = model.center_offset
+        quats, d = spin_poses(v, a, w, eps, u, span)
+        # R = exp(phi) turns with V(phi) phi'.
+        spins = se3.v_matrix_times(w * span + 0.5 * eps * span**2, w + eps * span)
+        return quats, d, spins, v + a * span - rotations.cross(spins, rotations.rotate(quats, u + zero))
     if model.kind == "constant_twist":
-        return twist_curve(v, w, span)
+        quats, d = twist_poses(v, w, span)
+        return quats, d, w + zero, rotations.rotate(quats, v + zero)
     quats, d = _world_twist(model, tau)
     spins = w + eps * span
     return quats, d, spins, v + a * span + rotations.cross(spins, d)
 
 
-def spin_curve(
+def spin_poses(
     v: np.ndarray, a: np.ndarray, w: np.ndarray, eps: np.ndarray, center: np.ndarray, span: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The "ballistic_spin" curve, all arguments broadcast: rates [..., 3] as in `MotionModel`, times span [..., 1].
-
-    The angular velocity is V(phi) phi' with phi = w tau + eps tau^2/2.
-    """
-    turn = w * span + 0.5 * eps * span**2
-    quats = rotations.rotvecs_to_quats(turn)
-    spins = se3.v_matrix_times(turn, w + eps * span)
-    arm = rotations.rotate(quats, center + 0 * turn)
-    d = v * span + 0.5 * a * span**2 + (center - arm)
-    return quats, d, spins, v + a * span - rotations.cross(spins, arm)
+) -> se3.Pose:
+    """Poses of the "ballistic_spin" curve, all arguments broadcast: rates [..., 3], times span [..., 1]."""
+    quats = rotations.rotvecs_to_quats(w * span + 0.5 * eps * span**2)
+    arm = rotations.rotate(quats, center + 0 * quats[..., 1:])
+    return quats, v * span + 0.5 * a * span**2 + (center - arm)
 
 
-def twist_curve(
-    v: np.ndarray, w: np.ndarray, span: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The "constant_twist" curve, all arguments broadcast: v, w [..., 3], times span [..., 1]."""
+def twist_poses(v: np.ndarray, w: np.ndarray, span: np.ndarray) -> se3.Pose:
+    """Poses of the "constant_twist" curve, all arguments broadcast: v, w [..., 3], times span [..., 1]."""
     turn = w * span
-    quats = rotations.rotvecs_to_quats(turn)
-    path = v + 0 * turn
-    return quats, se3.v_matrix_times(turn, path) * span, w + 0 * turn, rotations.rotate(quats, path)
+    return rotations.rotvecs_to_quats(turn), se3.v_matrix_times(turn, v + 0 * turn) * span
 
 
 def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:

@@ -1,0 +1,233 @@
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import candidates, fitting, models, rotations
+from tests import problems
+from tests.problems import MOTIONS, RADIUS, SIZE, T_MAX
+
+TIMES = np.linspace(0, T_MAX, 15)
+UNEVEN = np.sort(np.r_[0.0, T_MAX, np.random.default_rng(9).uniform(0, T_MAX, 13)])
+HORIZON = np.array([0.25, 1.25])  # t = 1 and t = 2
+
+
+def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
+    truth, _ = MOTIONS[name]
+    quats, displacements, last_quat, last = problems.observe(truth, times, rng, sigma_t, sigma_r)
+    fit = fitting.fit(times, quats, displacements, radius=RADIUS, **options)
+    return fit, problems.error_percent(fit.model, truth, HORIZON, last_quat, last)
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_each_motion_is_recovered_without_noise(name):
+    fit, error = fitted(name, np.random.default_rng(0), 1e-7 * SIZE, 1e-7)
+    assert fit.chosen in MOTIONS[name][1]
+    assert error.max() < 0.1
+    assert not fit.rested
+
+
+@pytest.mark.parametrize("name", ["uniform", "hinge", "ballistic, spinning"])
+def test_uneven_times_and_a_gap_are_no_obstacle(name):
+    times = np.concatenate([UNEVEN[UNEVEN < 0.3], UNEVEN[UNEVEN > 0.45]])
+    fit, error = fitted(name, np.random.default_rng(1), 1e-7 * SIZE, 1e-7, times)
+    assert fit.chosen in MOTIONS[name][1]
+    assert error.max() < 0.1
+
+
+def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
+    rng = np.random.default_rng(2)
+    right, total, ours, full = 0, 0, [], []
+    for name, (_, names) in MOTIONS.items():
+        for _ in range(1 + (name != "static")):
+            truth = MOTIONS[name][0]
+            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
+            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            largest = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
+            right += fit.chosen in names
+            total += 1
+            ours.append(problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0])
+            full.append(problems.error_percent(largest.model, truth, HORIZON[:1], last_quat, last)[0])
+    assert right >= 0.85 * total
+    assert np.median(ours) < 0.6 * np.median(full)
+
+
+def test_at_low_noise_the_choice_is_never_clearly_worse_than_the_largest():
+    rng = np.random.default_rng(3)
+    for name in ("static", "rolling, slowing", "hinge, accelerating", "free axis", "screw"):
+        errors = []
+        for _ in range(2):
+            truth = MOTIONS[name][0]
+            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 1e-3 * SIZE, np.radians(0.1))
+            errors.append(
+                [
+                    problems.error_percent(
+                        fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=names).model,
+                        truth,
+                        HORIZON[:1],
+                        last_quat,
+                        last,
+                    )[0]
+                    for names in (None, ["full, free centre"])
+                ]
+            )
+        ours, full = np.median(errors, axis=0)
+        assert ours <= max(1.3 * full, 0.3), name
+
+
+def test_one_gross_outlier_is_shrugged_off():
+    rng = np.random.default_rng(4)
+    truth = MOTIONS["ballistic, spinning"][0]
+    clean, dirty = [], []
+    for _ in range(2):
+        quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(0.5))
+        spoiled_quats, spoiled = quats.copy(), d.copy()
+        spoiled[6] += [0.5, -0.4, 0.3]
+        spoiled_quats[6] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[6])
+        for result, (q, x) in ((clean, (quats, d)), (dirty, (spoiled_quats, spoiled))):
+            model = fitting.fit(TIMES, q, x, radius=RADIUS).model
+            result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
+    assert np.median(dirty) <= max(1.3 * np.median(clean), 2.5)
+
+
+def test_weight_zero_leaves_a_pose_out():
+    rng = np.random.default_rng(5)
+    truth = MOTIONS["uniform"][0]
+    quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 1e-6, 1e-6)
+    d[:4] += 3.0
+    weights = np.r_[np.zeros(4), np.ones(len(TIMES) - 4)]
+    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, weights=weights)
+    assert fit.chosen == "translation"
+    assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 0.1
+
+
+def test_a_stop_is_found_and_slow_movers_keep_moving():
+    rng = np.random.default_rng(6)
+    stopped = []
+    for _ in range(4):
+        path = np.minimum(TIMES, 0.42)[:, None] * [0.8, 0.1, 0] + 0.003 * rng.normal(size=(15, 3))
+        turns = rotations.rotvecs_to_quats(
+            np.minimum(TIMES, 0.42)[:, None] * [0, 0, 2.0] + 0.01 * rng.normal(size=(15, 3))
+        )
+        quats = rotations.multiply(turns, rotations.conjugate(turns[-1]))
+        fit = fitting.fit(TIMES, quats, path - path[-1], radius=RADIUS)
+        stopped.append(fit.chosen == "static" and fit.rested)
+    assert sum(stopped) >= 3
+    slow = models.MotionModel("translation", velocity=[0.1 * SIZE, 0, 0])
+    frozen = []
+    for _ in range(5):
+        quats, d, _, _ = problems.observe(slow, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
+        frozen.append(fitting.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
+    assert sum(frozen) <= 1
+
+
+def test_the_band_holds_the_true_error():
+    rng = np.random.default_rng(7)
+    inside = []
+    for name in ("uniform", "ballistic", "spin", "hinge", "rolling", "ballistic, spinning"):
+        for correlation in (0.0, 0.5):
+            truth = MOTIONS[name][0]
+            quats, d, last_quat, last = problems.observe(
+                truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5, correlation
+            )
+            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
+            inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
+    assert np.mean(inside) >= 0.9
+    assert (np.diff(fit.band) > 0).all()
+
+
+def test_the_noise_is_estimated():
+    fit, _ = fitted("hinge", np.random.default_rng(8), 0.004, 0.02)
+    assert fit.sigma_t == pytest.approx(0.004, rel=0.4)
+    assert fit.sigma_r == pytest.approx(0.02, rel=0.4)
+
+
+def test_the_future_starts_at_the_bind_state_however_noisy():
+    fit, _ = fitted("hinge", np.random.default_rng(10), 0.02, 0.1)
+    quats, displacements = models.evaluate(fit.model, 0.0)
+    assert quats.tolist() == [1, 0, 0, 0]
+    assert displacements.tolist() == [0, 0, 0]
+    assert np.linalg.norm(fit.model.offset_displacement) > 1e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7])
+def test_few_poses_give_a_plain_model_that_runs_through_them(count):
+    truth = MOTIONS["rolling"][0]
+    times = np.linspace(0, T_MAX, count) if count > 1 else np.array([T_MAX])
+    quats, d, last_quat, last = problems.observe(truth, times, np.random.default_rng(0), 1e-6, 1e-6)
+    fit = fitting.fit(times, quats, d, radius=RADIUS)
+    if count == 1:
+        assert fit.model.is_static
+    else:
+        assert fit.chosen == "translation + spin"
+        assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 1
+
+
+def test_a_body_that_never_moves_is_static_with_few_poses_too():
+    fit = fitting.fit(np.array([0.0, 1.0]), rotations.identity(2), np.zeros((2, 3)), radius=1.0)
+    assert fit.chosen == "static"
+    assert fit.model.is_static or np.abs(fit.model.offset_displacement).max() < 1e-9
+
+
+def test_scale_and_units_of_time_do_not_change_the_choice():
+    rng = np.random.default_rng(11)
+    truth = MOTIONS["hinge"][0]
+    quats, d, _, _ = problems.observe(truth, TIMES, rng, 0.003, 0.01)
+    plain = fitting.fit(TIMES, quats, d, radius=RADIUS)
+    scaled = fitting.fit(50 + 24 * TIMES, quats, 1000 * d, radius=1000 * RADIUS)
+    assert plain.chosen == scaled.chosen
+    np.testing.assert_allclose(scaled.model.angular_velocity * 24, plain.model.angular_velocity, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        models.evaluate(scaled.model, 12.0)[1] / 1000, models.evaluate(plain.model, 0.5)[1], atol=1e-5
+    )
+
+
+def test_the_world_twist_can_be_asked_for():
+    truth = models.MotionModel(
+        "world_twist",
+        velocity=[0.5, 0, 0.1],
+        angular_velocity=[0, 0.5, 1.5],
+        angular_acceleration=[0.5, 0, 0],
+        radius=RADIUS,
+    )
+    quats, d, last_quat, last = problems.observe(truth, TIMES, np.random.default_rng(12), 1e-7, 1e-7)
+    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=["world twist"])
+    assert fit.model.kind == "world_twist"
+    assert problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last).max() < 0.1
+
+
+def test_the_table_names_every_candidate_and_covariance_is_stored():
+    fit, _ = fitted("uniform", np.random.default_rng(13), 0.003, 0.01)
+    assert [s.name for s in fit.scores] == [c.name for c in candidates.FAMILY]
+    assert min(s.held_out for s in fit.scores) <= next(s.held_out for s in fit.scores if s.name == fit.chosen)
+    variances = np.diag(fit.model.covariance)
+    assert fit.model.covariance_names[0] == "velocity.x"
+    assert (variances[:3] > 0).all()
+    assert variances[0] ** 0.5 < 0.05
+
+
+def test_equal_input_gives_equal_models():
+    first, second = (fitted("rolling", np.random.default_rng(14), 0.003, 0.01)[0] for _ in range(2))
+    assert first.model == second.model
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"times": TIMES[::-1]}, "increasing"),
+        ({"displacements": np.full((15, 3), np.nan)}, "finite"),
+        ({"quats": np.zeros((15, 3))}, r"\(S, 4\)"),
+        ({"radius": 0.0}, "radius"),
+        ({"weights": -np.ones(15)}, "weights"),
+        ({"candidates": ["warp"]}, "warp"),
+    ],
+)
+def test_unusable_tracks_are_refused(change, message):
+    arguments = {
+        "times": TIMES,
+        "quats": rotations.identity(15),
+        "displacements": np.zeros((15, 3)),
+        "radius": RADIUS,
+        **change,
+    }
+    with pytest.raises(ValueError, match=message):
+        fitting.fit(**arguments)

@@ -1,0 +1,161 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r5dgs_core.motion import models, rotations, se3
+from r5dgs_core.motion.models import MotionModel
+from tests import problems
+
+OFFSETS = {"offset_rotvec": [0.05, -0.02, 0.1], "offset_displacement": [0.02, 0.01, -0.03]}
+WORLD_TWIST = MotionModel(
+    "world_twist",
+    velocity=[0.5, 0.3, -0.9],
+    acceleration=[-0.2, 0.8, 0.5],
+    angular_velocity=[1.2, -0.7, 2.6],
+    angular_acceleration=[0.9, 1.1, -0.4],
+    radius=0.3,
+)
+CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {"world twist": WORLD_TWIST}
+
+
+def with_offsets(model):
+    return MotionModel.from_dict({**model.to_dict(), **OFFSETS})
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_future_starts_at_the_bind_state_to_the_bit(name):
+    quats, displacements = models.evaluate(with_offsets(CASES[name]), np.array([0.0, 0.3]))
+    assert quats[0].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert displacements[0].tolist() == [0.0, 0.0, 0.0]
+    assert (quats[1] != quats[0]).any()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_motion_converges_to_the_fitted_curve(name):
+    model = with_offsets(CASES[name])
+    tau = 40 * model.fade_time
+    quats, displacements = models.evaluate(model, tau)
+    curve_quats, curve, _, _ = models.curve(model, tau)
+    np.testing.assert_allclose(displacements, curve + model.offset_displacement, atol=1e-12)
+    expected = rotations.multiply(curve_quats, rotations.rotvecs_to_quats(model.offset_rotvec))
+    assert rotations.angle_between(quats, expected) < 1e-12
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rates_are_the_exact_derivative(name):
+    model, tau, h = with_offsets(CASES[name]), np.array([0.01, 0.4, 1.7]), 1e-6
+    _, _, spins, velocities = models.evaluate_with_rates(model, tau)
+    (q0, d0), (q1, d1) = models.evaluate(model, tau - h), models.evaluate(model, tau + h)
+    np.testing.assert_allclose((d1 - d0) / (2 * h), velocities, atol=2e-7)
+    turn = rotations.quats_to_rotvecs(rotations.multiply(q1, rotations.conjugate(q0)))
+    np.testing.assert_allclose(turn / (2 * h), spins, atol=2e-7)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_distances_are_kept(name):
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    quats, displacements = models.evaluate(with_offsets(CASES[name]), 2.3)
+    moved = rotations.rotate(quats, points) + displacements
+    before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_velocity_and_spin_at_t_max_are_those_of_the_model():
+    for kind in ("ballistic_spin", "constant_twist", "world_twist"):
+        model = MotionModel(kind, velocity=[1, 2, 3], angular_velocity=[0.1, -0.2, 0.3])
+        _, _, spin, velocity = models.evaluate_with_rates(model, 0.0)
+        np.testing.assert_allclose(spin, model.angular_velocity)
+        np.testing.assert_allclose(velocity, model.velocity)
+
+
+def test_a_hinge_keeps_its_axis_in_place():
+    model = problems.MOTIONS["hinge, accelerating"][0]
+    quats, displacements = models.evaluate(model, np.linspace(0, 3, 20))
+    axis_point = rotations.rotate(quats, np.broadcast_to(model.center_offset, displacements.shape)) + displacements
+    np.testing.assert_allclose(axis_point, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
+
+
+def test_a_screw_is_a_hinge_where_it_does_not_advance():
+    tau = np.linspace(0, 3, 7)
+    w, u = np.array([0, 0, 2.0]), np.array([0.5, 0.2, 0.0])
+    hinge = MotionModel("ballistic_spin", angular_velocity=w, center_offset=u)
+    screw = MotionModel("constant_twist", angular_velocity=w, velocity=-np.cross(w, u))
+    for x, y in zip(models.evaluate(hinge, tau), models.evaluate(screw, tau), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-12)
+
+
+def test_world_twist_equals_many_magnus_steps():
+    m = WORLD_TWIST
+    rates = (m.angular_velocity, m.velocity, m.angular_acceleration, m.acceleration)
+    for tau in (0.1, 1.0, 4.0):
+        quats, displacements = models.evaluate(m, tau)
+        fine_quats, fine = se3.integrate(*rates, tau, 8192)
+        assert rotations.angle_between(quats, fine_quats) < 1e-8
+        np.testing.assert_allclose(displacements, fine, atol=1e-8)
+
+
+def test_world_twist_does_not_depend_on_the_other_times_asked_for():
+    together = models.evaluate(WORLD_TWIST, np.array([0.2, 9.0]))
+    alone = models.evaluate(WORLD_TWIST, 0.2)
+    for x, y in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(x[0], y)
+
+
+def test_batches_of_any_shape_equal_single_times():
+    tau = np.array([[0.0, 0.1, 0.2], [0.7, 1.5, 3.0]])
+    for model in CASES.values():
+        quats, displacements = models.evaluate(model, tau)
+        assert quats.shape == (2, 3, 4)
+        assert displacements.shape == (2, 3, 3)
+        one = models.evaluate(model, 1.5)
+        np.testing.assert_allclose(quats[1, 1], one[0], atol=1e-14)
+        np.testing.assert_allclose(displacements[1, 1], one[1], atol=1e-13)
+
+
+@settings(max_examples=50)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3), st.floats(1e-6, 1e3), st.sampled_from(models.KINDS))
+def test_json_restores_a_model_to_the_bit(vector, number, kind):
+    names = ("velocity.x", "velocity.y")
+    model = MotionModel(
+        kind, velocity=vector, offset_rotvec=vector, fade_time=number, covariance=np.eye(2) / 3, covariance_names=names
+    )
+    back = MotionModel.from_dict(json.loads(json.dumps(model.to_dict())))
+    assert back == model
+    assert back.to_dict() == model.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "teleport"}, "kind"),
+        ({"velocity": [1, 2]}, "velocity"),
+        ({"velocity": [1, 2, math.nan]}, "velocity"),
+        ({"velocity": "fast"}, "velocity"),
+        ({"fade_time": 0.0}, "fade_time"),
+        ({"radius": -1.0}, "radius"),
+        ({"speed": 3}, "speed"),
+        ({"covariance": [[1.0]]}, "covariance"),
+    ],
+)
+def test_malformed_models_are_refused_by_the_name_of_the_key(change, message):
+    data = {**MotionModel().to_dict(), **change}
+    with pytest.raises(ValueError, match=message):
+        MotionModel.from_dict(data)
+
+
+def test_times_before_t_max_are_refused():
+    with pytest.raises(ValueError, match="tau"):
+        models.evaluate(MotionModel(), -0.1)
+
+
+def test_static_and_turning_are_told_apart():
+    assert MotionModel().is_static
+    assert not MotionModel(offset_displacement=[0, 0, 1e-9]).is_static
+    assert not MotionModel("translation", velocity=[1, 0, 0]).turns
+    assert MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1]).turns
+    assert MotionModel("static", offset_rotvec=[0.1, 0, 0]).turns
+    assert MotionModel("ballistic_spin", center_offset=[1, 0, 0]).is_static

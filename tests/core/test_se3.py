@@ -1,0 +1,154 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from r5dgs_core.motion import rotations, se3
+
+W, V = np.array([1.2, -0.7, 2.6]), np.array([0.5, 0.3, -0.9])
+EPS, ACC = np.array([0.9, 1.1, -0.4]), np.array([-0.2, 0.8, 0.5])
+
+
+def matrix(pose):
+    result = np.eye(4)
+    result[:3, :3] = rotations.quats_to_rotmats(pose[0])
+    result[:3, 3] = pose[1]
+    return result
+
+
+def wedge(w, v):
+    x, y, z = w
+    return np.array([[0, -z, y, v[0]], [z, 0, -x, v[1]], [-y, x, 0, v[2]], [0, 0, 0, 0]])
+
+
+def fine(w, v, eps, a, duration):
+    return se3.integrate(w, v, eps, a, duration, 2048)
+
+
+def distance(p, q, radius=1.0):
+    turn = rotations.angle_between(p[0], q[0])
+    return np.linalg.norm(p[1] - q[1], axis=-1) + 2 * radius * np.sin(0.5 * turn)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.5, math.pi, 2 * math.pi, 100.0])
+def test_exponential_equals_the_matrix_exponential(angle):
+    w = angle * np.array([0.36, -0.48, 0.8])
+    np.testing.assert_allclose(matrix(se3.exp(w, V)), expm(wedge(w, V)), atol=2e-13)
+
+
+def test_the_zero_twist_is_the_identity_to_the_bit():
+    q, d = se3.exp(np.zeros(3), np.zeros(3))
+    assert q.tolist() == [1, 0, 0, 0]
+    assert d.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("order", "expected"), [(2, 2.0), (4, 4.0)])
+def test_magnus_steps_converge_with_their_order(order, expected):
+    truth = fine(W, V, EPS, ACC, 2.0)
+    coarse, finer = (distance(se3.integrate(W, V, EPS, ACC, 2.0, n, order), truth) for n in (16, 64))
+    assert 0.5 * math.log2(coarse / finer) == pytest.approx(expected, abs=0.1)
+
+
+def test_magnus_solves_the_differential_equation():
+    from scipy.integrate import solve_ivp
+
+    x0 = np.array([0.4, -0.2, 0.7])
+    exact = solve_ivp(
+        lambda t, x: V + t * ACC + np.cross(W + t * EPS, x), (0, 1.3), x0, method="DOP853", rtol=1e-12, atol=1e-12
+    ).y[:, -1]
+    q, d = fine(W, V, EPS, ACC, 1.3)
+    np.testing.assert_allclose(rotations.rotate(q, x0) + d, exact, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 64, 1000])
+def test_products_by_halving_and_doubling_equal_the_loop(count):
+    rng = np.random.default_rng(count)
+    poses = se3.exp(0.3 * rng.normal(size=(count, 3)), 0.1 * rng.normal(size=(count, 3)))
+    loop = (rotations.identity(), np.zeros(3))
+    prefixes = []
+    for i in range(count):
+        loop = se3.compose((poses[0][i], poses[1][i]), loop)
+        prefixes.append(loop)
+    assert distance(se3.product(*poses), loop) < 1e-12
+    quats, displacements = se3.scan(*poses)
+    np.testing.assert_allclose(displacements, np.stack([p[1] for p in prefixes]), atol=1e-12)
+    np.testing.assert_allclose(quats, np.stack([p[0] for p in prefixes]), atol=1e-12)
+
+
+def test_step_rule_holds_its_tolerance():
+    rng = np.random.default_rng(0)
+    ratios = []
+    for _ in range(200):
+        w = rng.normal(size=3) * 10 ** rng.uniform(-1, 1)
+        eps = rng.normal(size=3) * np.linalg.norm(w)
+        v, a, duration = rng.normal(size=3), rng.normal(size=3), 10 ** rng.uniform(-1, 0.3)
+        tolerance = 10 ** rng.uniform(-6, -2)
+        n = se3.steps_needed(w, v, eps, a, duration, 0.3, tolerance)
+        truth = se3.integrate(w, v, eps, a, duration, 16 * n)
+        ratios.append(distance(se3.integrate(w, v, eps, a, duration, n), truth, 0.3) / tolerance)
+    assert max(ratios) <= 2
+    assert np.median(ratios) > 1e-3  # the rule is not wasteful by a factor of ten in steps
+
+
+def test_one_step_is_exact_where_twist_and_rate_commute():
+    n = se3.steps_needed(W, V, 0.5 * W, 0.5 * V, 3.0, 1.0, 1e-9)
+    assert n == 1
+    assert distance(se3.integrate(W, V, 0.5 * W, 0.5 * V, 3.0, 1), fine(W, V, 0.5 * W, 0.5 * V, 3.0)) < 1e-11
+
+
+def test_reversal_through_a_stop_is_exact_for_a_fixed_axis():
+    w, eps = np.array([0, 0, 2.0]), np.array([0, 0, -2.0])
+    q, _ = se3.integrate(w, np.zeros(3), eps, np.zeros(3), 2.0, 1)
+    assert rotations.angle_between(q, np.array([1.0, 0, 0, 0])) < 1e-12
+
+
+@pytest.mark.parametrize("angle", [1e-9, 0.3, math.pi, 2 * math.pi, 40.0])
+def test_closed_form_of_constant_spin_equals_many_steps(angle):
+    w = angle * np.array([0.6, 0.0, 0.8])
+    steps = se3.integrate(w, V, np.zeros(3), ACC, 1.0, 4096)
+    assert distance(se3.accelerated_spin(w, V, ACC, np.array(1.0)), steps) < 1e-9
+    # Constant v and w: a single exponential is the exact answer.
+    assert distance(se3.accelerated_spin(w, V, np.zeros(3), np.array(1.0)), se3.exp(w, V)) < 1e-13
+
+
+def test_origin_shift_changes_nothing_but_rounding():
+    c = np.array([3.0, -4.0, 5.0])
+    v, a = se3.recentre(W, V, EPS, ACC, c)
+    q, d = se3.integrate(W, V, EPS, ACC, 1.0, 32)
+    q2, d2 = se3.integrate(W, v, EPS, a, 1.0, 32)
+    np.testing.assert_allclose(q, q2, atol=1e-14)
+    # x = c + r: world form gives q c + d, the centred form c + d2 for the centre itself.
+    np.testing.assert_allclose(rotations.rotate(q, c) + d, c + d2, atol=1e-12)
+
+
+def test_backward_undoes_forward():
+    q, d = se3.integrate(W, V, EPS, ACC, 1.5, 5)
+    back = se3.integrate(W + 1.5 * EPS, V + 1.5 * ACC, EPS, ACC, -1.5, 5)
+    assert distance(se3.compose(back, (q, d)), (rotations.identity(), np.zeros(3))) < 1e-13
+
+
+def test_motion_composes_over_time():
+    first = fine(W, V, EPS, ACC, 0.4)
+    second = fine(W + 0.4 * EPS, V + 0.4 * ACC, EPS, ACC, 0.7)
+    assert distance(se3.compose(second, first), fine(W, V, EPS, ACC, 1.1)) < 1e-10
+
+
+def test_invert_undoes():
+    pose = se3.exp(W, V)
+    assert distance(se3.compose(se3.invert(pose), pose), (rotations.identity(), np.zeros(3))) < 1e-14
+
+
+def test_many_steps_stay_orthogonal_and_keep_distances():
+    q, d = se3.integrate(np.array([2.08, 0, 0.3]), V, np.zeros(3), np.zeros(3), 1e5 / 60, 100000)
+    r = rotations.quats_to_rotmats(q)
+    assert np.abs(r.T @ r - np.eye(3)).max() < 1e-11
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    moved = rotations.rotate(q, points) + d
+    pairs = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(moved[:, None] - moved[None], axis=-1), pairs, atol=1e-12)
+
+
+def test_an_unknown_order_is_refused():
+    with pytest.raises(ValueError, match="order"):
+        se3.integrate(W, V, EPS, ACC, 1.0, 4, order=3)
