@@ -64,6 +64,23 @@ def ranges(scene: Scene) -> list[Range]:
     ]
 
 
+def homes(scene: Scene, parts: list[Range]) -> list[Range]:
+    """The ranges whose objects keep the anchors: one for each motion group, one for each object's pinned Gaussians.
+
+    A body's anchor stays with the group's own object where that has Gaussians of it, though Gaussians of others may
+    move with it; any other with the object that has the most of it.
+    """
+    best: dict[tuple[int, int], Range] = {}
+    for part in parts:
+        group = scene.groups[part.motion_id]
+        own = group.role == "body" and part.object_id == group.object_id
+        known = best.get(_anchor_key(part))
+        known_own = known is not None and group.role == "body" and known.object_id == group.object_id
+        if known is None or (own, part.count) > (known_own, known.count):
+            best[_anchor_key(part)] = part
+    return list(best.values())
+
+
 def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options = Options()) -> bpy.types.Collection:
     """Build a scene in the active Blender scene. After an error everything is as it was before.
 
@@ -83,19 +100,19 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         root = _root(collection, scene, options.world_convention or scene.world_convention)
         _describe(collection, scene, path, root, times)
         material = clouds.material(_name(f"R5DGS {scene.name}"))
-        children: dict[int, bpy.types.Collection] = {}
-        anchors: dict[tuple[int, int], bpy.types.Object] = {}
-        for part in ranges(scene):
-            child = children.get(part.object_id)
-            if child is None:
-                child = bpy.data.collections.new(_name(object_name(scene, part.object_id)))
-                collection.children.link(child)
-                children[part.object_id] = child
-            key = (part.object_id if part.motion_id == 0 else 0, part.motion_id)
-            if key not in anchors:
-                anchors[key] = _anchor(child, root, scene, part)
-                keyframes.animate(anchors[key], scene, part.motion_id, times, options.key_tolerance)
-            _cloud(child, anchors[key], scene, part, material, options.view_dependence)
+        parts = ranges(scene)
+        children = {}
+        for object_id in sorted({part.object_id for part in parts}):
+            children[object_id] = bpy.data.collections.new(_name(object_name(scene, object_id)))
+            collection.children.link(children[object_id])
+        anchors = {}
+        for part in homes(scene, parts):
+            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, parts)
+        for part in parts:
+            anchor = anchors[_anchor_key(part)]
+            _cloud(children[part.object_id], anchor, scene, part, parts, material, options.view_dependence)
+        for (_, motion_id), anchor in anchors.items():
+            keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
         if options.fit_timeline:
             timeline.fit(context.scene, times)
         context.view_layer.update()
@@ -173,15 +190,26 @@ def _pivot(scene: Scene, part: Range) -> np.ndarray:
     return np.median(scene.means[part.start : part.start + part.count].astype(np.float64), axis=0)
 
 
-def _anchor_name(scene: Scene, part: Range) -> str:
+def _anchor_key(part: Range) -> tuple[int, int]:
+    """What shares an anchor: a motion group; of the pinned one, each object by itself, so that it can be moved."""
+    return (part.object_id if part.motion_id == 0 else 0, part.motion_id)
+
+
+def _part_name(scene: Scene, part: Range, parts: list[Range]) -> str:
+    """Name of a range: its object's for the largest one, which of the object's Gaussians these are for the others."""
+    name = object_name(scene, part.object_id)
     group: MotionGroup = scene.groups[part.motion_id]
     if group.role == "shadow":
-        return f"{object_name(scene, group.object_id)} shadow anchor"
-    return f"{object_name(scene, part.object_id if part.motion_id == 0 else group.object_id)} anchor"
+        return f"{object_name(scene, group.object_id)} shadow"
+    if part == max((other for other in parts if other.object_id == part.object_id), key=lambda other: other.count):
+        return name
+    return f"{name} still" if part.motion_id == 0 else f"{name} with {object_name(scene, group.object_id)}"
 
 
-def _anchor(collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range) -> bpy.types.Object:
-    anchor = bpy.data.objects.new(_name(_anchor_name(scene, part)), None)
+def _anchor(
+    collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range, parts: list[Range]
+) -> bpy.types.Object:
+    anchor = bpy.data.objects.new(_name(f"{_part_name(scene, part, parts)} anchor"), None)
     pivot = _pivot(scene, part)
     anchor.empty_display_type = "ARROWS"
     anchor.empty_display_size = 0.05 * scene.extent
@@ -199,20 +227,17 @@ def _cloud(
     anchor: bpy.types.Object,
     scene: Scene,
     part: Range,
+    parts: list[Range],
     material: bpy.types.Material,
     view_dependence: bool,
 ) -> bpy.types.Object:
-    name = object_name(scene, part.object_id)
-    group = scene.groups[part.motion_id]
-    if group.role == "shadow" and group.object_id != part.object_id:
-        name = f"{object_name(scene, group.object_id)} shadow"
-    cloud = compat.new_point_cloud(_name(name), part.count, collection)
+    cloud = compat.new_point_cloud(_name(_part_name(scene, part, parts)), part.count, collection)
     clouds.fill(cloud.data, scene, slice(part.start, part.start + part.count), view_dependence)
     cloud.data.materials.append(material)
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
     cloud.color = (*color, 1.0)
     cloud.parent = anchor
-    pivot = Vector(anchor.r5dgs.pivot)  # not the anchor's location, which its keys have moved by now
+    pivot = Vector(anchor.r5dgs.pivot)
     cloud.matrix_parent_inverse = Matrix.Translation(-pivot)
     state = cloud.r5dgs
     state.role, state.object_id, state.motion_id, state.pivot = "CLOUD", part.object_id, part.motion_id, pivot

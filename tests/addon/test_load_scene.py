@@ -295,3 +295,23 @@ def test_registering_twice_in_a_row_is_clean(blender, extension):
         assert not hasattr(blender.types.Object, "r5dgs")
         extension.register()
     assert "load_scene" in dir(blender.ops.r5dgs)
+
+
+def test_an_anchor_stays_with_its_own_object_whoever_moves_with_it(blender, tmp_path):
+    scene = scenes.make_scene(n=400, objects=3)
+    motion_ids, object_ids = scene.motion_ids.copy(), scene.object_ids.copy()
+    floor = np.flatnonzero((object_ids == 0) & (motion_ids == 0))
+    motion_ids[floor[-5:]] = 2  # labelled background, moving with the apple
+    motion_ids[np.flatnonzero(object_ids == 3)[-4:]] = 0  # of the car, standing still
+    order = np.lexsort((motion_ids, object_ids))
+    fields = ("means", "quats", "log_scales", "opacity_logits", "sh", "identities", "shading")
+    arrays = {name: getattr(scene, name)[order] for name in fields}
+    scene = dataclasses.replace(scene, **arrays, motion_ids=motion_ids[order], object_ids=object_ids[order])
+    path = scene_file.write(scene, tmp_path / "mixed.r5dgs")
+    collection = load(blender, path)
+    assert_plays_like_the_core(blender, collection, scene_file.read(path), (0.2, 0.9))
+    by_name = {obj.name: obj for obj in collection.all_objects}
+    assert by_name["red apple anchor"].users_collection[0].name == "red apple"
+    assert by_name["background with red apple"].parent == by_name["red apple anchor"] == by_name["red apple"].parent
+    assert by_name["toy car still"].parent == by_name["toy car still anchor"]
+    assert by_name["toy car"].parent == by_name["toy car anchor"]
