@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
@@ -201,7 +201,7 @@ def _neighbour_scales(points: np.ndarray) -> np.ndarray:
     """Logarithm of the mean distance to the three nearest neighbours, bounded. [P, 3]"""
     if len(points) < 4:
         return np.full((len(points), 3), np.log(0.05))
-    distance, _ = cKDTree(points).query(points, k=4)
+    distance, _ = KDTree(points).query(points, k=4)
     return np.repeat(np.log(np.clip(distance[:, 1:].mean(1), 0.005, 0.2))[:, None], 3, axis=1)
 
 

@@ -29,11 +29,14 @@ class Representation(Protocol):
 
     Attributes:
         name: Its name in the configuration.
-        params: What the optimizer moves, by the names of the learning rates.
     """
 
     name: str
-    params: dict[str, Tensor]
+
+    @property
+    def params(self) -> dict[str, Tensor]:
+        """What the optimizer moves, by the names of the learning rates."""
+        ...
 
     def splats(self, gaussians: Gaussians, camera: Camera, t: float) -> posing.Splats:
         """Activated Gaussians in the world at a time, coloured as a camera sees them; differentiable."""

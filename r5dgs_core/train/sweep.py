@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy import ndimage
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from ..scene import cameras
 from .views import TrainView
@@ -51,7 +51,7 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     for group in groups:
         images = np.stack([v.image for v in group]).astype(np.float32) / 255
         free = np.stack([_free(v) for v in group])
-        known = free.any(0)
+        known = np.asarray(free.any(0))
         images[~free] = np.nan
         images[:, ~known] = 0.0
         median = np.nanmedian(images, axis=0)
@@ -62,7 +62,7 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
 def _free(view: TrainView) -> np.ndarray:
     free = np.ones(view.image.shape[:2], bool)
     if view.mask is not None:
-        free &= ~ndimage.binary_dilation(view.mask > 0)
+        free &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
     if view.alpha is not None:
         free &= view.alpha > 127
     return free
@@ -214,7 +214,7 @@ class _Support:
         if len(flat) > 4000:
             flat = flat[:: len(flat) // 4000]
         if len(flat) >= 10:
-            near = cKDTree(flat).query(flat, k=10)[0][:, -1]
+            near = KDTree(flat).query(flat, k=10)[0][:, -1]
             flat = flat[near <= 3 * np.median(near)]
         self._hull = Delaunay(flat) if len(flat) >= 10 else None
 

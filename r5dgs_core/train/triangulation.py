@@ -86,7 +86,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
                 centers[row, s] = best.origin + best.ray * np.linalg.norm(best.origin)
                 sizes.append(best.angular_radius * np.linalg.norm(best.origin))
         radii[row] = np.quantile(sizes, 0.8) if sizes else 0.1
-    measured = ~np.isnan(centers).any(-1)
+    measured = np.asarray(~np.isnan(centers).any(-1))
     for row in range(m):
         known = np.flatnonzero(measured[row])
         for axis in range(3):
