@@ -130,7 +130,11 @@ class R5DGS_OT_capture_dataset(bpy.types.Operator):
             return self._end(context, {"CANCELLED"})
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        finished = self._step(context)
+        try:
+            finished = self._step(context)
+        except Exception:
+            self._end(context, {"CANCELLED"})
+            raise
         return {"RUNNING_MODAL"} if finished is None else self._end(context, finished)
 
     def _step(self, context):

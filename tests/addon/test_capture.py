@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -489,6 +490,18 @@ def test_without_openimageio_the_remedy_is_named(service, blender, scene, tmp_pa
     monkeypatch.setitem(sys.modules, "OpenImageIO", None)
     with pytest.raises(errors.BackendError, match="pip install OpenImageIO"):
         capture(service, blender, tmp_path / "set")
+
+
+def test_a_blender_that_cannot_denoise_says_what_to_switch_off(service, blender, scene, tmp_path, monkeypatch):
+    def render(**keywords):
+        raise RuntimeError("Error: Failed to denoise, build has no OpenImageDenoise support\n")
+
+    ops = SimpleNamespace(render=SimpleNamespace(render=render))
+    stand_in = SimpleNamespace(ops=ops, app=blender.app, data=blender.data)
+    monkeypatch.setattr(service.capture_render, "bpy", stand_in)
+    with pytest.raises(errors.BackendError, match="capture: Failed to denoise, .*; switch denoising off"):
+        capture(service, blender, tmp_path / "set")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
