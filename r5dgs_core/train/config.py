@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
+import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -236,10 +236,12 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _merge(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    merged = json.loads(json.dumps(values))
+    merged = {section: dict(keys) if isinstance(keys, dict) else keys for section, keys in values.items()}
     for name, value in changes.items():
         section, _, key = name.partition(".")
-        merged.setdefault(section, {})[key] = value
+        if not isinstance(merged.setdefault(section, {}), dict):
+            raise ConfigError(f"{section}: expected a section with keys, got {merged[section]!r}")
+        merged[section][key] = value
     return merged
 
 
@@ -250,9 +252,11 @@ def _suggest(name: str, known: Any) -> str:
 
 def _check(name: str, value: Any, kind: type) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        value = float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ConfigError(f"{name}: expected {kind.__name__}, got {value!r}")
+    if kind in (int, float) and not 0 <= value < math.inf:
+        raise ConfigError(f"{name}: expected a finite number that is not negative, got {value!r}")
     return value
 
 
@@ -272,6 +276,7 @@ def _validate(config: Config) -> None:
         (train.checkpoint_every >= 1, "train.checkpoint_every", "at least 1", train.checkpoint_every),
         (train.log_every >= 1, "train.log_every", "at least 1", train.log_every),
         (0 <= config.losses.ssim <= 1, "losses.ssim", "0 to 1", config.losses.ssim),
+        (config.init.sweep_depths >= 2, "init.sweep_depths", "at least 2", config.init.sweep_depths),
         (0 < config.init.opacity < 1, "init.opacity", "between 0 and 1", config.init.opacity),
         (config.densify.every >= 1, "densify.every", "at least 1", config.densify.every),
         (config.identity.dim >= 2, "identity.dim", "at least 2", config.identity.dim),

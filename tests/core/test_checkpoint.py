@@ -1,0 +1,127 @@
+"""Run folders and checkpoints: whole or not at all, and a damaged one is named instead of half-loaded."""
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from r5dgs_core.errors import CheckpointError
+from r5dgs_core.train import checkpoint, config
+
+STATE = {"tensors": {"a": torch.arange(1000.0), "empty": torch.zeros(0, 3)}, "iteration": 7, "queue": [3, 1], "x": 0.1}
+
+
+class Gift:
+    """Something that only pickle can bring along."""
+
+
+def dataset(root="/data"):
+    return SimpleNamespace(root=Path(root), digest="d1")
+
+
+def same(a, b):
+    return all(torch.equal(a["tensors"][n], b["tensors"][n]) for n in a["tensors"]) and a["queue"] == b["queue"]
+
+
+def test_what_is_saved_is_loaded_to_the_bit(tmp_path):
+    checkpoint.save(tmp_path, STATE)
+    loaded = checkpoint.load(tmp_path)
+    assert same(STATE, loaded) and loaded["iteration"] == 7 and loaded["x"] == 0.1
+    assert os.listdir(tmp_path) == [checkpoint.CHECKPOINT_FILE]
+
+
+def test_objects_that_could_run_code_are_refused(tmp_path):
+    torch.save({"format_version": 1, "gift": Gift()}, tmp_path / checkpoint.CHECKPOINT_FILE)
+    with pytest.raises(CheckpointError, match=r"checkpoint.pt: damaged"):
+        checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_checkpoint_is_named(tmp_path, share):
+    checkpoint.save(tmp_path, STATE)
+    path = tmp_path / checkpoint.CHECKPOINT_FILE
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CheckpointError, match=r"checkpoint.pt: damaged"):
+        checkpoint.load(tmp_path)
+
+
+def test_foreign_files_and_other_versions_are_named(tmp_path):
+    path = tmp_path / checkpoint.CHECKPOINT_FILE
+    with pytest.raises(CheckpointError, match="no checkpoint yet"):
+        checkpoint.load(tmp_path)
+    path.write_bytes(b"not a checkpoint" * 10)
+    with pytest.raises(CheckpointError, match="checkpoint.pt"):
+        checkpoint.load(tmp_path)
+    for content in ({"format_version": 999}, {"tensors": {}}, [1, 2]):
+        torch.save(content, path)
+        with pytest.raises(CheckpointError, match="checkpoint.pt: expected a checkpoint of format_version 1"):
+            checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize("moment", ["save", "fsync", "replace"])
+def test_the_old_checkpoint_survives_a_crash_while_the_new_one_is_written(tmp_path, monkeypatch, moment):
+    checkpoint.save(tmp_path, STATE)
+
+    def crash(*args):
+        if moment == "save":
+            args[1].write(b"half")
+        raise OSError("power is gone")
+
+    monkeypatch.setattr(torch if moment == "save" else os, moment, crash)
+    with pytest.raises(OSError, match="power"):
+        checkpoint.save(tmp_path, {**STATE, "iteration": 8})
+    monkeypatch.undo()
+    assert checkpoint.load(tmp_path)["iteration"] == 7
+    checkpoint.save(tmp_path, {**STATE, "iteration": 9})  # and what the crash left is no obstacle
+    assert checkpoint.load(tmp_path)["iteration"] == 9
+
+
+def test_a_run_is_opened_as_it_was_made(tmp_path):
+    settings = config.load(None, ["train.seed=5", "losses.ssim=0.3"])
+    made = checkpoint.create_run(tmp_path / "deep" / "run", dataset(), settings)
+    opened = checkpoint.open_run(tmp_path / "deep" / "run")
+    assert opened == made and opened.config == settings and opened.digest == "d1"
+    assert set(opened.versions) >= {"r5dgs", "torch", "numpy"}
+
+
+def test_a_new_run_in_an_old_run_folder_starts_clean(tmp_path):
+    checkpoint.create_run(tmp_path, dataset(), config.Config())
+    checkpoint.save(tmp_path, STATE)
+    (tmp_path / checkpoint.LOG_FILE).write_text("old\n")
+    checkpoint.create_run(tmp_path, dataset(), config.Config())
+    assert os.listdir(tmp_path) == [checkpoint.RUN_FILE]
+
+
+def test_a_folder_with_other_things_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(CheckpointError, match="is not a run folder; choose another --out"):
+        checkpoint.create_run(tmp_path, dataset(), config.Config())
+    assert os.listdir(tmp_path) == ["thesis.tex"]
+    with pytest.raises(CheckpointError, match="is not a run folder"):
+        checkpoint.create_run(tmp_path / "thesis.tex", dataset(), config.Config())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text[: len(text) // 2], "damaged"),
+        (lambda text: "[]", "damaged"),
+        (lambda text: json.dumps({**json.loads(text), "format_version": 2}), "expected format_version 1, got 2"),
+        (lambda text: json.dumps({k: v for k, v in json.loads(text).items() if k != "digest"}), "damaged.*digest"),
+    ],
+)
+def test_a_damaged_run_file_is_named(tmp_path, change, message):
+    checkpoint.create_run(tmp_path, dataset(), config.Config())
+    path = tmp_path / checkpoint.RUN_FILE
+    path.write_text(change(path.read_text()))
+    with pytest.raises(CheckpointError, match=f"run.json: {message}"):
+        checkpoint.open_run(tmp_path)
+
+
+def test_a_folder_that_is_no_run_is_said(tmp_path):
+    with pytest.raises(CheckpointError, match="not a run folder"):
+        checkpoint.open_run(tmp_path)

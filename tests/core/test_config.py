@@ -1,0 +1,104 @@
+"""Configurations: files and overrides arrive as typed values, and what cannot be used is named."""
+
+import json
+
+import hypothesis
+import pytest
+from hypothesis import strategies as st
+
+from r5dgs_core.errors import ConfigError
+from r5dgs_core.train import config
+
+
+@hypothesis.given(
+    st.fixed_dictionaries(
+        {
+            "train": st.fixed_dictionaries({"iterations": st.integers(1, 10**6), "sh_degree": st.integers(0, 3)}),
+            "losses": st.fixed_dictionaries({"ssim": st.floats(0, 1)}),
+            "rates": st.fixed_dictionaries({}, optional={"means": st.floats(0, 1), "decay": st.integers(0, 3)}),
+        }
+    )
+)
+def test_configurations_survive_the_way_through_json(values):
+    made = config.from_dict(values)
+    assert config.from_dict(json.loads(json.dumps(made.to_dict()))) == made
+    assert made.train.iterations == values["train"]["iterations"]
+
+
+def test_omitted_keys_keep_their_defaults():
+    made = config.from_dict({"train": {"seed": 3}})
+    assert made.train.seed == 3
+    assert made.replace(**{"train.seed": 0}) == config.Config()
+
+
+def test_overrides_win_over_the_file(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("[train]\niterations = 10\nseed = 4\n[losses]\nssim = 0.5\n")
+    made = config.load(path, ["train.iterations=20", "train.background=white", "train.shading = false"])
+    assert (made.train.iterations, made.train.seed, made.losses.ssim) == (20, 4, 0.5)
+    assert made.train.background == "white" and made.train.shading is False
+
+
+def test_the_last_of_two_overrides_wins_and_whole_numbers_serve_as_decimals():
+    made = config.load(None, ["losses.ssim=0.3", "losses.ssim=1"])
+    assert made.losses.ssim == 1.0 and isinstance(made.losses.ssim, float)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("losses.sim=0.1", "losses.sim: unknown key; did you mean 'ssim'?"),
+        ("loses.ssim=0.1", r"\[loses\]: unknown section; did you mean 'losses'?"),
+        ("losses.zzzz=1", "losses.zzzz: unknown key; known are roughness, ssim"),
+        ("train.iterations=1.5", "train.iterations: expected int, got 1.5"),
+        ("train.iterations=true", "train.iterations: expected int, got True"),
+        ("train.shading=1", "train.shading: expected bool, got 1"),
+        ("train.shading=maybe", "train.shading: expected bool, got 'maybe'"),
+        ("losses.ssim=high", "losses.ssim: expected float, got 'high'"),
+        ("losses.ssim=1.5", "losses.ssim: expected 0 to 1, got 1.5"),
+        ("train.iterations=0", "train.iterations: expected at least 1, got 0"),
+        ("train.sh_degree=4", "train.sh_degree: expected 0 to 3, got 4"),
+        ("train.background=gray", "train.background: expected auto or learned or white or black, got 'gray'"),
+        ("init.opacity=1", "init.opacity: expected between 0 and 1, got 1.0"),
+        ("losses.ssim", "expected SECTION.KEY=VALUE"),
+        ("ssim=0.1", "expected SECTION.KEY=VALUE"),
+        ("a.b.c=1", "expected SECTION.KEY=VALUE"),
+    ],
+)
+def test_what_cannot_be_used_is_named(override, message):
+    with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
+        config.load(None, [override])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("train = 3", "train: expected a section with keys, got 3"),
+        ("[train\n", "not valid TOML"),
+        ("[train]\nseed = 2026-01-01", "train.seed: expected int, got datetime.date"),
+        ("[train]\niteration = 3", "train.iteration: unknown key; did you mean 'iterations'?"),
+    ],
+)
+def test_faults_of_a_file_are_named(tmp_path, text, message):
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
+        config.load(path)
+
+
+def test_an_override_into_something_that_is_no_section_is_refused(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("train = 3")
+    with pytest.raises(ConfigError, match="train"):
+        config.load(path, ["train.seed=1"])
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1"])
+def test_numbers_that_no_key_can_use_are_refused(value):
+    with pytest.raises(ConfigError, match="rates.means"):
+        config.load(None, [f"rates.means={value}"])
+
+
+def test_a_missing_file_is_said(tmp_path):
+    with pytest.raises(ConfigError, match="c.toml: no such configuration file"):
+        config.load(tmp_path / "c.toml")
