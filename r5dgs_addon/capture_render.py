@@ -110,7 +110,8 @@ def render_view(
             bpy.ops.render.render(write_still=True, scene=scene.name, layer=context.view_layer.name)
     except RuntimeError as error:
         remedy = "; switch denoising off" if "denois" in str(error).lower() else ""
-        raise errors.BackendError(f"capture: {str(error).removeprefix("Error: ").splitlines()[0]}{remedy}") from error
+        message = str(error).removeprefix("Error: ").splitlines()[0]
+        raise errors.BackendError(f"capture: {message}{remedy}") from error
     if not exr.is_file():
         raise errors.BackendError(f"capture: Cycles rendered nothing from camera {camera.name!r}; see the console")
     _set_format(scene.render.image_settings, "PNG", "8", "RGBA" if transparent else "RGB")
