@@ -22,7 +22,6 @@ _EMPTY = np.empty((0, 0), np.float32)
 class _Pass:
     """What the backward pass needs of the forward pass, all numpy and never handed out."""
 
-    camera: Camera
     view: np.ndarray
     limits: np.ndarray
     tile_starts: np.ndarray
@@ -32,9 +31,6 @@ class _Pass:
     slot_starts: np.ndarray
     geometry: np.ndarray
     values: np.ndarray
-    image: np.ndarray
-    alpha: np.ndarray
-    depth: np.ndarray
     transmittance: np.ndarray
 
 
@@ -83,20 +79,19 @@ class _Rasterize(torch.autograd.Function):
             behind = background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
         view = pack_view(camera, settings)
         radii = np.zeros(n, np.float32)
-        state, ids = _forward(arrays, behind, camera, labels, settings, view, radii)
+        state, *results = _forward(arrays, behind, camera, labels, settings, view, radii)
         if stats is not None:
             stats.radii = torch.from_numpy(radii)
             stats.visible = stats.radii > 0
             stats.grad_norm = torch.zeros(n)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(means, quats, scales, opacities)
+        image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
+        # Results are saved as tensors: whoever changes one in place gets torch's error instead of a wrong gradient.
+        ctx.save_for_backward(means, quats, scales, opacities, image, alpha, depth)
         ctx.state, ctx.stats, ctx.n_channels = state, stats, n_channels
         ctx.background_shape = None if background is None else background.shape
-        # Copies are handed out: a caller that changes the image in place must not change the gradient.
-        results = [torch.from_numpy(a.copy()) for a in (state.image, state.alpha, state.depth)]
-        ids = torch.from_numpy(ids)
         ctx.mark_non_differentiable(ids)
-        return (*results, ids)
+        return image, alpha, depth, ids
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -104,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
         state: _Pass = ctx.state
         arrays = [t.detach().contiguous().numpy() for t in ctx.saved_tensors]
         if d_image is None:
-            d_image = torch.zeros(state.image.shape)
+            d_image = torch.zeros(ctx.saved_tensors[4].shape)
         d_image = d_image.contiguous().numpy()
         d_alpha = _EMPTY if d_alpha is None else d_alpha.contiguous().numpy()
         d_depth = _EMPTY if d_depth is None else d_depth.contiguous().numpy()
@@ -120,8 +115,8 @@ class _Rasterize(torch.autograd.Function):
         return (*(torch.from_numpy(g) for g in gradients), d_background, None, None, None, None)
 
 
-def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple[_Pass, np.ndarray]:
-    """Project, sort, assign and blend; fills ``radii`` [N]."""
+def _forward(arrays, background, camera, labels, settings, view, radii):
+    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state, image, alpha, depth and ids."""
     means, quats, scales, opacities, channels = arrays
     n, n_channels = channels.shape
     height, width = camera.height, camera.width
@@ -157,21 +152,20 @@ def _forward(arrays, background, camera, labels, settings, view, radii) -> tuple
         ids, tile_ends,
     )  # fmt: skip
     state = _Pass(
-        camera, view, limits, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values,
-        image, alpha, depth, transmittance,
+        view, limits, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values, transmittance,
     )  # fmt: skip
-    return state, ids
+    return state, image, alpha, depth, ids
 
 
 def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
-    means, quats, scales, opacities = arrays
+    means, quats, scales, opacities, image, alpha, depth = arrays
     n = len(means)
     slots = np.empty((len(state.pair_ranks), cpu_projection.MOMENTS + state.values.shape[1]), np.float32)
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_ranks, state.pair_slots, state.geometry, state.values,
-        state.limits, state.image, state.alpha, state.depth, state.transmittance, d_image, d_alpha, d_depth, slots,
+        state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth, slots,
     )  # fmt: skip
     gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
     gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]

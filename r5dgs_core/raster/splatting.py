@@ -6,6 +6,7 @@ import importlib.util
 import logging
 from typing import Any
 
+import numpy as np
 import torch
 
 from .. import errors
@@ -185,7 +186,9 @@ def _check(means, quats, scales, opacities, channels, camera, background, labels
         raise ValueError(f"labels: expected {n} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
     for name, tensor in inputs.items():
         # A sum is one fast pass, and not finite as soon as one term is not; only then is the culprit looked for.
-        if not torch.isfinite(tensor.detach().sum(dtype=torch.float64)):
+        # On the CPU numpy sums: torch would wake its thread pool for it.
+        content = tensor.detach()
+        if not np.isfinite(content.numpy().sum() if content.device.type == "cpu" else content.sum().item()):
             bad = torch.nonzero(~torch.isfinite(tensor))
             if len(bad):
                 index = tuple(bad[0].tolist())
