@@ -53,7 +53,7 @@ class MotionGroup:
         model: Motion past t_max, about ``pivot``.
         follows: Group whose displacement this one takes through ``follow_matrix`` (no rotation), or None.
         follow_matrix: Linear map from that group's displacement to this one's. [3, 3]
-        rigid_rms: Root mean square of the distance that members keep from this rigid motion in the observed time, world.
+        rigid_rms: Root mean square of the distance that members keep from this rigid motion in the observed time.
         rigid_max: The same, largest.
     """
 
