@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import secrets
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -65,6 +66,7 @@ for _name in FIXED_POINT:
     _STORED_DTYPES[_name].add("<i2")
 for _name in _HALF:
     _STORED_DTYPES[_name].add("<f2")
+# What zipfile, zlib and numpy raise on damaged bytes; the encrypted flag is a RuntimeError, odd names a ValueError.
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError, KeyError)
 
 
@@ -107,15 +109,16 @@ def read(path: str | Path) -> Scene:
             f"{path}: expected a .r5dgs file, found {'a folder' if path.is_dir() else 'nothing'}"
         )
     try:
-        with zipfile.ZipFile(path) as archive:
-            scene = _read_zip(archive, str(path))
-    except zipfile.BadZipFile as error:
+        archive = zipfile.ZipFile(path)
+    except PermissionError as error:
+        raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
+    except (*_BROKEN, struct.error) as error:
         raise errors.SceneFileError(
             f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "
             "bake or copy it again"
         ) from error
-    except OSError as error:
-        raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
+    with archive:
+        scene = _read_zip(archive, str(path))
     validation.check(scene, str(path))
     return scene
 
@@ -211,6 +214,7 @@ def _to_json(scene: Scene) -> dict[str, Any]:
         "generator": f"r5dgs {__version__}",
         "name": scene.name,
         "gaussians": len(scene.means),
+        "arrays": [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None],
         "t_max": float(scene.t_max),
         "frames_per_unit": float(scene.frames_per_unit),
         "world_convention": scene.world_convention,
@@ -260,8 +264,9 @@ def _to_json(scene: Scene) -> dict[str, Any]:
 
 def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
     data = _read_json(archive, place)
-    arrays = {name: _read_array(archive, name, place) for name in _MEMORY_DTYPES}
     json_place = f"{place}: {JSON_MEMBER}"
+    listed = _words(data, "arrays", json_place)
+    arrays = {name: _read_array(archive, name, place, name in listed) for name in _MEMORY_DTYPES}
     count, means = _get(data, "gaussians", int, json_place), arrays["means"]
     if means is None or means.shape[:1] != (count,):
         found = None if means is None else means.shape
@@ -306,12 +311,13 @@ def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:
     return data
 
 
-def _read_array(archive: zipfile.ZipFile, name: str, place: str) -> np.ndarray | None:
+def _read_array(archive: zipfile.ZipFile, name: str, place: str, listed: bool) -> np.ndarray | None:
+    """One array. An optional one is absent where scene.json does not list it, so that a lost one is noticed."""
     member = f"{name}.npy"
     where = f"{place}: {member}"
+    if name in _OPTIONAL and not listed:
+        return None
     if member not in archive.namelist():
-        if name in _OPTIONAL:
-            return None
         raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found")
     try:
         data = archive.read(member)

@@ -63,6 +63,9 @@ def check(scene: Scene, place: str) -> None:
             _fail(place, name, "finite numbers", f"NaN or infinity in row {bad}")
     if (scene.classifier_weight is None) != (scene.classifier_bias is None):
         _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
+    stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
+    if len(stray):
+        _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
     _check_units(scene, place)
     _check_times(scene, place)
     _check_objects(scene, place)
@@ -162,8 +165,6 @@ def _check_group(scene: Scene, place: str, row: int, group: MotionGroup) -> None
             or (poses != poses[-1]).any()
         ):
             _fail(place, where, "role 'pinned', a static model and no motion", repr(group.role))
-        if ((scene.motion_ids < 0) | (scene.motion_ids >= len(scene.groups))).any():
-            _fail(place, "motion_ids", f"ids of the {len(scene.groups)} motion groups", int(scene.motion_ids.max()))
     if group.follows is None:
         return
     if not 0 <= group.follows < len(scene.groups) or scene.groups[group.follows].follows is not None:

@@ -1,0 +1,151 @@
+import math
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import keyframes, models, rotations
+from r5dgs_core.motion.models import MotionModel
+from tests.problems import MOTIONS, RADIUS, SIZE
+
+TOLERANCE = 1e-3 * SIZE
+# Scalar keys over [0, 2] at 0.1 % of the size. One cubic holds an arc of radius u for about (384 tol / (2 u))^(1/4)
+# rad, so the hinge, which turns by 4 rad and by 7 when it accelerates, needs 6 and 11 intervals in location.
+MOST_KEYS = {
+    "static": 7,
+    "uniform": 10,
+    "ballistic": 10,
+    "ballistic, spinning": 24,
+    "spin": 20,
+    "hinge": 34,
+    "hinge, accelerating": 70,
+    "rolling": 26,
+    "rolling, slowing": 36,
+    "spin, accelerating": 32,
+}
+HARD = MotionModel(
+    "world_twist",
+    velocity=[1, 0, 0.5],
+    acceleration=[0, 0.5, 0],
+    angular_velocity=[1, 0, 2],
+    angular_acceleration=[0, 1.5, 0],
+    offset_rotvec=[0.03, 0, 0.02],
+    offset_displacement=[0.01, 0.02, 0],
+    radius=RADIUS,
+)
+CASES = {name: model for name, (model, _) in MOTIONS.items()} | {"hard": HARD}
+
+
+def reduced(model, tolerance=TOLERANCE, t1=2.0, **options):
+    return keyframes.reduce(keyframes.model_sampler(model, 0.0), 0.0, t1, tolerance, RADIUS, **options)
+
+
+def largest_error(curves, model, times):
+    quats, displacements = models.evaluate(model, times)
+    shift = np.linalg.norm(keyframes.evaluate(curves.location, times) - displacements, axis=-1)
+    angle = rotations.angle_between(keyframes.evaluate(curves.rotation, times, unit=True), quats)
+    return float((shift + 2 * RADIUS * np.sin(0.5 * angle)).max())
+
+
+@pytest.mark.parametrize("tolerance", [TOLERANCE, 1e-5 * SIZE])
+@pytest.mark.parametrize("name", CASES)
+def test_no_point_leaves_the_tolerance_between_keys(name, tolerance):
+    curves = reduced(CASES[name], tolerance)
+    assert largest_error(curves, CASES[name], np.linspace(0, 2, 1931)) <= 1.001 * tolerance
+
+
+@pytest.mark.parametrize("name", MOST_KEYS)
+def test_few_keys_suffice(name):
+    curves = reduced(CASES[name])
+    assert 3 * len(curves.location.times) + 4 * len(curves.rotation.times) <= MOST_KEYS[name]
+
+
+def test_constant_curves_have_one_key():
+    curves = reduced(MOTIONS["spin"][0])
+    assert len(curves.location.times) == 1
+    assert len(curves.rotation.times) > 1
+    curves = reduced(MOTIONS["ballistic"][0])
+    assert len(curves.location.times) == 2
+    assert len(curves.rotation.times) == 1
+    assert len(reduced(MotionModel(), forced_times=(0.5, 1.0)).location.times) == 1
+
+
+def test_keys_lie_on_the_motion_and_ends_are_exact():
+    curves = reduced(HARD)
+    quats, _ = models.evaluate(HARD, curves.rotation.times)
+    _, displacements = models.evaluate(HARD, curves.location.times)
+    assert rotations.angle_between(curves.rotation.values, quats).max() < 1e-12
+    np.testing.assert_array_equal(curves.location.values, displacements)
+    assert curves.location.times[[0, -1]].tolist() == [0, 2]
+    assert curves.location.values[0].tolist() == [0, 0, 0]
+    assert curves.rotation.values[0].tolist() == [1, 0, 0, 0]
+
+
+def test_fast_spins_never_step_over_120_degrees():
+    model = MotionModel("ballistic_spin", angular_velocity=[0, 5, 40.0])
+    curves = reduced(model, 0.5 * SIZE)
+    values = curves.rotation.values
+    assert ((values[1:] * values[:-1]).sum(-1) >= math.cos(math.radians(60)) - 1e-12).all()
+    assert largest_error(curves, model, np.linspace(0, 2, 3001)) <= 0.5 * SIZE
+
+
+def test_forced_times_get_a_key():
+    curves = reduced(MOTIONS["ballistic, spinning"][0], forced_times=(0.3, 1.7, 5.0))
+    for keys in (curves.location, curves.rotation):
+        assert {0.3, 1.7} <= set(keys.times.tolist())
+        assert 5.0 not in keys.times
+
+
+def test_joined_curves_keep_the_kink_and_both_sides():
+    before, after = MotionModel("translation", velocity=[1, 0, 0]), MotionModel("translation", velocity=[0, 2, 0])
+
+    def first(times):
+        quats, d, rates, slopes = keyframes.model_sampler(before, 0.0)(times)
+        return quats, d - 1.0 * np.array([1, 0, 0]), rates, slopes
+
+    left = keyframes.reduce(first, 0.0, 1.0, TOLERANCE, RADIUS)
+    right = keyframes.reduce(keyframes.model_sampler(after, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
+    joined = keyframes.join(left, right)
+    assert joined.location.times.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(joined.location.left_slopes[1], [1, 0, 0])
+    np.testing.assert_allclose(joined.location.right_slopes[1], [0, 2, 0])
+    np.testing.assert_allclose(keyframes.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
+    assert keyframes.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
+
+
+def test_joining_keeps_quaternion_signs_continuous():
+    model = MotionModel("ballistic_spin", angular_velocity=[0, 0, 3.0])
+    left = reduced(model, t1=1.0)
+
+    def later(times):
+        quats, d, rates, slopes = keyframes.model_sampler(model, 0.0)(times)
+        return -quats, d, -rates, slopes
+
+    joined = keyframes.join(left, keyframes.reduce(later, 1.0, 2.0, TOLERANCE, RADIUS))
+    assert (np.diff(joined.rotation.times) > 0).all()
+    assert largest_error(joined, model, np.linspace(0, 2, 901)) <= TOLERANCE
+
+
+def test_flipping_signs_of_samples_changes_nothing():
+    model = MOTIONS["ballistic, spinning"][0]
+
+    def flipped(times):
+        quats, d, rates, slopes = keyframes.model_sampler(model, 0.0)(times)
+        signs = np.where(np.arange(len(times)) % 3 == 1, -1.0, 1.0)[:, None]
+        return quats * signs, d, rates * signs, slopes
+
+    curves = keyframes.reduce(flipped, 0.0, 2.0, TOLERANCE, RADIUS)
+    assert largest_error(curves, model, np.linspace(0, 2, 901)) <= TOLERANCE
+
+
+def test_equal_input_gives_equal_keys():
+    first, second = reduced(HARD), reduced(HARD)
+    np.testing.assert_array_equal(first.rotation.values, second.rotation.values)
+    np.testing.assert_array_equal(first.rotation.times, second.rotation.times)
+
+
+def test_unusable_arguments_are_refused():
+    sampler = keyframes.model_sampler(HARD, 0.0)
+    with pytest.raises(ValueError, match="t0"):
+        keyframes.reduce(sampler, 1.0, 1.0, 1e-3, 1.0)
+    with pytest.raises(ValueError, match="tolerance"):
+        keyframes.reduce(sampler, 0.0, 1.0, 0.0, 1.0)

@@ -1,0 +1,152 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import keyframes, models, rotations
+from r5dgs_core.scene import playback
+from tests.scenes import T_MAX, make_scene
+
+AFTER = np.nextafter(T_MAX, 1.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(objects=5, sh_degree=1)
+
+
+def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
+    frame = playback.frame(scene, T_MAX)
+    np.testing.assert_array_equal(frame.means, scene.means)
+    np.testing.assert_array_equal(frame.quats, scene.quats)
+    assert (frame.shading_factor == 1).all()
+    assert (frame.group_quats == rotations.identity(len(scene.groups))).all()
+    assert (frame.group_displacements == 0).all()
+
+
+def test_playback_is_continuous_at_t_max(scene):
+    for t in (np.nextafter(T_MAX, 0.0), AFTER, T_MAX + 1e-9, T_MAX - 1e-9):
+        frame = playback.frame(scene, t)
+        np.testing.assert_allclose(frame.means, scene.means, atol=1e-6)
+        assert rotations.angle_between(frame.group_quats, rotations.identity(1)).max() < 1e-7
+
+
+def test_knots_are_met_exactly(scene):
+    for k, t in enumerate(scene.track_times):
+        quats, displacements = playback.group_poses(scene, t)
+        np.testing.assert_allclose(displacements, scene.track_poses[:, k, 4:], atol=1e-12)
+        assert rotations.angle_between(quats, scene.track_poses[:, k, :4]).max() < 1e-7
+
+
+def test_before_the_first_time_the_first_pose_is_held(scene):
+    for first, early in zip(playback.group_poses(scene, 0.0), playback.group_poses(scene, -3.0), strict=True):
+        np.testing.assert_array_equal(first, early)
+
+
+def test_between_knots_the_curve_is_smooth_and_near_the_motion(scene):
+    times = np.linspace(0.001, T_MAX - 0.001, 400)
+    quats, displacements = (np.stack(x) for x in zip(*(playback.group_poses(scene, t) for t in times), strict=True))
+    for group in scene.groups[1:6]:
+        true_quats, true, _, _ = models.curve(group.model, times - T_MAX)
+        assert np.linalg.norm(displacements[:, group.id] - true, axis=-1).max() < 2e-3
+        assert rotations.angle_between(quats[:, group.id], true_quats).max() < 2e-3
+    inner = scene.track_times[1:-1]
+    before, at, after = (np.stack([playback.group_poses(scene, t + h)[1] for t in inner]) for h in (-1e-7, 0, 1e-7))
+    np.testing.assert_allclose((at - before) / 1e-7, (after - at) / 1e-7, atol=1e-4)
+
+
+def test_keys_at_the_knots_reproduce_playback(scene):
+    """Blender's Bezier keys with handles at a third are cubic Hermite curves: `keyframes.evaluate` is their rule."""
+    quats, displacements = playback.knots(scene)
+    quat_slopes, slopes = playback.knot_slopes(scene)
+    times = np.linspace(0, T_MAX, 131)
+    for g in range(len(scene.groups)):
+        location = keyframes.Keys(scene.track_times, displacements[g], slopes[g], slopes[g])
+        rotation = keyframes.Keys(scene.track_times, quats[g], quat_slopes[g], quat_slopes[g])
+        keyed = keyframes.evaluate(location, times), keyframes.evaluate(rotation, times, unit=True)
+        played = [playback.group_poses(scene, t) for t in times]
+        np.testing.assert_allclose(keyed[0], np.stack([p[1][g] for p in played]), atol=1e-12)
+        np.testing.assert_allclose(keyed[1], np.stack([p[0][g] for p in played]), atol=1e-12)
+
+
+def test_slopes_are_exact_for_parabolas_on_uneven_times():
+    times = np.array([0.0, 0.1, 0.35, 0.4, 0.9])
+    values = np.stack([3 * times**2 - times, 2 + 0 * times], -1)
+    expected = np.stack([6 * times - 1, 0 * times], -1)
+    np.testing.assert_allclose(playback.slopes(times, values), expected, atol=1e-12)
+    np.testing.assert_allclose(playback.slopes(times[:2], values[:2])[0, 0], (values[1, 0] - values[0, 0]) / 0.1)
+    assert (playback.slopes(times[:1], values[:1]) == 0).all()
+
+
+def test_signs_in_the_file_do_not_matter(scene):
+    flipped = scene.track_poses.copy()
+    flipped[:, ::2, :4] *= -1
+    other = dataclasses.replace(scene, track_poses=flipped)
+    for t in (0.13, 0.5, 0.74):
+        for a, b in zip(playback.group_poses(scene, t), playback.group_poses(other, t), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-14)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.33, 0.9, 3.0])
+def test_every_group_moves_rigidly(scene, t):
+    frame = playback.frame(scene, t)
+    for start, stop, g in playback.runs(scene.motion_ids):
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-6)
+        pivot, q, d = scene.groups[g].pivot, frame.group_quats[g], frame.group_displacements[g]
+        np.testing.assert_allclose(after, pivot + rotations.rotate(q, before - pivot) + d, atol=1e-6)
+        own = rotations.multiply(q, scene.quats[start:stop].astype(float))
+        assert rotations.angle_between(own, frame.quats[start:stop].astype(float)).max() < 1e-6
+
+
+def test_pinned_gaussians_never_change(scene):
+    still = scene.motion_ids == 0
+    for t in (0.0, 2.0):
+        frame = playback.frame(scene, t)
+        np.testing.assert_array_equal(frame.means[still], scene.means[still])
+        assert (frame.shading_factor[still] == 1).all()
+
+
+def test_a_follower_takes_its_leaders_displacement_without_turning(scene):
+    shadow = next(g for g in scene.groups if g.follows is not None)
+    quats, displacements = playback.group_poses(scene, 1.4)
+    np.testing.assert_allclose(displacements[shadow.id], shadow.follow_matrix @ displacements[shadow.follows])
+    assert np.linalg.norm(displacements[shadow.id]) > 0.1
+    assert quats[shadow.id].tolist() == [1, 0, 0, 0]
+
+
+def test_shading_follows_the_light_in_the_objects_frame(scene):
+    frame = playback.frame(scene, 1.1)
+    row = int(np.flatnonzero(scene.motion_ids == 1)[0])
+    rotmat = rotations.quats_to_rotmats(frame.group_quats[1])
+    light = scene.light_direction
+    expected = 1 + (rotmat.T @ light - light) @ scene.shading[row]
+    assert frame.shading_factor[row] == pytest.approx(max(expected, 0), rel=1e-5)
+    dark = dataclasses.replace(scene, shading=scene.shading * 1e4)
+    assert playback.frame(dark, 1.1).shading_factor.min() == 0
+    assert playback.frame(make_scene(shading=False), 1.1).shading_factor is None
+
+
+def test_sh_rotations_bring_directions_into_the_bind_frame(scene):
+    quats, _ = playback.group_poses(scene, 0.2)
+    direction = np.array([0.6, 0.0, 0.8])
+    back = playback.sh_rotations(quats) @ direction
+    np.testing.assert_allclose(rotations.rotate(quats, back), np.broadcast_to(direction, back.shape), atol=1e-12)
+
+
+def test_scenes_without_gaussians_objects_or_motion_play():
+    empty = make_scene(n=0, objects=0, unassigned=0)
+    assert len(playback.frame(empty, 5.0).means) == 0
+    still = make_scene(n=30, objects=0)
+    np.testing.assert_array_equal(playback.frame(still, 5.0).means, still.means)
+    base = make_scene()
+    single = dataclasses.replace(base, track_times=base.track_times[-1:], track_poses=base.track_poses[:, -1:])
+    np.testing.assert_array_equal(playback.frame(single, 0.0).means, base.means)
+
+
+def test_unknown_modes_and_times_are_refused(scene):
+    with pytest.raises(ValueError, match="mode"):
+        playback.frame(scene, 1.0, mode="wobbly")
+    with pytest.raises(ValueError, match="finite"):
+        playback.frame(scene, float("nan"))
