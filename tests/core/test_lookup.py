@@ -1,0 +1,125 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.scene import lookup
+from tests.scenes import make_scene
+
+MUG, APPLE, CAR, LEMON, BLOCK, GLOBE = range(1, 7)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(objects=6)
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"),
+    [
+        ("mug", [MUG]),
+        ("Mugs", [MUG]),
+        ("the cup", [MUG]),
+        ("coffee mug", [MUG]),
+        ("red apple", [APPLE]),
+        ("apple, red", [APPLE]),
+        ("apple red", [APPLE]),
+        ("apples", [APPLE]),
+        ("aple", [APPLE]),
+        ("aplpe", [APPLE]),
+        ("toy", [CAR]),
+        ("toycar", [CAR]),
+        ("glob", [GLOBE]),
+        ("wood", [BLOCK]),
+        ("wooden blocks", [BLOCK]),
+        ("fruit", [APPLE, LEMON]),
+        ("mug and lemon", [MUG, LEMON]),
+        ("lemons, globe & cup", [LEMON, GLOBE, MUG]),
+        ("background", [0]),
+    ],
+)
+def test_words_find_their_objects_best_first(scene, text, ids):
+    assert [match.object_id for match in lookup.search(scene, text)] == ids
+
+
+@pytest.mark.parametrize(
+    "text", ["giraffe", "cat", "table", "cupboard", "carpet", "mug handle", "", "  ", "the", "?!", "unassigned"]
+)
+def test_nothing_matches_what_is_not_there(scene, text):
+    assert lookup.search(scene, text) == []
+
+
+def test_an_exact_name_scores_one_and_better_answers_score_more(scene):
+    def score(text, object_id):
+        return next(m.score for m in lookup.search(scene, text) if m.object_id == object_id)
+
+    assert score("red apple", APPLE) == 1.0
+    assert score("red apple", APPLE) > score("apple", APPLE) > score("aple", APPLE) >= lookup.THRESHOLD
+    assert score("cup", MUG) < score("mug", MUG)
+    assert score("coffee mug", MUG) < score("mug", MUG)
+
+
+def test_matches_say_why(scene):
+    (match,) = lookup.search(scene, "cups")
+    assert match.why == "alias 'cup'"
+    (match,) = lookup.search(scene, "aple")
+    assert "'red apple'" in match.why
+    assert "'aple'" in match.why
+
+
+def test_the_threshold_is_the_callers(scene):
+    assert lookup.search(scene, "aple", threshold=0.95) == []
+    assert lookup.search(scene, "coffee mug", threshold=0.95) == []
+
+
+def test_an_exact_name_goes_before_a_longer_one():
+    labels = [lookup.Label(1, "red car"), lookup.Label(2, "car"), lookup.Label(3, "carafe")]
+    assert [m.object_id for m in lookup.search_labels(labels, "car")] == [2, 1, 3]
+
+
+def test_other_scripts_and_accents_are_words():
+    labels = [lookup.Label(1, "Café"), lookup.Label(2, "кружка"), lookup.Label(3, "杯子")]
+    assert [m.object_id for m in lookup.search_labels(labels, "cafe")] == [1]
+    assert [m.object_id for m in lookup.search_labels(labels, "Кружка")] == [2]
+    assert [m.object_id for m in lookup.search_labels(labels, "杯子")] == [3]
+
+
+@pytest.mark.parametrize(
+    ("plural", "singular"),
+    [
+        ("mugs", "mug"),
+        ("boxes", "box"),
+        ("berries", "berry"),
+        ("glass", "glass"),
+        ("dishes", "dish"),
+        ("knives", "knif"),
+        ("cactus", "cactus"),
+    ],
+)
+def test_plurals_become_singular(plural, singular):
+    assert lookup.singular(plural) == singular
+
+
+def test_stored_embeddings_answer_words_that_no_name_has(scene):
+    count = len(scene.objects)
+    axes = np.eye(count + 2, dtype=np.float32)
+    row = next(i for i, item in enumerate(scene.objects) if item.id == LEMON)
+    near = 0.8 * axes[row] + 0.6 * axes[count]
+    rich = dataclasses.replace(
+        scene,
+        embeddings=axes[:count],
+        vocabulary=("sour thing", "zeppelin"),
+        vocabulary_embeddings=np.stack([near, axes[count + 1]]),
+    )
+    (match,) = lookup.search(rich, "sour things")
+    assert match.object_id == LEMON
+    assert "meaning" in match.why
+    assert lookup.search(rich, "zeppelin") == []
+    assert lookup.search(scene, "sour things") == []
+
+
+def test_a_sentence_says_what_there_is(scene):
+    labels = [lookup.Label(item.id, item.name) for item in scene.objects if item.id > 0]
+    said = lookup.explain_nothing(labels, " giraffe ")
+    assert said.startswith("nothing matches 'giraffe'")
+    assert "mug" in said
