@@ -25,7 +25,3 @@ def pytest_report_header(config: pytest.Config) -> str:
         return f"blender: ABSENT, its tests are skipped: the bpy module exists for Python {wanted}, this is {here}"
     remedy = "pip install -c constraints.txt -e '.[test]'"
     return f"blender: ABSENT, its tests are skipped: bpy is not installed, {remedy}"
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--update-golden", action="store_true", help="write golden images anew instead of comparing")
