@@ -8,7 +8,9 @@ from . import compat
 
 # A colour attribute named exactly `color` renders black in Cycles, hence this name.
 DISPLAY_COLOR = "display_color"
-DISPLAY_SIGMAS = 1.5  # radius of the sphere that stands for a Gaussian in viewports without splats
+# Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
+DISPLAY_SIGMAS = 1.2
+LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
 C0 = 0.28209479177387814  # spherical harmonic of degree 0
 
 
@@ -18,7 +20,7 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, view_dependence: bool) -> None:
+def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, view_dependence: bool) -> None:
     """Write Gaussians to a point cloud of as many points.
 
     Attributes: `position`; `scale` (standard deviations) and `rotation` (wxyz); `radiance:base` (degree-0 coefficients
@@ -29,6 +31,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, view_dependence
         cloud: The point cloud.
         scene: The scene.
         rows: Its rows to write.
+        extent: The scene's size.
         view_dependence: Whether to write the coefficients above degree 0.
     """
     sh = scene.sh[rows]
@@ -36,7 +39,8 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, view_dependence
     opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
     shown = srgb_to_linear(0.5 + C0 * sh[:, 0].astype(np.float64))
-    radii = DISPLAY_SIGMAS * np.exp(log_scales.mean(-1))
+    radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
+    radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
     _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows])
     _write(cloud, "radius", "FLOAT", "value", radii)
     _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales))

@@ -4,6 +4,9 @@ import atexit
 
 import bpy
 
+# In newer versions a path property has to say that it may begin with "//"; before, there is no such word.
+_SAYS_RELATIVE = "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties
+PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _SAYS_RELATIVE else set()
 KEYFRAME = bpy.types.Keyframe.bl_rna
 
 

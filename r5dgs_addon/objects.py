@@ -97,6 +97,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         times = timeline.Times.of(scene, options.frame_zero, options.t_end)
         collection = bpy.data.collections.new(_name(f"R5DGS {scene.name}"))
         context.scene.collection.children.link(collection)
+        extent = scene.extent
         root = _root(collection, scene, options.world_convention or scene.world_convention)
         _describe(collection, scene, path, root, times)
         material = clouds.material(_name(f"R5DGS {scene.name}"))
@@ -107,10 +108,10 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
             collection.children.link(children[object_id])
         anchors = {}
         for part in homes(scene, parts):
-            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, parts)
+            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, parts, extent)
         for part in parts:
             anchor = anchors[_anchor_key(part)]
-            _cloud(children[part.object_id], anchor, scene, part, parts, material, options.view_dependence)
+            _cloud(children[part.object_id], anchor, scene, part, parts, material, extent, options.view_dependence)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
         if options.fit_timeline:
@@ -207,12 +208,17 @@ def _part_name(scene: Scene, part: Range, parts: list[Range]) -> str:
 
 
 def _anchor(
-    collection: bpy.types.Collection, root: bpy.types.Object, scene: Scene, part: Range, parts: list[Range]
+    collection: bpy.types.Collection,
+    root: bpy.types.Object,
+    scene: Scene,
+    part: Range,
+    parts: list[Range],
+    extent: float,
 ) -> bpy.types.Object:
     anchor = bpy.data.objects.new(_name(f"{_part_name(scene, part, parts)} anchor"), None)
     pivot = _pivot(scene, part)
     anchor.empty_display_type = "ARROWS"
-    anchor.empty_display_size = 0.05 * scene.extent
+    anchor.empty_display_size = 0.03 * extent
     anchor.rotation_mode = "QUATERNION"
     anchor.location = pivot
     anchor.parent = root
@@ -229,10 +235,11 @@ def _cloud(
     part: Range,
     parts: list[Range],
     material: bpy.types.Material,
+    extent: float,
     view_dependence: bool,
 ) -> bpy.types.Object:
     cloud = compat.new_point_cloud(_name(_part_name(scene, part, parts)), part.count, collection)
-    clouds.fill(cloud.data, scene, slice(part.start, part.start + part.count), view_dependence)
+    clouds.fill(cloud.data, scene, slice(part.start, part.start + part.count), extent, view_dependence)
     cloud.data.materials.append(material)
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
     cloud.color = (*color, 1.0)

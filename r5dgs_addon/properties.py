@@ -16,6 +16,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from . import compat
+
 ROLES = (
     ("NONE", "None", "Not part of an R5DGS scene"),
     ("ROOT", "Root", "Carries the world convention of the scene"),
@@ -53,6 +55,7 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
         name="Scene File",
         description="The .r5dgs file that the preview reads; relative to the .blend file where possible",
         subtype="FILE_PATH",
+        options={"ANIMATABLE"} | compat.PATH_OPTIONS,
     )
     gaussians: IntProperty(name="Gaussians", description="Number of Gaussians in the scene file")
     t_start: FloatProperty(name="First Time", description="First observed scene time", precision=4)
