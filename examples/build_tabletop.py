@@ -17,6 +17,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 from mathutils import Euler, Quaternion, Vector
@@ -281,7 +282,7 @@ def slide(
 
 def new_scene(sky: Sequence[float], sky_strength: float, sun: float, sun_rotation_deg: Sequence[float]) -> None:
     """Empty the file; a constant sky, a soft sun, and Cycles set for it."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = FIRST_FRAME, FIRST_FRAME + FRAMES_PER_UNIT
     scene.render.fps = 30
@@ -413,10 +414,9 @@ def build_tabletop() -> None:
             part.pass_index = number
 
 
-def capture_tabletop(directory: Path) -> None:
-    """Capture the open file with the add-on's service of this checkout, and print a line of JSON for each image."""
-    capture = _load_capture()
-    settings = capture.CaptureSettings(
+def tabletop_settings(capture: ModuleType, directory: Path):
+    """Settings of the bundled data set, as the ``CaptureSettings`` of the capture service."""
+    return capture.CaptureSettings(
         directory=directory,
         resolution_x=128,
         resolution_y=128,
@@ -435,11 +435,17 @@ def capture_tabletop(directory: Path) -> None:
         rig_fov_deg=42.0,
         objects="PASS_INDEX",
     )
+
+
+def capture_tabletop(directory: Path) -> None:
+    """Capture the open file with the add-on's service of this checkout, and print a line of JSON for each image."""
+    capture = _load_capture()
+    settings = tabletop_settings(capture, directory)
     result = capture.capture(bpy.context, settings, lambda state: print(json.dumps(vars(state)), flush=True))
     print(f"{result.directory}: {result.images}, objects {result.objects}, not seen {result.unseen or 'none'}")
 
 
-def _load_capture():
+def _load_capture() -> ModuleType:
     """The capture service, from the folder above this one as the package ``r5dgs``."""
     root = Path(__file__).resolve().parent.parent
     spec = importlib.util.spec_from_file_location("r5dgs", root / "__init__.py", submodule_search_locations=[str(root)])
