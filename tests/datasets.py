@@ -18,6 +18,7 @@ from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.train import config
 
 T_MAX = 0.75
 OBSERVED = np.linspace(0.0, T_MAX, 6)
@@ -31,6 +32,19 @@ MOTIONS = {
     BALL: MotionModel("translation", velocity=[-0.7, 0.4, -0.9], acceleration=[0, 0, -2.0], radius=0.4),
 }
 SKY = np.array([0.55, 0.7, 0.9])
+# Few Gaussians and early rounds, so that a run of some hundred steps shows what a long one does.
+SETTINGS = (
+    "init.object_points=150",
+    "init.background_points=700",
+    "init.shadow_points=10",
+    "init.sweep_depths=32",
+    "rates.rotvecs=0.02",
+    "densify.start=20",
+    "densify.every=20",
+    "densify.max_gaussians=1400",
+    "identity.iterations=80",
+    "train.log_every=10",
+)
 
 
 @dataclass(frozen=True)
@@ -121,6 +135,11 @@ def make_dataset(
     (folder / "objects.json").write_text(json.dumps({i: {"name": n, "aliases": a} for i, (n, a) in NAMES.items()}))
     (folder / "ground_truth.json").write_text(json.dumps(_poses(data)))
     return data
+
+
+def settings(*overrides: str) -> config.Config:
+    """Configuration for this data set, with further ``section.key=value`` overrides."""
+    return config.load(None, [*SETTINGS, *overrides])
 
 
 def make_truth(*, floor: bool = True) -> Scene:

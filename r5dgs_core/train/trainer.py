@@ -115,14 +115,20 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate(group["name"])
         stats = RasterStats()
-        image = self.render(view.camera, view.t, stats)
+        try:
+            image = self.render(view.camera, view.t, stats)
+        except ValueError:
+            self._check_finite(0.0, view.name)
+            raise
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
         penalty = self.motion.penalty(self.iteration)
         total = loss if penalty is None else loss + penalty
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         value = float(loss.detach())
-        if not math.isfinite(value) or self.iteration % 50 == 0:
+        # A sum is quick, and not finite as soon as one term is not; only then is the culprit looked for.
+        sums = [p.grad.sum() for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
+        if not math.isfinite(value + float(torch.stack(sums).sum())):
             self._check_finite(value, view.name)
         self.optimizer.step()
         if stats.grad_norm is not None and stats.visible is not None and stats.radii is not None:
@@ -224,13 +230,14 @@ class Trainer:
             self.gradients = densification.ScreenGradients(len(self.gaussians))
 
     def _check_finite(self, value: float, view: str) -> None:
+        """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
         named = {**self.gaussians.params, **self.motion.params, **self.background.params}
-        bad = [n for n, p in named.items() if p.grad is not None and not bool(torch.isfinite(p.grad).all())]
+        bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
+        bad += [f"gradient of {n}" for n, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
         if bad or not math.isfinite(value):
-            what = f"gradient of {', '.join(bad)}" if bad else "loss"
             raise TrainingError(
-                f"step {self.iteration}, view {view}: {what} is not finite; the last checkpoint is kept. "
-                "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
+                f"step {self.iteration}, view {view}: {', '.join(bad) or 'loss'} is not finite; the last checkpoint is "
+                "kept. Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
             )
 
     def state(self) -> dict[str, Any]:
@@ -257,7 +264,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        tensors = state["tensors"]
+        tensors = {name: tensor.clone() for name, tensor in state["tensors"].items()}  # training changes them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
         self.motion.restore(tensors)
