@@ -39,9 +39,7 @@ def set_threads(count: int) -> None:
     if count < 1:
         raise ValueError(f"threads: expected at least 1, got {count}")
     with _lock:
-        if _pool is not None:
-            _pool.shutdown(wait=True)
-        _pool, _threads = None, count
+        _pool, _threads = None, count  # the old threads end by themselves once nobody uses them
 
 
 def threads() -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import time
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,7 @@ def rasterize(
         Colour, alpha, depth, features and ids.
     """
     means = gaussians.means
+    object_ids = getattr(gaussians, "object_ids", None) if ids else None
     channels = shaded_colors(gaussians, camera)
     n_features = 0 if features is None else features.shape[-1]
     if features is not None and n_features:
@@ -113,7 +115,7 @@ def rasterize(
         channels,
         camera,
         background,
-        labels=getattr(gaussians, "object_ids", None) if ids else None,
+        labels=None if object_ids is None else torch.as_tensor(object_ids),
         settings=settings,
         backend=backend,
         stats=stats,
@@ -125,6 +127,19 @@ def rasterize(
         features=splats.image[..., 3:] if features is not None else None,
         ids=splats.ids,
     )
+
+
+def warm_up() -> float:
+    """Compile the kernels of the `cpu` backend, or load them where an earlier process did; returns the seconds it took.
+
+    The first call of a fresh installation takes about ten seconds; whoever shows progress calls this first and says so.
+    """
+    start = time.perf_counter()
+    view = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
+    row = torch.ones(1, 3, requires_grad=True)
+    quats = torch.ones(1, 4)
+    rasterize_splats(row, quats, row, row[:, 0], row, view, backend="cpu").image.sum().backward()
+    return time.perf_counter() - start
 
 
 def shaded_colors(gaussians: Any, camera: Camera) -> torch.Tensor:
@@ -188,7 +203,9 @@ def _check(means, quats, scales, opacities, channels, camera, background, labels
         # A sum is one fast pass, and not finite as soon as one term is not; only then is the culprit looked for.
         # On the CPU numpy sums: torch would wake its thread pool for it.
         content = tensor.detach()
-        if not np.isfinite(content.numpy().sum() if content.device.type == "cpu" else content.sum().item()):
+        with np.errstate(invalid="ignore", over="ignore"):
+            total = content.numpy().sum() if content.device.type == "cpu" else content.sum().item()
+        if not np.isfinite(total):
             bad = torch.nonzero(~torch.isfinite(tensor))
             if len(bad):
                 index = tuple(bad[0].tolist())

@@ -1,6 +1,8 @@
 """The rasterizer means what 3D Gaussian splatting means, and the fast backend agrees with the reference."""
 
 import math
+import multiprocessing
+import os
 import threading
 from types import SimpleNamespace
 
@@ -10,12 +12,13 @@ import torch
 
 from r5dgs_core import errors
 from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import RasterSettings, RasterStats, rasterize, rasterize_splats
+from r5dgs_core.raster import RasterSettings, RasterStats, rasterize, rasterize_splats, splatting, warm_up
 from r5dgs_core.scene import cameras
 from tests.splats import camera, draw, relative, splats
 
 pytest.importorskip("numba", reason="the cpu backend needs numba")
 from r5dgs_core.raster import compile as compilation  # noqa: E402
+from r5dgs_core.raster import cpu_blending, cpu_projection, cpu_tiles  # noqa: E402
 
 # float32 against float64: rounding grows with the number of layers; the largest seen on these scenes is about 3e-6
 TOLERANCE = 2e-5
@@ -210,6 +213,37 @@ def test_two_python_threads_may_draw_at_once():
     assert all(torch.equal(gradients[name], expected[name]) for gradients in found for name in gradients)
 
 
+def test_every_kernel_is_compiled_once_for_all_inputs():
+    warm_up()
+    for n_channels, background, labels in ((1, None, None), (3, torch.rand(3), torch.arange(50)), (19, None, None)):
+        draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
+    kernels = [
+        *(cpu_projection.project, cpu_projection.gather, cpu_projection.project_backward),
+        *(cpu_tiles.sort_by_depth, cpu_tiles.assign_tiles, cpu_blending.blend, cpu_blending.blend_backward),
+    ]
+    assert {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels} == {
+        kernel.py_func.__name__: 1 for kernel in kernels
+    }
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forking is a POSIX matter")
+def test_a_forked_child_draws_too():
+    scene, view = [t.float() for t in splats(9000, 3, seed=10, radius_px=3.0)], camera(150, 130, 160.0)
+    before = compilation.threads()
+    compilation.set_threads(2)
+    try:
+        expected = rasterize_splats(*scene, view).image
+        context = multiprocessing.get_context("fork")
+        receiver, sender = context.Pipe(duplex=False)
+        child = context.Process(target=lambda: sender.send(rasterize_splats(*scene, view).image.numpy().tobytes()))
+        child.start()
+        assert receiver.poll(60), "the child hangs"
+        assert receiver.recv() == expected.numpy().tobytes()
+        child.join()
+    finally:
+        compilation.set_threads(before)
+
+
 # Laws of gradients
 
 
@@ -219,6 +253,14 @@ def test_gradient_of_the_background_is_what_it_shows_through():
     result = rasterize_splats(*[t.float() for t in scene], view, background)
     result.image.sum().backward()
     torch.testing.assert_close(background.grad, (1 - result.alpha)[..., None].expand(-1, -1, 3), atol=1e-6, rtol=1e-5)
+
+
+def test_changing_a_result_in_place_is_refused_instead_of_giving_wrong_gradients():
+    leaves = [t.float().requires_grad_() for t in splats(50, 3)]
+    image = rasterize_splats(*leaves, camera()).image
+    image.clamp_(0, 0.1)
+    with pytest.raises(RuntimeError, match="inplace"):
+        image.sum().backward()
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -405,6 +447,16 @@ def test_backends_that_cannot_draw_say_why():
     with pytest.raises(ValueError, match="backend.*'metal'"):
         rasterize_splats(*single, camera(), backend="metal")
     assert rasterize_splats(*double, camera()).image.dtype == torch.float64
+
+
+def test_without_numba_the_reference_draws_and_says_so(monkeypatch, caplog):
+    scene = [t.float() for t in splats(10, 3)]
+    expected = rasterize_splats(*scene, camera(), backend="reference").image
+    monkeypatch.setattr(splatting.importlib.util, "find_spec", lambda name: None)
+    assert torch.equal(rasterize_splats(*scene, camera()).image, expected)
+    assert "pip install numba" in caplog.text
+    with pytest.raises(errors.BackendError, match="pip install numba"):
+        rasterize_splats(*scene, camera(), backend="cpu")
 
 
 @pytest.mark.parametrize("change", [{"near_plane": 0.0}, {"alpha_min": 0.0}, {"alpha_max": 1.0}, {"dilation": -1.0}])
