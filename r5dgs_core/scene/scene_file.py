@@ -14,17 +14,14 @@ import secrets
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import __version__, errors
-from ..motion.models import MotionModel
-from . import validation
-from .cameras import Camera
-from .scene import MotionGroup, Scene, SceneObject
+from .. import errors
+from . import scene_json, validation
+from .scene import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -157,8 +154,9 @@ def info(scene: Scene) -> dict[str, Any]:
 
 def _write_zip(scene: Scene, stream: Any, exact: bool) -> None:
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        text = json.dumps(_to_json(scene), indent=1, allow_nan=False, default=_plain, ensure_ascii=False)
-        _add(archive, JSON_MEMBER, text.encode())
+        arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None]
+        head = {"format": FORMAT, "format_version": FORMAT_VERSION, "arrays": arrays}
+        _add(archive, JSON_MEMBER, scene_json.dump(scene, head))
         for name, dtype in _MEMORY_DTYPES.items():
             array = getattr(scene, name)
             if array is None:
@@ -198,96 +196,18 @@ def _decode(name: str, array: np.ndarray) -> np.ndarray:
     return array.astype(_MEMORY_DTYPES[name])
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise errors.SceneFileError(f"provenance or needs: expected JSON types, found {type(value).__name__}")
-
-
-def _to_json(scene: Scene) -> dict[str, Any]:
-    light = scene.light_direction
-    return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "generator": f"r5dgs {__version__}",
-        "name": scene.name,
-        "gaussians": len(scene.means),
-        "arrays": [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None],
-        "t_max": float(scene.t_max),
-        "frames_per_unit": float(scene.frames_per_unit),
-        "world_convention": scene.world_convention,
-        "objects": [
-            {
-                "id": o.id,
-                "name": o.name,
-                "aliases": list(o.aliases),
-                "caption": o.caption,
-                "color": [float(c) for c in o.color],
-                "start": o.start,
-                "count": o.count,
-            }
-            for o in scene.objects
-        ],
-        "groups": [
-            {
-                "id": g.id,
-                "object_id": g.object_id,
-                "role": g.role,
-                "anchor_index": g.anchor_index,
-                "pivot": np.asarray(g.pivot, np.float64).tolist(),
-                "model": g.model.to_dict(),
-                "follows": g.follows,
-                "follow_matrix": None if g.follow_matrix is None else np.asarray(g.follow_matrix, np.float64).tolist(),
-                "rigid_rms": float(g.rigid_rms),
-                "rigid_max": float(g.rigid_max),
-            }
-            for g in scene.groups
-        ],
-        "cameras": [
-            {
-                "name": c.name,
-                "width": c.width,
-                "height": c.height,
-                "intrinsics": c.intrinsics.tolist(),
-                "T_cam_world": c.T_cam_world.tolist(),
-            }
-            for c in scene.cameras
-        ],
-        "light_direction": None if light is None else np.asarray(light, np.float64).tolist(),
-        "vocabulary": list(scene.vocabulary),
-        "provenance": scene.provenance,
-        "needs": list(scene.needs),
-    }
-
-
 def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
     data = _read_json(archive, place)
     json_place = f"{place}: {JSON_MEMBER}"
-    listed = _words(data, "arrays", json_place)
+    listed = scene_json.words(data, "arrays", json_place)
     arrays = {name: _read_array(archive, name, place, name in listed) for name in _MEMORY_DTYPES}
-    count, means = _get(data, "gaussians", int, json_place), arrays["means"]
+    count, means = scene_json.get(data, "gaussians", int, json_place), arrays["means"]
     if means is None or means.shape[:1] != (count,):
         found = None if means is None else means.shape
         raise errors.SceneFileError(
             f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
         )
-    light = data.get("light_direction")
-    return Scene(
-        name=_get(data, "name", str, json_place),
-        **arrays,  # type: ignore[arg-type]
-        objects=tuple(_each(data, "objects", _read_object, json_place)),
-        groups=tuple(_each(data, "groups", _read_group, json_place)),
-        t_max=_get(data, "t_max", float, json_place),
-        frames_per_unit=_get(data, "frames_per_unit", float, json_place),
-        world_convention=_get(data, "world_convention", str, json_place),
-        cameras=tuple(_each(data, "cameras", _read_camera, json_place)),
-        light_direction=None if light is None else _numbers(data, "light_direction", (3,), json_place),
-        vocabulary=tuple(_words(data, "vocabulary", json_place)),
-        provenance=_get(data, "provenance", dict, json_place),
-        needs=tuple(_each(data, "needs", lambda row, place: dict(row), json_place)),
-    )
+    return Scene(**arrays, **scene_json.fields(data, json_place))  # type: ignore[arg-type]
 
 
 def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:
@@ -339,87 +259,6 @@ def _read_array(archive: zipfile.ZipFile, name: str, place: str, listed: bool) -
             f"{where}: expected {size} bytes for shape {shape}, found {len(data) - stream.tell()}"
         )
     return _decode(name, np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape))
-
-
-def _get(data: dict[str, Any], key: str, kind: type, place: str) -> Any:
-    value = data.get(key)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
-        found = "nothing" if key not in data else repr(value)[:60]
-        raise errors.SceneFileError(f"{place}: {key}: expected {kind.__name__}, found {found}")
-    return value
-
-
-def _each(data: dict[str, Any], key: str, reader: Callable[[dict[str, Any], str], Any], place: str) -> list[Any]:
-    rows = _get(data, key, list, place)
-    for i, row in enumerate(rows):
-        if not isinstance(row, dict):
-            raise errors.SceneFileError(f"{place}: {key}[{i}]: expected an object, found {row!r}")
-    return [reader(row, f"{place}: {key}[{i}]") for i, row in enumerate(rows)]
-
-
-def _numbers(data: dict[str, Any], key: str, shape: tuple[int, ...], place: str) -> np.ndarray:
-    try:
-        array = np.array(data.get(key), np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise errors.SceneFileError(
-            f"{place}: {key}: expected finite numbers of shape {shape}, found {data.get(key)!r}"
-        )
-    return array
-
-
-def _words(data: dict[str, Any], key: str, place: str) -> list[str]:
-    words = _get(data, key, list, place)
-    for word in words:
-        if not isinstance(word, str):
-            raise errors.SceneFileError(f"{place}: {key}: expected words, found {word!r}")
-    return words
-
-
-def _read_object(row: dict[str, Any], place: str) -> SceneObject:
-    r, g, b = _numbers(row, "color", (3,), place).tolist()
-    return SceneObject(
-        id=_get(row, "id", int, place),
-        name=_get(row, "name", str, place),
-        aliases=tuple(_words(row, "aliases", place)),
-        caption=_get(row, "caption", str, place),
-        color=(r, g, b),
-        start=_get(row, "start", int, place),
-        count=_get(row, "count", int, place),
-    )
-
-
-def _read_group(row: dict[str, Any], place: str) -> MotionGroup:
-    try:
-        model = MotionModel.from_dict(_get(row, "model", dict, place))
-    except ValueError as error:
-        raise errors.SceneFileError(f"{place}: model: {error}") from error
-    follows = row.get("follows")
-    return MotionGroup(
-        id=_get(row, "id", int, place),
-        object_id=_get(row, "object_id", int, place),
-        role=_get(row, "role", str, place),
-        anchor_index=_get(row, "anchor_index", int, place),
-        pivot=_numbers(row, "pivot", (3,), place),
-        model=model,
-        follows=None if follows is None else _get(row, "follows", int, place),
-        follow_matrix=None if row.get("follow_matrix") is None else _numbers(row, "follow_matrix", (3, 3), place),
-        rigid_rms=_get(row, "rigid_rms", float, place),
-        rigid_max=_get(row, "rigid_max", float, place),
-    )
-
-
-def _read_camera(row: dict[str, Any], place: str) -> Camera:
-    return Camera(
-        width=_get(row, "width", int, place),
-        height=_get(row, "height", int, place),
-        intrinsics=_numbers(row, "intrinsics", (3, 3), place),
-        T_cam_world=_numbers(row, "T_cam_world", (4, 4), place),
-        name=_get(row, "name", str, place),
-    )
 
 
 def _sync_folder(folder: Path) -> None:
