@@ -103,7 +103,8 @@ class _Rasterize(torch.autograd.Function):
         d_image = d_image.contiguous().numpy()
         d_alpha = _EMPTY if d_alpha is None else d_alpha.contiguous().numpy()
         d_depth = _EMPTY if d_depth is None else d_depth.contiguous().numpy()
-        gradients, grad_norm = _backward(state, arrays, ctx.n_channels, d_image, d_alpha, d_depth)
+        with_geometry = any(ctx.needs_input_grad[:4])
+        gradients, grad_norm = _backward(state, arrays, ctx.n_channels, d_image, d_alpha, d_depth, with_geometry)
         if ctx.stats is not None:
             ctx.stats.grad_norm = torch.from_numpy(grad_norm)
         d_background = None
@@ -112,7 +113,11 @@ class _Rasterize(torch.autograd.Function):
             shape = ctx.background_shape
             d_background = torch.from_numpy(shown if len(shape) == 3 else shown.sum((0, 1), dtype=np.float64))
             d_background = d_background.to(torch.float32)
-        return (*(torch.from_numpy(g) for g in gradients), d_background, None, None, None, None)
+        wanted = (
+            torch.from_numpy(g) if needed else None
+            for g, needed in zip(gradients, ctx.needs_input_grad[:5], strict=True)
+        )
+        return (*wanted, d_background, None, None, None, None)
 
 
 def _forward(arrays, background, camera, labels, settings, view, radii):
@@ -157,7 +162,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii):
     return state, image, alpha, depth, ids
 
 
-def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
+def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth, with_geometry):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
     means, quats, scales, opacities, image, alpha, depth = arrays
     n = len(means)
@@ -165,13 +170,15 @@ def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth):
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_ranks, state.pair_slots, state.geometry, state.values,
-        state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth, slots,
+        state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth, with_geometry,
+        slots,
     )  # fmt: skip
     gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
     gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]
     grad_norm = np.zeros(n, np.float32)
     run(
         cpu_projection.project_backward, n // _WORTH_A_THREAD,
-        state.view, means, quats, scales, opacities, state.slot_starts, slots, *gradients, grad_norm,
+        state.view, means, quats, scales, opacities, state.slot_starts, slots, with_geometry,
+        *gradients, grad_norm,
     )  # fmt: skip
     return gradients, grad_norm

@@ -161,7 +161,7 @@ def _unfinished(passed, rows):
 @kernel
 def blend_backward(
     worker, workers, tile_starts, tile_ends, pair_ranks, pair_slots, geometry, values, limits, image, alpha, depth,
-    transmittance, d_image, d_alpha, d_depth, slots,
+    transmittance, d_image, d_alpha, d_depth, with_geometry, slots,
 ):  # fmt: skip
     """Write the gradient slot of every pair of every workers-th tile: moments, then channels, depth and zeros.
 
@@ -171,7 +171,8 @@ def blend_backward(
 
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
-            latter two empty where there is none; slots [S, 6 + B] the result.
+            latter two empty where there is none; with_geometry is whether more than channels want a gradient, or else
+            the moments are zero; slots [S, 6 + B] the result.
     """
     height, width, n_channels = image.shape
     n_values, n_slots = values.shape[1], slots.shape[1]
@@ -242,10 +243,11 @@ def blend_backward(
                         for _ in range(0, n_values, 4):
                             g0, g1 = load(gradient, of), load(gradient, of + LANES)
                             g2, g3 = load(gradient, of + 2 * LANES), load(gradient, of + 3 * LANES)
-                            inner = fma(broadcast(flat, value), g0, inner)
-                            inner = fma(broadcast(flat, value + 1), g1, inner)
-                            inner = fma(broadcast(flat, value + 2), g2, inner)
-                            inner = fma(broadcast(flat, value + 3), g3, inner)
+                            if with_geometry:
+                                inner = fma(broadcast(flat, value), g0, inner)
+                                inner = fma(broadcast(flat, value + 1), g1, inner)
+                                inner = fma(broadcast(flat, value + 2), g2, inner)
+                                inner = fma(broadcast(flat, value + 3), g3, inner)
                             store(d_values, to, fma(weight, g0, load(d_values, to)))
                             to += LANES
                             store(d_values, to, fma(weight, g1, load(d_values, to)))
@@ -257,6 +259,8 @@ def blend_backward(
                             of += 4 * LANES
                             value += 4
 
+                        if not with_geometry:
+                            continue
                         own = weight * inner
                         remaining = load(rest, at) - own
                         store(rest, at, remaining)

@@ -143,8 +143,8 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
 
 @kernel
 def project_backward(
-    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, d_means, d_quats, d_scales,
-    d_opacities, d_channels, grad_norm,
+    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, with_geometry, d_means, d_quats,
+    d_scales, d_opacities, d_channels, grad_norm,
 ):  # fmt: skip
     """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay as they are.
 
@@ -153,6 +153,7 @@ def project_backward(
         means, quats, scales, opacities: The inputs, one row per Gaussian.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
         slots: Moments and channel gradients of each pair of Gaussian and tile, depth after the channels. [S, 6 + B]
+        with_geometry: Whether more than channels want a gradient.
         d_means, d_quats, d_scales, d_opacities, d_channels: Gradients. [N, ...]
         grad_norm: Norm of the gradient with respect to the projected centre in px. [N]
     """
@@ -169,6 +170,8 @@ def project_backward(
                 sums[c] += slots[slot, c]
         for c in range(n_channels):
             d_channels[i, c] = sums[MOMENTS + c]
+        if not with_geometry:
+            continue
         d_opacities[i] = sums[0] / opacities[i]
 
         x, y, z = _to_camera(view, means, i)

@@ -255,6 +255,21 @@ def test_gradient_of_the_background_is_what_it_shows_through():
     torch.testing.assert_close(background.grad, (1 - result.alpha)[..., None].expand(-1, -1, 3), atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("position", range(5))
+def test_gradients_do_not_depend_on_which_others_are_wanted(backend, position):
+    scene, view = splats(200, 19, seed=17), camera()
+    expected = draw(scene, view, backend)[1]
+    dtype = next(iter(expected.values())).dtype
+    inputs = [t.to(dtype) for t in scene]
+    inputs[position].requires_grad_()
+    result = rasterize_splats(*inputs, view, backend=backend)
+    generator = torch.Generator().manual_seed(7)
+    outputs = (result.image, result.alpha, result.depth * result.alpha.detach())
+    sum((o * torch.randn(o.shape, generator=generator, dtype=torch.float64)).sum() for o in outputs).backward()
+    torch.testing.assert_close(inputs[position].grad, list(expected.values())[position])
+
+
 def test_changing_a_result_in_place_is_refused_instead_of_giving_wrong_gradients():
     leaves = [t.float().requires_grad_() for t in splats(50, 3)]
     image = rasterize_splats(*leaves, camera()).image
