@@ -26,13 +26,20 @@ class Survey:
         frames: Captured frames, increasing. T of them
         matrices: World matrix of everything that renders and of its ancestors. [T, 4, 4] each
         corners: Corners of the bounding box of everything that renders, world. [T, 8, 3] each
-        animated: What moves or deforms in the frame range.
+        moving: Whatever of these changes its world matrix in the frame range.
+        deforming: What renders and may change its shape.
     """
 
     frames: tuple[float, ...]
     matrices: dict[bpy.types.Object, np.ndarray]
     corners: dict[bpy.types.Object, np.ndarray]
-    animated: frozenset[bpy.types.Object]
+    moving: frozenset[bpy.types.Object]
+    deforming: frozenset[bpy.types.Object]
+
+    @property
+    def animated(self) -> frozenset[bpy.types.Object]:
+        """What renders and moves or deforms."""
+        return (self.moving & self.corners.keys()) | self.deforming
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Ove
         overrides.set(ob, "hide_viewport", False)
     matrices: dict[bpy.types.Object, list[np.ndarray]] = {ob: [] for ob in followed}
     corners: dict[bpy.types.Object, list[np.ndarray]] = {ob: [] for ob in geometry}
-    animated = {ob for ob in geometry if _deforms(ob)}
+    moving: set[bpy.types.Object] = set()
     first: dict[bpy.types.Object, np.ndarray] = {}
     whole = map(float, range(math.floor(frames[0]), math.floor(frames[-1]) + 1))
     for frame in sorted({*frames, *whole}):
@@ -84,8 +91,8 @@ def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Ove
             evaluated = ob.evaluated_get(depsgraph)
             matrix = np.array(evaluated.matrix_world, np.float64)
             reference = first.setdefault(ob, matrix)
-            if ob in corners and not np.allclose(matrix, reference, rtol=1e-6, atol=1e-6):
-                animated.add(ob)
+            if not np.allclose(matrix, reference, rtol=1e-6, atol=1e-6):
+                moving.add(ob)
             if frame not in frames:
                 continue
             matrices[ob].append(matrix)
@@ -96,7 +103,8 @@ def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Ove
         frames=frames,
         matrices={ob: np.stack(rows) for ob, rows in matrices.items()},
         corners={ob: np.stack(rows) for ob, rows in corners.items()},
-        animated=frozenset(animated),
+        moving=frozenset(moving),
+        deforming=frozenset(ob for ob in geometry if _deforms(ob)),
     )
 
 
@@ -104,8 +112,9 @@ def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: 
     """Decide what the objects are.
 
     What hangs from one parent is one object, unless something under that parent is none (then the parent is a handle
-    of the whole scene). With "PASS_INDEX", equal indices are one object and are its id; else ids count from 1 in the
-    order of names, so that they stay the same from capture to capture.
+    of the whole scene), or the part moves while the parent stands (then they are not one rigid thing). With
+    "PASS_INDEX", equal indices are one object and are its id; else ids count from 1 in the order of names, so that
+    they stay the same from capture to capture.
 
     Args:
         layer: Holds the selection.
@@ -128,7 +137,8 @@ def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: 
         by_index = defaultdict(set)
         for ob in chosen:
             by_index[ob.pass_index].add(ob)
-        found = [_object(index, None, members, chosen, geometry) for index, members in sorted(by_index.items())]
+        roots = _roots(survey, chosen)
+        found = [_object(index, None, members, roots) for index, members in sorted(by_index.items())]
         return _with_unique_names(_not_empty(found, choice))
     if choice == "COLLECTION":
         source = bpy.data.collections.get(collection)
@@ -140,14 +150,14 @@ def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: 
         chosen = {ob for ob in geometry if any(_is_selected(part, layer) for part in (ob, *_ancestors(ob)))}
     else:
         chosen = geometry & survey.animated
-    allowed = chosen.union(*groups.values())
+    roots = _roots(survey, chosen.union(*groups.values()))
     by_root = defaultdict(set)
     for ob in chosen:
-        by_root[_root(ob, allowed, geometry)].add(ob)
+        by_root[roots[ob]].add(ob)
     named = [(name, members) for name, members in groups.items()]
     named += [(root.name, members) for root, members in by_root.items()]
     named.sort(key=lambda item: (item[0].casefold(), item[0]))
-    found = [_object(index + 1, name, members, allowed, geometry) for index, (name, members) in enumerate(named)]
+    found = [_object(index + 1, name, members, roots) for index, (name, members) in enumerate(named)]
     return _with_unique_names(_not_empty(found, choice))
 
 
@@ -208,27 +218,30 @@ def _is_selected(ob: bpy.types.Object, layer: bpy.types.ViewLayer) -> bool:
     return layer.objects.get(ob.name) == ob and ob.select_get(view_layer=layer)
 
 
-def _root(ob: bpy.types.Object, chosen: set[bpy.types.Object], geometry: set[bpy.types.Object]) -> bpy.types.Object:
-    """The highest parent under which everything that renders is chosen."""
-    outsiders = {ancestor for other in geometry - chosen for ancestor in (other, *_ancestors(other))}
-    root = ob
-    for ancestor in _ancestors(ob):
-        if ancestor in outsiders or ancestor.type == "CAMERA":
-            break
-        root = ancestor
-    return root
+def _roots(survey: Survey, chosen: set[bpy.types.Object]) -> dict[bpy.types.Object, bpy.types.Object]:
+    """For each chosen object the highest parent that it shares its fate with."""
+    others = set(survey.corners) - chosen
+    outsiders = {ancestor for other in others for ancestor in (other, *_ancestors(other))}
+    roots = {}
+    for ob in chosen:
+        roots[ob] = ob
+        for ancestor in _ancestors(ob):
+            stands = ob in survey.moving and ancestor not in survey.moving
+            if stands or ancestor in outsiders or ancestor.type == "CAMERA":
+                break
+            roots[ob] = ancestor
+    return roots
 
 
 def _object(
     index: int,
     name: str | None,
     members: set[bpy.types.Object],
-    chosen: set[bpy.types.Object],
-    geometry: set[bpy.types.Object],
+    roots: dict[bpy.types.Object, bpy.types.Object],
 ) -> CapturedObject:
     ordered = sorted(members, key=lambda ob: ob.name_full)
-    roots = {_root(ob, chosen, geometry) for ob in ordered}
-    root = roots.pop() if len(roots) == 1 else ordered[0]
+    common = {roots[ob] for ob in ordered}
+    root = common.pop() if len(common) == 1 else ordered[0]
     return CapturedObject(index, root.name if name is None else name, root, tuple(ordered))
 
 

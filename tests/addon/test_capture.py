@@ -332,6 +332,15 @@ def test_an_empty_that_carries_the_whole_scene_is_no_object(service, blender, sc
     assert [o.name for o in choose(service, blender, "ANIMATED")] == ["moving ball"]
 
 
+def test_what_moves_under_an_empty_that_stands_is_an_object_of_its_own(service, blender, scene):
+    other = add_ball(blender, "other ball", (0.0, 2.0, 0.5), (0.5, 0.5, 0.5))
+    other.keyframe_insert("location", frame=1)
+    other.location.y = 3.0
+    other.keyframe_insert("location", frame=9)
+    parent_to_empty(blender, "group", [other, blender.data.objects["moving ball"]])
+    assert [o.name for o in choose(service, blender, "ANIMATED")] == ["moving ball", "other ball"]
+
+
 def test_equal_pass_indices_are_one_object(service, blender, scene):
     for name in ("moving ball", "still ball"):
         blender.data.objects[name].pass_index = 5
