@@ -1,0 +1,144 @@
+"""The sidebar, menus and drag and drop are there, and name only operators and properties that exist."""
+
+import dataclasses
+import importlib
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from r5dgs_core.scene import scene_file
+from tests import scenes
+
+PANELS = ("R5DGS_PT_scene", "R5DGS_PT_prompt", "R5DGS_PT_preview", "R5DGS_PT_capture")
+
+
+class Layout:
+    """Stands in for `UILayout`, which exists only while a window is drawn: keeps what is said, refuses what is not."""
+
+    def __init__(self, bpy, said):
+        self.bpy, self.said = bpy, said
+
+    def row(self, **_):
+        return Layout(self.bpy, self.said)
+
+    column = box = row
+
+    def label(self, text="", icon="NONE"):
+        assert icon in self.bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items
+        self.said.append(text)
+
+    def prop(self, data, name, **_):
+        assert name in data.bl_rna.properties
+        self.said.append(name)
+
+    def operator(self, idname, text="", icon="NONE"):
+        module, name = idname.split(".")
+        properties = getattr(getattr(self.bpy.ops, module), name).get_rna_type().properties
+        self.said.append(idname)
+        return SetOnly({p.identifier for p in properties})
+
+
+class SetOnly:
+    def __init__(self, names):
+        object.__setattr__(self, "names", names)
+
+    def __setattr__(self, name, value):
+        assert name in self.names
+
+
+@pytest.fixture
+def sidebar(blender):
+    panels = importlib.import_module("r5dgs.r5dgs_addon.panels")
+
+    def draw():
+        said = []
+        for name in PANELS:
+            panel = getattr(panels, name)
+            if not hasattr(panel, "poll") or panel.poll(blender.context):
+                panel.draw(SimpleNamespace(layout=Layout(blender, said)), blender.context)
+        return said
+
+    return draw
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    return scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs")
+
+
+def test_without_a_scene_the_sidebar_offers_to_load_one(sidebar):
+    said = sidebar()
+    assert "r5dgs.load_scene" in said and "No scene loaded" in said and "r5dgs.capture_dataset" in said
+    assert "r5dgs.preview" not in said
+
+
+def test_with_a_scene_the_sidebar_says_what_is_loaded_and_whether_now_is_the_future(blender, sidebar, scene_path):
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    blender.context.scene.frame_set(31)
+    said = sidebar()
+    assert "synthetic: 3 objects, 200 Gaussians" in said and "t = 0.500: observed" in said
+    assert "r5dgs.preview" in said and said.count("r5dgs.select_by_prompt") == 3
+    blender.context.scene.frame_set(55)
+    assert "t = 0.900: extrapolated by 0.150" in sidebar()
+
+
+def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar, scene_path):
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    blender.ops.r5dgs.select_by_prompt(text="cup")
+    assert {"mug", "0.97"} <= set(sidebar())
+    blender.ops.r5dgs.select_by_prompt(text="submarine")
+    assert "Nothing matches 'submarine'" in sidebar()
+
+
+def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
+    for menu, operator in (("import", "r5dgs.load_scene"), ("export", "r5dgs.capture_dataset")):
+        functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs
+        ours = [function for function in functions if function.__module__.startswith("r5dgs.")]
+        said = []
+        for function in ours:
+            function(SimpleNamespace(layout=Layout(blender, said)), blender.context)
+        assert said == [operator]
+    handler = blender.types.R5DGS_FH_scene
+    assert (handler.bl_import_operator, handler.bl_file_extensions) == ("r5dgs.load_scene", ".r5dgs")
+    extension.unregister()
+    try:
+        functions = blender.types.TOPBAR_MT_file_import.draw._draw_funcs
+        assert not [function for function in functions if function.__module__.startswith("r5dgs.")]
+    finally:
+        extension.register()
+
+
+def test_cycles_shows_points_in_the_colours_of_the_file(blender, tmp_path):
+    srgb = np.array([0.8, 0.35, 0.1])
+    scene = scenes.make_scene(n=3000, objects=2, shading=False)
+    sh = np.tile(((srgb - 0.5) / 0.28209479177387814).astype(np.float32), (len(scene.means), 1, 1))
+    path = scene_file.write(dataclasses.replace(scene, sh=sh), tmp_path / "one_colour.r5dgs")
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    bl_scene = blender.context.scene
+    camera = blender.data.objects.new("camera", blender.data.cameras.new("camera"))
+    camera.location = (0, 0, 8)
+    bl_scene.collection.objects.link(camera)
+    bl_scene.camera = camera
+    bl_scene.render.engine = "CYCLES"
+    bl_scene.cycles.samples, bl_scene.cycles.use_denoising = 4, False
+    bl_scene.render.film_transparent = True
+    bl_scene.render.resolution_x = bl_scene.render.resolution_y = 32
+    bl_scene.render.resolution_percentage = 100
+    bl_scene.view_settings.view_transform = "Standard"
+    bl_scene.render.filepath = str(tmp_path / "render.png")
+    silenced, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)  # Cycles prints its progress past Python
+    try:
+        blender.ops.render.render(write_still=True)
+    finally:
+        os.dup2(silenced, 1)
+        os.close(silenced)
+        os.close(nowhere)
+    images = importlib.import_module("r5dgs_core.data.images")
+    rgba = images.read(tmp_path / "render.png")
+    covered = rgba[..., 3] == 1
+    assert covered.sum() > 10
+    np.testing.assert_allclose(rgba[covered][:, :3], np.broadcast_to(srgb, (covered.sum(), 3)), atol=0.01)
