@@ -8,12 +8,15 @@ Notation: M objects, S observed times, V views.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .views import TrainView
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,11 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
                 centers[row, s] = center
                 sizes += [x.angular_radius * np.linalg.norm(center - x.origin) for x in whole]
         if np.isnan(centers[row]).all():
+            log.warning(
+                "object %d is never seen whole enough by two cameras at one time: its depth is a guess. "
+                "Remedy: more cameras at the same times, or masks that follow it",
+                object_id,
+            )
             for s, seen in sightings[int(object_id)].items():
                 best = max(seen, key=lambda x: x.weight)
                 centers[row, s] = best.origin + best.ray * np.linalg.norm(best.origin)
