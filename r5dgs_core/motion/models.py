@@ -237,8 +237,8 @@ def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
     tolerance = _STEP_TOLERANCE * model.radius
-    needed = [se3.steps_needed(w, v, eps, a, float(t), model.radius, tolerance) for t in flat]
-    steps = np.array([1 << min(math.ceil(math.log2(n)), 20) for n in needed], np.int64)
+    needed = se3.steps_needed(w, v, eps, a, flat, model.radius, tolerance)
+    steps = 1 << np.minimum(np.ceil(np.log2(needed)), 20).astype(np.int64)
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
     for n in np.unique(steps):
         rows = np.flatnonzero(steps == n)

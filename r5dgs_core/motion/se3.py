@@ -149,8 +149,8 @@ def integrate(
 
 
 def steps_needed(
-    w: np.ndarray, v: np.ndarray, eps: np.ndarray, a: np.ndarray, duration: float, radius: float, tolerance: float
-) -> int:
+    w: np.ndarray, v: np.ndarray, eps: np.ndarray, a: np.ndarray, durations: np.ndarray, radius: float, tolerance: float
+) -> np.ndarray:
     """Magnus-4 steps that keep the error of every point of a body under ``tolerance``.
 
     Args:
@@ -158,29 +158,33 @@ def steps_needed(
         v: Velocity of the centre. [3]
         eps: Rate of w. [3]
         a: Rate of v. [3]
-        duration: Signed time to reach.
+        durations: Signed times to reach. [...]
         radius: Radius of the body.
         tolerance: Largest allowed distance, in the units of radius.
 
     Returns:
-        n >= 1; 1 where twist and rate commute, which one step solves exactly.
+        n >= 1 for each duration; 1 where twist and rate commute, which one step solves exactly. [...] int64
 
     Source: leading omitted term D = [C1, a2]/240 + [a1, [a1, C1]]/720 with C1 = [a1, a2], a1 = m, a2 = b at h = 1:
         n = ceil((c T^5 / tol)^(1/4)), c the mean over [0, T] of radius |D_w| + |D_v|; at least |w| T / 2 steps.
     """
-    times = np.linspace(0.0, duration, 5)[:, None]
+    durations = np.asarray(durations, np.float64)
+    times = np.linspace(np.zeros_like(durations), durations, 5)[..., None]
     a1 = (w + times * eps, v + times * a)
-    a2 = (np.broadcast_to(eps, (5, 3)), np.broadcast_to(a, (5, 3)))
+    a2 = (eps + 0 * times, a + 0 * times)
     c1 = _bracket(a1, a2)
     first, second = _bracket(c1, a2), _bracket(a1, _bracket(a1, c1))
-    omitted = [x / 240 + y / 720 for x, y in zip(first, second, strict=True)]
-    c = float(np.mean(radius * np.linalg.norm(omitted[0], axis=-1) + np.linalg.norm(omitted[1], axis=-1)))
-    span = abs(duration)
-    largest = float(np.linalg.norm(a1[0], axis=-1).max())
-    scale = float(np.mean(radius * np.linalg.norm(a1[0], axis=-1) + np.linalg.norm(a1[1], axis=-1)))
-    if c * span**5 <= 1e-15 * scale * span:
-        return 1
-    return max(1, math.ceil((c * span**5 / tolerance) ** 0.25), math.ceil(largest * span / 2))
+    omitted = _reach((first[0] / 240 + second[0] / 720, first[1] / 240 + second[1] / 720), radius)
+    span = np.abs(durations)
+    by_error = np.ceil((omitted * span**5 / tolerance) ** 0.25)
+    by_turn = np.ceil(np.linalg.norm(a1[0], axis=-1).max(axis=0) * span / 2)
+    commutes = omitted * span**5 <= 1e-15 * _reach(a1, radius) * span
+    return np.where(commutes, 1, np.maximum(1, np.maximum(by_error, by_turn))).astype(np.int64)
+
+
+def _reach(twist: Pose, radius: float) -> np.ndarray:
+    """Mean over axis 0 of the speed that a twist gives to the farthest point. [n, ..., 3] each -> [...]"""
+    return np.mean(radius * np.linalg.norm(twist[0], axis=-1) + np.linalg.norm(twist[1], axis=-1), axis=0)
 
 
 def _bracket(x: Pose, y: Pose) -> Pose:

@@ -83,10 +83,12 @@ def test_series_keep_their_digits(angle):
         rot.remainder_ratio: (x - mpmath.sin(x)) / x**3,
     }
     for function, truth in exact.items():
-        # Near a zero of the function only the absolute error can be small: the argument itself is rounded.
-        error = abs(float(function(np.array(angle2)) - truth))
-        scale = abs(float(truth)) if angle <= 1.01 else 1 / max(1.0, angle2 ** (function is not rot.cosine))
-        assert error <= 2e-15 * scale * max(1.0, angle)
+        for make in (np.array, torch.tensor):
+            argument = make(angle2, dtype=np.float64 if make is np.array else torch.float64)
+            error = abs(float(function(argument)) - truth)
+            # Near a zero of the function only the absolute error can be small: the argument itself is rounded.
+            scale = abs(float(truth)) if angle <= 1.01 else 1 / max(1.0, angle2 ** (function is not rot.cosine))
+            assert error <= 2e-15 * scale * max(1.0, angle)
 
 
 def test_zero_vector_gives_the_identity_to_the_bit():

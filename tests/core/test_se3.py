@@ -84,7 +84,7 @@ def test_step_rule_holds_its_tolerance():
         eps = rng.normal(size=3) * np.linalg.norm(w)
         v, a, duration = rng.normal(size=3), rng.normal(size=3), 10 ** rng.uniform(-1, 0.3)
         tolerance = 10 ** rng.uniform(-6, -2)
-        n = se3.steps_needed(w, v, eps, a, duration, 0.3, tolerance)
+        n = int(se3.steps_needed(w, v, eps, a, duration, 0.3, tolerance))
         truth = se3.integrate(w, v, eps, a, duration, 16 * n)
         ratios.append(distance(se3.integrate(w, v, eps, a, duration, n), truth, 0.3) / tolerance)
     assert max(ratios) <= 2
