@@ -65,7 +65,7 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
     times = observed_times(views)
     places = triangulation.locate(views, times, init.min_mask_pixels)
     if all(v.mask is None for v in views):
-        log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/<view>.png in the data set")
+        log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/VIEW.png files")
     first = _first_time(places, len(times))
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))
