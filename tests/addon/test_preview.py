@@ -29,9 +29,7 @@ def scene_path(tmp_path):
 @pytest.fixture
 def worker(blender, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    module = importlib.import_module("r5dgs.r5dgs_addon.worker")
-    yield module
-    module.stop()
+    return importlib.import_module("r5dgs.r5dgs_addon.worker")  # one worker serves all tests that do not break it
 
 
 @pytest.fixture
