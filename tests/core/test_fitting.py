@@ -210,6 +210,22 @@ def test_equal_input_gives_equal_models():
     assert first.model == second.model
 
 
+@pytest.mark.parametrize("count", [2, 3, 5, 9, 15])
+def test_poses_without_sense_give_finite_motions(count):
+    rng = np.random.default_rng(count)
+    times = np.sort(rng.uniform(size=count))
+    quats = rotations.normalize(rng.normal(size=(count, 4)))
+    fit = fitting.fit(times, quats, rng.normal(size=(count, 3)), radius=RADIUS)
+    for values in (*models.evaluate(fit.model, np.array([0.0, 1.0, 100.0])), fit.band):
+        assert np.isfinite(values).all()
+
+
+def test_exact_rest_is_static_to_the_bit():
+    fit = fitting.fit(TIMES, rotations.identity(15), np.zeros((15, 3)), radius=RADIUS)
+    assert fit.model.is_static
+    assert fit.chosen == "static"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
