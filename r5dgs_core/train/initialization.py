@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
-from . import hull, sweep, triangulation
+from . import hull, shadows, sweep, triangulation
 from .config import Config
 from .views import TrainView
 
@@ -95,10 +95,12 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
     flat: list[np.ndarray] = [np.tile([1.0, 0, 0, 0], (len(opacities[0]), 1))]
     if plane is not None and config.train.shadows and init.shadow_points > 0:
         casters = np.arange(1, bodies)
-        normal, height = plane
+        normal, _ = plane
+        light = shadows.find_light(views, scenes, places, times, plane, rng)
+        log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
         for body in casters:
             radius = places.radii[body - 1]
-            drop = centers[body] - (centers[body] @ normal - height) * normal
+            drop = shadows.cast(centers[body], light.direction, plane)
             jitter = rng.normal(size=(init.shadow_points, 3)) * 0.6 * radius
             lift = (0.02 + 0.01 * rng.random(init.shadow_points)) * 1.0
             jitter += (lift - jitter @ normal)[:, None] * normal
@@ -137,6 +139,9 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
         torch.from_numpy(casters),
         None if plane is None else torch.from_numpy(plane[0].astype(np.float32)),
     )
+    if plane is not None and len(casters):
+        with torch.no_grad():
+            tracks.params["slope"].copy_(torch.from_numpy(shadows.slope(light.direction, plane[0])))
     return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane)
 
 
