@@ -52,9 +52,12 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
 
     from .data import dataset as datasets
     from .report import evaluate, table
-    from .scene import scene_file
+    from .scene import playback, scene_file
     from .train import bake, checkpoint
 
+    for mode in modes:
+        if mode not in playback.MODES:
+            raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.MODES)}")
     if target.is_dir():
         run = checkpoint.open_run(target)
         dataset = datasets.read(data if data is not None else run.dataset_root)

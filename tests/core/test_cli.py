@@ -1,0 +1,148 @@
+"""The command line: the way from images to a table, and one line on stderr for what the user can mend."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from r5dgs_core import __version__, cli, demo
+from r5dgs_core.data import dataset as datasets
+from tests import datasets as tiny_datasets
+
+OPTIONS = [
+    text
+    for override in (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
+    for text in ("--set", override)
+]
+
+
+def complaint(capsys, *arguments):
+    """The one line that a failing command prints."""
+    assert cli.main([str(a) for a in arguments]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("r5dgs: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def made(tiny, tmp_path_factory):
+    """A folder with a run and a scene, made by the commands, and what they printed."""
+    folder = tmp_path_factory.mktemp("made")
+    run, scene = folder / "run", folder / "tiny.r5dgs"
+    assert cli.main(["train", str(tiny.root), "--out", str(run), "--progress", "none", *OPTIONS]) == 0
+    assert cli.main(["bake", str(run), "--out", str(scene)]) == 0
+    return run, scene
+
+
+def test_train_and_bake_leave_their_files(made):
+    run, scene = made
+    assert {p.name for p in run.iterdir()} >= {"run.json", "checkpoint.pt", "log.jsonl"}
+    assert scene.is_file()
+    assert not list(scene.parent.rglob("*.tmp")) and not list(scene.parent.rglob("*.part"))
+
+
+@pytest.mark.parametrize("target", ["run", "scene"])
+def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
+    run, scene = made
+    if target == "run":
+        arguments, path = [str(run)], run / "evaluation.json"
+    else:
+        arguments, path = [str(scene), "--data", str(tiny.root)], scene.with_suffix(".evaluation.json")
+    assert cli.main(["evaluate", *arguments]) == 0
+    result = json.loads(path.read_text())
+    assert result["splits"]["val"]["rigid"]["images"] == 2 and result["splits"]["test"]["rigid"]["images"] == 4
+    assert 5 < result["splits"]["val"]["rigid"]["psnr"] < 60
+    assert [row["name"] for row in result["objects"]] == ["brick", "ball"]
+    assert all(row["position_error"] is not None for row in result["objects"])
+    assert result["train"]["iterations"] == 20
+    assert str(path) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_evaluate_writes_where_it_is_told(made, tmp_path, capsys):
+    assert cli.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]) == 0
+    assert set(json.loads((tmp_path / "e.json").read_text())) == {"scene", "splits", "objects", "train"}
+
+
+def test_info_tells_the_same_to_people_and_programs(made, capsys):
+    assert cli.main(["info", str(made[1]), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [o["name"] for o in found["objects"]] == ["background", "brick", "ball"]
+    assert cli.main(["info", str(made[1])]) == 0
+    text = capsys.readouterr().out
+    assert "brick" in text and str(found["gaussians"]) in text
+
+
+def test_missing_things_are_one_line(tmp_path, tiny, made, capsys):
+    nowhere = tmp_path / "nowhere"
+    assert str(nowhere) in complaint(capsys, "train", nowhere, "--out", tmp_path / "run")
+    assert "not a run folder" in complaint(capsys, "bake", nowhere, "--out", tmp_path / "x.r5dgs")
+    assert str(nowhere) in complaint(capsys, "info", nowhere)
+    assert str(nowhere) in complaint(capsys, "evaluate", nowhere, "--data", tiny.root)
+    assert "--data DIR" in complaint(capsys, "evaluate", made[1])
+    assert not (tmp_path / "run").exists() and not (tmp_path / "x.r5dgs").exists()
+
+
+def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, tiny, capsys):
+    (tmp_path / "letter.txt").write_text("mine")
+    line = complaint(capsys, "train", tiny.root, "--out", tmp_path, *OPTIONS)
+    assert "is not a run folder" in line and [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("losses.sim=1", "did you mean 'ssim'?"),
+        ("train.iterations=many", "train.iterations: expected int, got 'many'"),
+        ("nonsense", "expected SECTION.KEY=VALUE"),
+    ],
+)
+def test_a_wrong_override_is_named_before_anything_is_made(tmp_path, tiny, capsys, override, words):
+    assert words in complaint(capsys, "train", tiny.root, "--out", tmp_path / "run", "--set", override)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_keeps_its_own_configuration(made, tiny, capsys):
+    line = complaint(capsys, "train", tiny.root, "--out", made[0], "--resume", "--set", "train.seed=1")
+    assert "--resume" in line
+    assert cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
+
+
+def test_an_unknown_mode_is_an_error_that_names_the_known_ones(made, capsys):
+    assert "rigid" in complaint(capsys, "evaluate", made[0], "--mode", "wobbly")
+
+
+def test_a_target_folder_that_does_not_exist_is_an_error_for_bake(made, tmp_path, capsys):
+    assert "folder" in complaint(capsys, "bake", made[0], "--out", tmp_path / "deep" / "x.r5dgs")
+
+
+def test_wrong_usage_is_status_2(capsys):
+    for arguments in ([], ["fly"], ["train"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(arguments)
+        assert stop.value.code == 2
+    assert "usage: r5dgs" in capsys.readouterr().err
+
+
+def test_help_and_version_need_no_torch():
+    code = (
+        "import sys; from r5dgs_core import cli\n"
+        "try: cli.main(['--version'])\n"
+        "except SystemExit: pass\n"
+        "print('torch' in sys.modules or 'numba' in sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.splitlines() == [f"r5dgs {__version__}", "False"]
+
+
+def test_the_bundled_data_is_found_and_small():
+    found = demo.bundled_data()
+    dataset = datasets.read(found)
+    assert dataset.train and dataset.val and dataset.test and dataset.ground_truth is not None
+    assert dataset.object_names
+    assert sum(p.stat().st_size for p in found.rglob("*") if p.is_file()) < 4e6
+
+
+def test_missing_bundled_data_is_said(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(demo, "NAME", "nothing")
+    assert "install r5dgs again" in complaint(capsys, "demo", "--out", tmp_path / "demo")

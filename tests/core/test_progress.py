@@ -1,0 +1,67 @@
+"""Progress: one JSON object per line for programs, few lines for a log, silence where asked."""
+
+import json
+
+import pytest
+
+from r5dgs_core import progress
+
+EVENTS = [
+    {"event": "start", "iterations": 100, "dataset": "data"},
+    *[
+        {"event": "step", "iteration": i, "loss": 0.5 / i, "gaussians": 10 * i, "seconds_left": 100.0 - i}
+        for i in range(1, 101)
+    ],
+    {"event": "identity", "iteration": 5, "iterations": 5, "loss": 0.1},
+    {"event": "done", "gaussians": 1000},
+]
+
+
+def show(kind):
+    with progress.make(kind) as report:
+        for event in EVENTS:
+            report(event)
+
+
+def test_json_lines_are_the_events(capsys):
+    show("json")
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == EVENTS
+
+
+def test_none_is_silent(capsys):
+    show("none")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_log_gets_few_lines(capsys, monkeypatch):
+    now = [1000.0]
+
+    def clock():
+        now[0] += 1.0
+        return now[0]
+
+    monkeypatch.setattr(progress.time, "monotonic", clock)
+    show("auto")
+    lines = capsys.readouterr().out.splitlines()
+    assert 5 <= len(lines) <= 2 + len(EVENTS) / progress.PLAIN_EVERY_S + 1
+    assert lines[0] == "start: 100 steps" and lines[-1] == "done: 1000 Gaussians"
+    assert lines[1] == "step 1: loss 0.5000, 10 Gaussians, 99 s left"
+
+
+def test_a_terminal_gets_bars(capsys, monkeypatch):
+    monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: True, raising=False)
+    show("auto")
+    shown = capsys.readouterr().out
+    assert "train" in shown and "100/100" in shown and "identities" in shown
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ({"event": "x"}, ""),
+        ({"event": "x", "iterations": 7}, "7 steps"),
+        ({"event": "x", "loss": 0.25, "iterations": 7}, "loss 0.2500"),
+    ],
+)
+def test_events_in_words(event, words):
+    assert progress.describe(event) == words

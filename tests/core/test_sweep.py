@@ -1,0 +1,133 @@
+"""The plane sweep finds a textured floor, and nothing where there is nothing to find."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from r5dgs_core.scene import cameras
+from r5dgs_core.train import initialization, sweep, triangulation, views
+from tests import scenes
+
+NO_PLACES = triangulation.Places(
+    np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 1), bool), np.zeros((0, 1)), np.zeros(0)
+)
+
+
+def floor_views(count=5, seed=0):
+    """Cameras on an arc that see nothing but a textured floor at z = 0, painted by intersecting their rays with it."""
+    texture = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(160, 160, 3)), (1.8, 1.8, 0))
+    texture = np.clip(0.5 + 0.9 * texture / np.abs(texture).max(), 0, 1)
+    seen = []
+    for k in range(count):
+        camera = steep_camera(0.25 * k)
+        rays = cameras.pixel_rays(camera)
+        hits = camera.center - rays * (camera.center[2] / rays[..., 2:])
+        at = (hits[..., :2] + 8) / 16 * 159  # the texture covers 16 x 16 units
+        image = np.stack(
+            [ndimage.map_coordinates(texture[..., c], np.moveaxis(at, -1, 0), order=1) for c in range(3)], -1
+        )
+        pixels = np.rint(image * 255).astype(np.uint8)
+        seen.append(views.TrainView(f"v{k}", camera, 0.0, pixels, None, None))
+    return seen
+
+
+def steep_camera(angle):
+    """A camera four units from the origin that looks down at it."""
+    position = np.array([2.4 * np.cos(angle), 2.4 * np.sin(angle), 3.2])
+    back = position / np.linalg.norm(position)
+    right = np.cross([0, 0, 1.0], back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
+    matrix[:3, 3] = position
+    return cameras.from_field_of_view(matrix, 0.8, 64, 48)
+
+
+@pytest.fixture(scope="module")
+def floor():
+    return floor_views()
+
+
+def constant_views():
+    """Cameras on an arc that see nothing but one colour."""
+    image = np.tile(np.array([120, 160, 220], np.uint8), (36, 48, 1))
+    return [views.TrainView(f"v{k}", scenes.orbit_camera(0.4 * k, 48, 36), 0.0, image, None, None) for k in range(5)]
+
+
+def depth_step(depths):
+    """Distance between the depths that are tried, near the cameras' focus."""
+    return 4.0**2 * (1 / sweep.NEAREST - 1 / sweep.FARTHEST) / (depths - 1)
+
+
+@pytest.mark.parametrize("depths", [96, 288])
+def test_points_lie_on_a_textured_floor_as_exactly_as_depths_are_tried(floor, depths):
+    points = sweep.Sweep(sweep.backdrops(floor), 150, depths).distinct_points()
+    assert len(points) > 200
+    assert np.median(np.abs(points[:, 2])) < 0.5 * depth_step(depths)
+    assert np.mean(np.abs(points[:, 2]) < 1.5 * depth_step(depths)) > 0.85
+
+
+def test_the_supporting_plane_is_the_floor_and_points_are_put_onto_it(floor):
+    search = sweep.Sweep(sweep.backdrops(floor), 150, 288)
+    eyes = np.stack([v.camera.center for v in floor])
+    plane = initialization.supporting_plane(search.distinct_points(), NO_PLACES, eyes, np.random.default_rng(0))
+    assert plane is not None
+    normal, height = plane
+    assert np.degrees(np.arccos(normal[2])) < 2 and abs(height) < 0.5 * depth_step(288)
+    points, colors = search.points(150, plane, np.random.default_rng(0))
+    assert points.shape == colors.shape == (150, 3)
+    assert np.mean(np.abs(points @ normal - height) < 1e-6) > 0.7
+    assert colors.min() >= 0 and colors.max() <= 1
+
+
+def test_the_same_draws_give_the_same_points(floor):
+    search = sweep.Sweep(sweep.backdrops(floor), 150, 48)
+    a, b = (search.points(100, None, np.random.default_rng(3))[0] for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_a_constant_sky_places_nothing():
+    search = sweep.Sweep(sweep.backdrops(constant_views()), 200, 48)
+    points, colors = search.points(200, None, np.random.default_rng(0))
+    assert points.shape == colors.shape == (0, 3)
+
+
+def test_without_parallax_or_neighbours_nothing_is_placed(floor):
+    for seen in (floor[:1], [floor[0]] * 3):
+        points, _ = sweep.Sweep(sweep.backdrops(seen), 200, 48).points(200, None, np.random.default_rng(0))
+        assert len(points) == 0
+
+
+def test_a_backdrop_is_what_lies_behind_the_objects(floor):
+    view = floor[0]
+    rng = np.random.default_rng(0)
+    seen = []
+    for k in range(5):
+        mask = np.zeros(view.image.shape[:2], np.int32)
+        mask[5 : 5 + 20, 10 * k : 10 * k + 12] = 1
+        image = np.where(mask[..., None] > 0, rng.integers(0, 255, view.image.shape), view.image).astype(np.uint8)
+        seen.append(dataclasses.replace(view, image=image, mask=mask, t=0.1 * k))
+    (backdrop,) = sweep.backdrops(seen)
+    assert backdrop.known.all()
+    np.testing.assert_allclose(backdrop.image, view.image / 255, atol=1e-6)
+
+
+def test_pixels_that_objects_always_cover_or_that_are_transparent_are_unknown(floor):
+    view = floor[0]
+    mask = np.zeros(view.image.shape[:2], np.int32)
+    mask[10:20, 10:20] = 2
+    alpha = np.full(mask.shape, 255, np.uint8)
+    alpha[30:, :] = 0
+    (backdrop,) = sweep.backdrops([dataclasses.replace(view, mask=mask, alpha=alpha)] * 2)
+    assert not backdrop.known[10:20, 10:20].any() and not backdrop.known[30:].any()
+    assert backdrop.known[:8].all() and np.isfinite(backdrop.image).all()
+
+
+def test_no_plane_carries_scattered_points():
+    rng = np.random.default_rng(0)
+    eyes = np.array([[0.0, 0, 10]])
+    scattered = rng.normal(size=(500, 3)) * 3
+    assert initialization.supporting_plane(scattered, NO_PLACES, eyes, rng) is None
+    assert initialization.supporting_plane(scattered[:10], NO_PLACES, eyes, rng) is None
