@@ -127,7 +127,8 @@ class DensifySection:
         start: First step.
         stop: Last step, as a share of the run.
         every: Steps between two rounds.
-        share: Share of Gaussians that grow in a round, by mean screen gradient.
+        gradient: Mean screen gradient above which a Gaussian grows, per half image width (the measure of 3DGS).
+        share: Largest share of Gaussians that grow in a round.
         split_pixels: Larger ones (standard deviation in pixels) are split, smaller ones cloned.
         max_gaussians: Cap; 0 chooses it from the image size (3/4 of an image's pixels, at most 60000).
         prune_opacity: Fainter ones are removed.
@@ -137,7 +138,8 @@ class DensifySection:
     start: int = 200
     stop: float = 0.5
     every: int = 100
-    share: float = 0.06
+    gradient: float = 2e-4
+    share: float = 0.2
     split_pixels: float = 1.0
     max_gaussians: int = 0
     prune_opacity: float = 0.01

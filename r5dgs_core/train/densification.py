@@ -1,8 +1,8 @@
 """Densification: Gaussians with large screen gradients are cloned or split, faint and oversized ones removed.
 
-The thresholds are relative: a fixed share grows in each round, and sizes are measured in pixels.
+Gradients are measured per half image width and sizes in pixels, so that the thresholds hold at any resolution.
 
-Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2, with a fixed share instead of a gradient threshold and
+Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2, with a bound on the share that grows in a round and
 without opacity resets.
 """
 
@@ -25,7 +25,7 @@ class ScreenGradients:
         self.pixel_sizes = torch.zeros(count)
 
     def add(self, grad_norm: Tensor, visible: Tensor, radii: Tensor) -> None:
-        """Add one view: gradient norms [N], visibility [N], radii in pixels [N]."""
+        """Add one view: gradient norms per half image width [N], visibility [N], radii in pixels [N]."""
         self.total += torch.where(visible, grad_norm, 0.0)
         self.views += visible
         self.pixel_sizes = torch.maximum(self.pixel_sizes, torch.where(visible, radii, 0.0))
@@ -61,7 +61,7 @@ def densify(
     room = cap - n
     with torch.no_grad():
         score = gradients.mean()
-        grow = int(min(section.share * n, room, int((score > 0).sum())))
+        grow = int(min(section.share * n, room, int((score > section.gradient).sum())))
         remove = torch.zeros(n, dtype=torch.bool)
         if grow > 0:
             chosen = score.topk(grow).indices

@@ -88,7 +88,10 @@ def train_encodings(
     directions = torch.randn(max(count, section.dim), section.dim, generator=generator)
     weight = torch.linalg.qr(directions).Q[:count].clone() if count <= section.dim else directions[:count]
     weight = (2 * weight / weight.norm(dim=1, keepdim=True)).requires_grad_(True)
-    bias = torch.zeros(count, requires_grad=True)
+    # Half of what a solid pixel of an object answers: where nothing is drawn, or less than half, it is background.
+    bias = torch.zeros(count)
+    bias[0] = 2.0
+    bias.requires_grad_(True)
     encodings = weight.detach()[labels].clone().requires_grad_(True)
     optimizer = torch.optim.Adam(
         [

@@ -92,11 +92,13 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
     colors.append(shade)
     labels.append(np.zeros(len(where)))
     casters = np.zeros(0, np.int64)
+    shadow_slope = np.zeros(3)
     flat: list[np.ndarray] = [np.tile([1.0, 0, 0, 0], (len(opacities[0]), 1))]
     if plane is not None and config.train.shadows and init.shadow_points > 0:
         casters = np.arange(1, bodies)
         normal, _ = plane
         light = shadows.find_light(views, scenes, places, times, plane, rng)
+        shadow_slope = shadows.slope(light.direction, normal)
         log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
         for body in casters:
             radius = places.radii[body - 1]
@@ -139,9 +141,8 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
         torch.from_numpy(casters),
         None if plane is None else torch.from_numpy(plane[0].astype(np.float32)),
     )
-    if plane is not None and len(casters):
-        with torch.no_grad():
-            tracks.params["slope"].copy_(torch.from_numpy(shadows.slope(light.direction, plane[0])))
+    with torch.no_grad():
+        tracks.params["slope"].copy_(torch.from_numpy(shadow_slope))
     return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane)
 
 

@@ -132,7 +132,8 @@ class Trainer:
             self._check_finite(value, view.name)
         self.optimizer.step()
         if stats.grad_norm is not None and stats.visible is not None and stats.radii is not None:
-            self.gradients.add(stats.grad_norm, stats.visible, stats.radii)
+            half_width = 0.5 * view.camera.width
+            self.gradients.add(half_width * stats.grad_norm, stats.visible, stats.radii)
         self.iteration += 1
         self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
         self._maintain()
