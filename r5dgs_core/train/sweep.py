@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy import ndimage
-from scipy.spatial import Delaunay, KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from ..scene import cameras
 from .views import TrainView
@@ -216,13 +216,15 @@ class _Support:
         if len(flat) >= 10:
             near = KDTree(flat).query(flat, k=10)[0][:, -1]
             flat = flat[near <= 3 * np.median(near)]
-        self._hull = Delaunay(flat) if len(flat) >= 10 else None
+        self._sides = ConvexHull(flat).equations if len(flat) >= 10 else None
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Whether points [..., 3] near the plane lie in that part. [...]"""
-        if self._hull is None:
+        if self._sides is None:
             return np.zeros(points.shape[:-1], bool)
-        return self._hull.find_simplex(points @ self._axes.T) >= 0
+        # The sides' half-planes; searching a triangulation takes seconds where many points lie outside.
+        flat = points @ self._axes.T
+        return np.logical_and.reduce([flat @ side[:2] + side[2] <= 0 for side in self._sides])
 
 
 def _cost(world: torch.Tensor, color: torch.Tensor, others) -> torch.Tensor:

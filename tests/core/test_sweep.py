@@ -131,3 +131,22 @@ def test_no_plane_carries_scattered_points():
     scattered = rng.normal(size=(500, 3)) * 3
     assert initialization.supporting_plane(scattered, NO_PLACES, eyes, rng) is None
     assert initialization.supporting_plane(scattered[:10], NO_PLACES, eyes, rng) is None
+
+
+def test_the_support_is_what_its_points_outline():
+    rng = np.random.default_rng(1)
+    normal = np.array([0.2, -0.3, 1.0]) / np.linalg.norm([0.2, -0.3, 1.0])
+    axes = np.linalg.svd(normal[None])[2][1:]
+    angles = rng.uniform(0, 2 * np.pi, 2000)
+    disc = (2 * np.sqrt(rng.random(2000)) * np.stack([np.cos(angles), np.sin(angles)])).T
+    support = sweep._Support(disc @ axes + 0.7 * normal, (normal, 0.7))
+    asked = rng.uniform(-4, 4, (50, 60, 2))
+    radii = np.linalg.norm(asked, axis=-1)
+    inside = support(asked @ axes + 0.7 * normal)
+    assert inside[radii < 1.9].all() and not inside[radii > 2].any()
+    assert not support(np.full((1, 3), 1e9))[0]
+
+
+def test_too_few_points_support_nothing():
+    support = sweep._Support(np.zeros((5, 3)), (np.array([0.0, 0, 1]), 0.0))
+    assert not support(np.zeros((2, 3))).any()
