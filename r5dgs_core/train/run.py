@@ -62,18 +62,19 @@ def train(
         run = checkpoint.create_run(folder, dataset, config)
     progress({"event": "start", "iterations": config.train.iterations, "dataset": str(dataset_root)})
     began = time.monotonic()
-    trainer = Trainer(dataset, config)
-    spent = 0.0
-    finished = False
+    state = None
     if resume and (run.folder / checkpoint.CHECKPOINT_FILE).exists():
         state = checkpoint.load(folder)
+        if state["finished"]:
+            progress({"event": "done", "gaussians": len(state["tensors"]["gaussians.means"])})
+            return run
+    trainer = Trainer(dataset, config)
+    if state is not None:
         trainer.restore(state)
         _trim_log(run.folder / checkpoint.LOG_FILE, trainer.iteration)
-        spent = state["seconds"]
-        finished = state["finished"]
-    if not finished:
-        _optimise(trainer, run, began - spent, progress)
-        _finish(trainer, run, began - spent, progress)
+        began -= state["seconds"]
+    _optimise(trainer, run, began, progress)
+    _finish(trainer, run, began, progress)
     progress({"event": "done", "gaussians": len(trainer.gaussians)})
     return run
 

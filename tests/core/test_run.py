@@ -42,6 +42,12 @@ def assert_equal_runs(folder, reference):
     }
 
 
+def log_of(folder):
+    """Steps, losses and counts of a run's log, without its clock."""
+    lines = (folder / checkpoint.LOG_FILE).read_text().splitlines()
+    return [[json.loads(line)[key] for key in ("iteration", "loss", "gaussians")] for line in lines]
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=["kill", "terminate"])
 def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys, number):
     folder = tmp_path / "run"
@@ -66,6 +72,7 @@ def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys
     assert cli.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
     assert capsys.readouterr().err == ""
     assert_equal_runs(folder, unbroken[0])
+    assert log_of(folder) == log_of(unbroken[0])
 
 
 def test_a_run_killed_before_its_last_labels_only_makes_these(tiny, unbroken, tmp_path, monkeypatch):
@@ -100,8 +107,10 @@ def test_progress_counts_up_to_the_end(unbroken):
 def test_resuming_a_finished_run_changes_nothing(tiny, unbroken):
     path = unbroken[0] / checkpoint.CHECKPOINT_FILE
     before = path.read_bytes()
-    run.train(tiny.root, unbroken[0], tiny_datasets.settings(), resume=True)
+    events = []
+    run.train(tiny.root, unbroken[0], tiny_datasets.settings(), resume=True, progress=events.append)
     assert path.read_bytes() == before
+    assert events[-1]["event"] == "done" and events[-1]["gaussians"] > 0
 
 
 def test_resuming_on_other_data_is_refused(unbroken, tmp_path):
