@@ -201,3 +201,7 @@ def test_shading_at_the_bind_state_keeps_every_colour():
     strong = factor(bind, shading) > bake.MIN_BIND_FACTOR
     assert strong.mean() > 0.8
     np.testing.assert_allclose(found[strong], expected[strong], atol=1e-9)
+    bands = sh[:, 1:] * factor(total, shading)[:, None, None]
+    np.testing.assert_allclose(
+        (baked_sh[:, 1:] * factor(later, baked_shading)[:, None, None])[strong], bands[strong], atol=1e-9
+    )
