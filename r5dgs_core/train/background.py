@@ -13,8 +13,7 @@ from torch import Tensor
 from ..model import spherical_harmonics
 from ..scene import cameras
 from ..scene.cameras import Camera
-
-DEGREE = 2
+from . import sky
 
 
 class Background:
@@ -51,8 +50,8 @@ def fixed(color: np.ndarray) -> Background:
     return Background(torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
 
 
-def learned(color: np.ndarray) -> Background:
-    """A trained sky that starts at one colour. [3]"""
-    start = torch.zeros((DEGREE + 1) ** 2, 3)
-    start[0] = torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))
+def learned(coefficients: np.ndarray) -> Background:
+    """A trained sky that starts at given coefficients, the missing ones at zero. [Kb, 3]"""
+    start = torch.zeros((sky.DEGREE + 1) ** 2, 3)
+    start[: len(coefficients)] = torch.from_numpy(np.asarray(coefficients, np.float32))
     return Background(start, True)

@@ -133,6 +133,8 @@ class DensifySection:
         max_gaussians: Cap; 0 chooses it from the image size (3/4 of an image's pixels, at most 60000).
         prune_opacity: Fainter ones are removed.
         prune_width: Wider ones are removed; standard deviation as a share of the image width.
+        prune_near: Background that is nearer to a camera and that no second camera sees is removed; normalised units
+            (the cameras' focus is at about 4); 0 keeps it.
     """
 
     start: int = 200
@@ -144,6 +146,7 @@ class DensifySection:
     max_gaussians: int = 0
     prune_opacity: float = 0.01
     prune_width: float = 0.16
+    prune_near: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,14 @@ without opacity resets.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from ..model.gaussians import Gaussians
 from ..motion import rotations
+from ..scene.cameras import Camera
 from .config import DensifySection
 
 
@@ -35,6 +38,36 @@ class ScreenGradients:
         return self.total / self.views.clamp(min=1)
 
 
+def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
+    """Background Gaussians close before a camera that no second camera sees: their depth is not determined.
+
+    Args:
+        gaussians: The Gaussians; those of group 0 are looked at.
+        eyes: The distinct training cameras; with fewer than three there is no second opinion.
+        distance: What is close, in normalised units.
+
+    Returns:
+        Which ones they are. [N] bool
+    """
+    means = gaussians.params["means"].detach()
+    pinned = gaussians.motion_ids == 0
+    if len(eyes) < 3 or distance <= 0:
+        return torch.zeros_like(pinned)
+    seen = torch.zeros(len(means))
+    near = torch.zeros_like(pinned)
+    for camera in eyes:
+        T = torch.from_numpy(camera.T_cam_world).float()
+        k = camera.intrinsics
+        p_cam = means @ T[:3, :3].T + T[:3, 3]
+        z = p_cam[:, 2].clamp(min=1e-6)
+        u = k[0, 0] * p_cam[:, 0] / z + k[0, 2]
+        v = k[1, 1] * p_cam[:, 1] / z + k[1, 2]
+        inside = (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        seen += inside
+        near |= p_cam.norm(dim=1) < distance
+    return pinned & near & (seen < 2)
+
+
 def densify(
     gaussians: Gaussians,
     optimizer: torch.optim.Optimizer,
@@ -43,6 +76,7 @@ def densify(
     cap: int,
     pixel_size: float,
     width_limit: float,
+    eyes: Sequence[Camera],
     generator: torch.Generator,
 ) -> None:
     """One round: grow where the image asks for it, then prune.
@@ -55,6 +89,7 @@ def densify(
         cap: Largest number of Gaussians.
         pixel_size: Typical size of a pixel at the objects, normalised units.
         width_limit: Standard deviation above which a Gaussian is removed, normalised units.
+        eyes: The distinct training cameras.
         generator: Source of the draws.
     """
     n = len(gaussians)
@@ -80,4 +115,4 @@ def densify(
             remove = torch.cat([remove, torch.zeros(len(source), dtype=torch.bool)])
         faint = torch.sigmoid(gaussians.opacity_logits) < section.prune_opacity
         wide = gaussians.log_scales.exp().amax(1) > width_limit
-        gaussians.keep(optimizer, ~(remove | faint | wide))
+        gaussians.keep(optimizer, ~(remove | faint | wide | floaters(gaussians, eyes, section.prune_near)))

@@ -34,6 +34,7 @@ class Start:
         places: Where the masks put the objects.
         first_time: Index of the time at which training begins.
         plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
+        sky: Coefficients of the sky, or None where none was found. [9, 3]
     """
 
     gaussians: Gaussians
@@ -42,6 +43,7 @@ class Start:
     places: triangulation.Places
     first_time: int
     plane: tuple[np.ndarray, float] | None
+    sky: np.ndarray | None
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
@@ -50,12 +52,13 @@ def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     return times if len(times) <= limit else np.linspace(times[0], times[-1], limit)
 
 
-def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) -> Start:
+def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.random.Generator) -> Start:
     """Place Gaussians and tracks.
 
     Args:
         views: Training views in normalised coordinates.
         config: Configuration of the run.
+        find_sky: Whether there may be sky behind the scene; not where the background's colour is given.
         rng: Source of the draws.
 
     Returns:
@@ -84,7 +87,8 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
     search = sweep.Sweep(scenes, init.background_points, init.sweep_depths)
     eyes = np.stack([v.camera.center for v in views])
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
-    where, shade = search.points(init.background_points, plane, rng)
+    placed = search.place(init.background_points, plane, find_sky, rng)
+    where, shade = placed.points, placed.colors
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
     opacities = [np.full(sum(map(len, points)) + len(where), init.opacity)]
     scales = [_neighbour_scales(np.concatenate([*points, where]))] if points or len(where) else []
@@ -143,7 +147,7 @@ def start(views: Sequence[TrainView], config: Config, rng: np.random.Generator) 
     )
     with torch.no_grad():
         tracks.params["slope"].copy_(torch.from_numpy(shadow_slope))
-    return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane)
+    return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane, placed.sky)
 
 
 def supporting_plane(

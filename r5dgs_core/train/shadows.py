@@ -16,7 +16,7 @@ import numpy as np
 from scipy import ndimage
 
 from .hull import pixel_indices
-from .sweep import Backdrop
+from .sweep import Backdrop, camera_key
 from .triangulation import Places
 from .views import TrainView
 
@@ -59,10 +59,10 @@ def find_light(
     directions = _directions(normal)
     score = np.zeros(len(directions))
     count = np.zeros(len(directions))
-    backdrop_of = {_key(b.camera): b for b in scenes}
+    backdrop_of = {camera_key(b.camera): b for b in scenes}
     offsets = _disc(normal, rng)
     for view in views:
-        backdrop = backdrop_of.get(_key(view.camera))
+        backdrop = backdrop_of.get(camera_key(view.camera))
         if backdrop is None:
             continue
         darkening, known = _darkening(view, backdrop)
@@ -128,7 +128,3 @@ def _darkening(view: TrainView, backdrop: Backdrop) -> tuple[np.ndarray, np.ndar
     if view.mask is not None:
         known &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
     return np.where(known, 1 - now / np.maximum(usual, 0.02), 0.0), known
-
-
-def _key(camera) -> bytes:
-    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes()

@@ -19,6 +19,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
 from ..scene import cameras
+from . import sky
 from .views import TrainView
 
 MAX_BACKDROPS = 24
@@ -40,15 +41,8 @@ class Backdrop:
 
 def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     """Median over time of the unmasked pixels, one per distinct camera."""
-    by_camera: dict[bytes, list[TrainView]] = {}
-    for view in views:
-        key = np.round(view.camera.T_cam_world, 5).tobytes() + np.round(view.camera.intrinsics, 3).tobytes()
-        by_camera.setdefault(key, []).append(view)
-    groups = list(by_camera.values())
-    if len(groups) > MAX_BACKDROPS:
-        groups = [groups[i] for i in np.linspace(0, len(groups) - 1, MAX_BACKDROPS).round().astype(int)]
     result = []
-    for group in groups:
+    for group in by_camera(views):
         images = np.stack([v.image for v in group]).astype(np.float32) / 255
         free = np.stack([_free(v) for v in group])
         known = np.asarray(free.any(0))
@@ -59,6 +53,22 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     return result
 
 
+def by_camera(views: Sequence[TrainView]) -> list[list[TrainView]]:
+    """Views that share pose and lens; a spread of 24 cameras where there are more."""
+    groups: dict[bytes, list[TrainView]] = {}
+    for view in views:
+        groups.setdefault(camera_key(view.camera), []).append(view)
+    found = list(groups.values())
+    if len(found) > MAX_BACKDROPS:
+        found = [found[i] for i in np.linspace(0, len(found) - 1, MAX_BACKDROPS).round().astype(int)]
+    return found
+
+
+def camera_key(camera: cameras.Camera) -> bytes:
+    """Equal for cameras of the same pose and lens."""
+    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes()
+
+
 def _free(view: TrainView) -> np.ndarray:
     free = np.ones(view.image.shape[:2], bool)
     if view.mask is not None:
@@ -66,6 +76,15 @@ def _free(view: TrainView) -> np.ndarray:
     if view.alpha is not None:
         free &= view.alpha > 127
     return free
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Background points [P, 3], their colours [P, 3], and coefficients of the sky [9, 3] or None."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    sky: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -80,6 +99,7 @@ class Rays:
         costs: Its colour difference to the other cameras, infinite where nothing was comparable. [h, w]
         flat: Whether most depths are about as good, as on sky and on plain surfaces. [h, w] bool
         sky: Whether infinity is about as good. [h, w] bool
+        known: Whether the colour is known. [h, w] bool
         neighbours: Backdrops that it was compared with.
     """
 
@@ -90,6 +110,7 @@ class Rays:
     costs: np.ndarray
     flat: np.ndarray
     sky: np.ndarray
+    known: np.ndarray
     neighbours: tuple[int, ...]
 
 
@@ -135,7 +156,7 @@ class Sweep:
         flat = low[..., :-1].sum(-1) > 0.5 * comparable
         known = reference.known[rows, cols]
         costs = np.where(known, best.numpy(), np.inf)
-        return Rays(i, directions, colors, z[at.numpy()], costs, flat.numpy(), low[..., -1].numpy(), neighbours)
+        return Rays(i, directions, colors, z[at.numpy()], costs, flat.numpy(), low[..., -1].numpy(), known, neighbours)
 
     def _compare(self, i: int, offsets: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]) -> torch.Tensor:
         world = torch.from_numpy(self.scenes[i].camera.center + offsets).float()
@@ -151,42 +172,65 @@ class Sweep:
         ]
         return np.concatenate(found) if found else np.zeros((0, 3))
 
-    def points(
-        self, count: int, plane: tuple[np.ndarray, float] | None, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draw background points.
+    def place(
+        self, count: int, plane: tuple[np.ndarray, float] | None, find_sky: bool, rng: np.random.Generator
+    ) -> Placed:
+        """Draw background points and find the sky.
 
         Rays on which the supporting plane is as good as the best depth are placed on the plane, within the region in
-        which it was found. Of the others, those
-        with one clear depth are placed there, and those on which any depth will do are left to the sky.
+        which it was found. Rays that show sky place nothing, nor do those on which any depth will do. The others are
+        placed at their best depth.
 
         Args:
             count: Number of points wanted.
             plane: Unit normal and offset of the supporting plane, or None.
+            find_sky: Whether there may be sky; not where the background's colour is given.
             rng: Source of the draws.
 
         Returns:
-            Points [P, 3] and colours [P, 3] with P <= count; none where there is no parallax or nothing but sky.
+            At most ``count`` points; none where there is no parallax or nothing but sky.
         """
-        points, colors, costs = [], [], []
-        on_support = _Support(self.distinct_points(), plane) if plane is not None else None
+        if not self.rays:
+            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
+        support = _Support(self.distinct_points(), plane) if plane is not None else None
+        origins, directions, colors, costs, depths, clear, on_support = ([] for _ in range(7))
         for r in self.rays:
-            depths, usable = r.depths.copy(), (r.costs < GOOD) & ~r.flat & ~r.sky
-            if plane is not None and on_support is not None:
+            center = self.scenes[r.backdrop].camera.center
+            best, usable, above = r.depths, (r.costs < GOOD) & ~r.flat & ~r.sky, np.zeros(r.costs.shape, bool)
+            if plane is not None and support is not None:
                 on_plane, cost = self._on_plane(r, plane)
-                hits = self.scenes[r.backdrop].camera.center + r.directions * on_plane[..., None]
-                snapped = (cost <= np.minimum(r.costs + 2 * SAME, GOOD)) & np.isfinite(r.costs) & on_support(hits)
-                depths = np.where(snapped, on_plane, depths)
-                usable |= snapped
-            points.append(self.scenes[r.backdrop].camera.center + (r.directions * depths[..., None])[usable])
-            colors.append(r.colors[usable])
-            costs.append(r.costs[usable])
-        if not points or sum(map(len, points)) == 0:
-            return np.zeros((0, 3)), np.zeros((0, 3))
-        everything, shades, badness = np.concatenate(points), np.concatenate(colors), np.concatenate(costs)
-        weights = 1 / (0.02 + badness)
-        chosen = rng.choice(len(everything), min(count, len(everything)), replace=False, p=weights / weights.sum())
-        return everything[chosen], shades[chosen]
+                above = np.isfinite(cost) & support(center + r.directions * on_plane[..., None])
+                snapped = (cost <= np.minimum(r.costs + 2 * SAME, GOOD)) & np.isfinite(r.costs) & above
+                best, usable = np.where(snapped, on_plane, best), usable | snapped
+            origins.append(np.broadcast_to(center, r.directions.shape).reshape(-1, 3))
+            directions.append(r.directions.reshape(-1, 3))
+            colors.append(r.colors.reshape(-1, 3))
+            for found, value in ((costs, r.costs), (depths, best), (clear, usable), (on_support, above)):
+                found.append(value.reshape(-1))
+        origin, direction, color = np.concatenate(origins), np.concatenate(directions), np.concatenate(colors)
+        cost, depth = np.concatenate(costs), np.concatenate(depths)
+        usable, supported = np.concatenate(clear), np.concatenate(on_support)
+        seen = sky.fit(
+            direction / np.linalg.norm(direction, axis=1, keepdims=True),
+            color,
+            self._known_rays() & ~supported if find_sky else np.zeros(len(color), bool),
+            self._up(),
+        )
+        if seen is not None:
+            usable &= ~seen[1]
+        points = (origin + direction * depth[:, None])[usable]
+        weights = 1 / (0.02 + cost[usable])
+        chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
+        return Placed(points[chosen], color[usable][chosen], None if seen is None else seen[0])
+
+    def _known_rays(self) -> np.ndarray:
+        """Rays whose colour is known, comparable or not. [P]"""
+        return np.concatenate([r.known.reshape(-1) for r in self.rays])
+
+    def _up(self) -> np.ndarray:
+        """Mean upward direction of the cameras, unit. [3]"""
+        up = -np.stack([b.camera.T_cam_world[1, :3] for b in self.scenes]).mean(0)
+        return up / max(float(np.linalg.norm(up)), 1e-9)
 
     def _on_plane(self, rays: Rays, plane: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
         """Depth at which each ray meets a plane, and the colour difference there (infinite where it does not)."""

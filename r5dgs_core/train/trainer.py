@@ -17,11 +17,12 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..errors import TrainingError
+from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, normalization, posing, views
+from . import densification, initialization, losses, normalization, posing, sweep, views
 from .config import Config
 from .representation import Representation, TracksRepresentation
 
@@ -50,14 +51,17 @@ class Trainer:
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
-        start = initialization.start(self.views, config, np.random.default_rng(config.train.seed))
+        start = initialization.start(self.views, config, behind is None, np.random.default_rng(config.train.seed))
         self.gaussians: Gaussians = start.gaussians
         self.motion: Representation = TracksRepresentation(start.tracks, start.places, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
-        self.background = backgrounds.fixed(behind) if behind is not None else backgrounds.learned(self._sky_color())
+        if behind is not None:
+            self.background = backgrounds.fixed(behind)
+        else:
+            self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color())
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.iteration = 0
         self.entered = (self.first_time, self.first_time)
@@ -69,6 +73,7 @@ class Trainer:
         self._pixel_size = normalization.TARGET_DISTANCE / focal
         width = float(np.median([v.camera.width for v in self.views]))
         self._width_limit = config.densify.prune_width * width * self._pixel_size
+        self._eyes = [group[0].camera for group in sweep.by_camera(self.views)]
         self.cap = config.densify.max_gaussians or int(min(60000, 0.75 * np.median(sizes)))
         self.optimizer = self._make_optimizer()
         self.gradients = densification.ScreenGradients(len(self.gaussians))
@@ -80,10 +85,10 @@ class Trainer:
             kind = "white" if self.dataset.has_alpha else "learned"
         return {"learned": None, "white": np.ones(3), "black": np.zeros(3)}[kind]
 
-    def _sky_color(self) -> np.ndarray:
-        """Median colour of what no object covers in the top rows, where sky is likeliest. [3]"""
-        rows = [v.image[: max(1, len(v.image) // 8)].reshape(-1, 3) for v in self.views]
-        return np.median(np.concatenate(rows), axis=0) / 255
+    def _mean_color(self) -> np.ndarray:
+        """Coefficients of one colour, the median of all pixels, where no sky was found. [1, 3]"""
+        color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
+        return spherical_harmonics.rgb_to_dc(color)[None]
 
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.config.rates
@@ -226,6 +231,7 @@ class Trainer:
                 self.cap,
                 self._pixel_size,
                 self._width_limit,
+                self._eyes,
                 self.generator,
             )
             self.gradients = densification.ScreenGradients(len(self.gaussians))
