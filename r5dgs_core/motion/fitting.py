@@ -29,6 +29,8 @@ _FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
 _LARGEST = families.BY_NAME["full, free centre"]
 _STATIC = families.BY_NAME["static"]
 _TAIL = 5
+STOP_RATIO = 8.0  # distance of the poses before a stop over the scatter of those after it
+STOP_MOTION = 0.02  # radii; less is no motion worth stopping
 
 
 @dataclass(frozen=True)
@@ -125,10 +127,11 @@ def fit(
     near = [c for c, s in zip(family, scores, strict=True) if s <= WITHIN * best] or [family[0]]
     solutions = {c.name: families.solve(c, track, sigmas) for c in near}
     chosen = min(near, key=lambda c: c.parameters)
-    rested = _rests(solutions[chosen.name], track, sigmas)
+    resting = _TAIL if _rests(solutions[chosen.name], track, sigmas) else _stopped(track)
+    rested = resting > 0
     solution, evidence = solutions[chosen.name], track
     if rested:
-        evidence = track.rows(slice(-_TAIL, None))
+        evidence = track.rows(slice(-resting, None))
         solution = families.solve(_STATIC, evidence, sigmas)
     table = tuple(
         Score(c.name, c.parameters, float(s), math.sqrt(solutions[c.name].chi2) if c.name in solutions else math.nan)
@@ -215,7 +218,8 @@ def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], o
     """Root mean square of the residuals on the last poses of a fit to the first ones, in units of the noise."""
     count = len(track.tau)
     held = max(3, math.ceil(HELD_OUT * count)) if count >= 8 else max(1, count // 4)
-    if candidate.parameters > 6 * (count - held) - 2:
+    # Six numbers a pose would determine more, but a third of them must be left to tell noise from motion.
+    if candidate.parameters > 4 * (count - held):
         return math.inf
     solution = families.solve(candidate, track.rows(slice(0, count - held)), sigmas)
     tail = track.rows(slice(count - held, count))
@@ -244,6 +248,34 @@ def _rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
     whole = families.residuals(picked.candidate, picked.theta[None], track, sigmas)[0]
     whole_chi2 = _tail_chi2(whole, picked.candidate.parameters)
     return still_chi2 <= 1.5 * moving_chi2 and whole_chi2 > 2 * max(still_chi2, 0.25)
+
+
+def _stopped(track: Track) -> int:
+    """Number of last poses over which the body clearly stands still after it moved, 0 where it does not.
+
+    Needs no noise estimate, which a stop within the window spoils: the last three to five poses scatter little about
+    their mean, and the two poses before lie far from it, one farther than the other, against that scatter. Steady
+    motion gives a ratio of at most 2.4 and the apex of a throw 4.3, so that neither is taken for a stop.
+    """
+    for count in (5, 4, 3):
+        if len(track.tau) < count + 3:
+            continue
+        tail = track.rows(slice(-count, None))
+        mean_quat = rotations.normalize(tail.quats.mean(0))
+        mean = tail.displacements.mean(0)
+        distance = _pose_distance(tail.quats, tail.displacements, mean_quat, mean)
+        before = track.rows(slice(-count - 2, -count))
+        earlier, just_before = _pose_distance(before.quats, before.displacements, mean_quat, mean)
+        scatter = max(float(np.sqrt((distance**2).mean())), _SIGMA_FLOOR)
+        if just_before > max(STOP_RATIO * scatter, STOP_MOTION) and earlier > just_before:
+            return count
+    return 0
+
+
+def _pose_distance(quats: np.ndarray, displacements: np.ndarray, mean_quat: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Distance of poses from one pose over the points of a sphere of radius one, root mean square. [S]"""
+    angle = rotations.angle_between(quats, mean_quat)
+    return np.sqrt(((displacements - mean) ** 2).sum(-1) + 2 / 3 * angle**2)
 
 
 def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:

@@ -119,6 +119,27 @@ def test_a_stop_is_found_and_slow_movers_keep_moving():
     assert sum(frozen) <= 1
 
 
+def test_a_body_that_brakes_and_stands_in_its_last_three_poses_stays():
+    rng = np.random.default_rng(11)
+    for _ in range(4):
+        left = np.maximum(TIMES[-3] - TIMES, 0.0)[:, None]
+        path = -3.0 * left**2 * [1.0, 0.2, 0.0] + 0.001 * SIZE * rng.normal(size=(15, 3))
+        fit = fitting.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
+        assert fit.rested
+        _, displacements = models.evaluate(fit.model, np.array([0.25, 1.0]))
+        assert np.abs(displacements).max() < 0.01 * SIZE
+
+
+@pytest.mark.parametrize("acceleration", [0.5, 2.0, 8.0])
+def test_the_apex_of_a_throw_is_not_a_stop(acceleration):
+    rng = np.random.default_rng(12)
+    for noise in (0.0, 0.002, 0.01):
+        path = -0.5 * acceleration * (TIMES[-1] - TIMES)[:, None] ** 2 * [0.0, 0.0, 1.0]
+        path = path + noise * SIZE * rng.normal(size=(15, 3))
+        fit = fitting.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
+        assert not fit.rested
+
+
 def test_the_band_holds_the_true_error():
     rng = np.random.default_rng(7)
     inside = []
