@@ -26,6 +26,7 @@ MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
+PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
 SAME = 0.012  # colour difference that tells nothing
 GOOD = 0.12  # larger colour differences are no match
 
@@ -177,9 +178,9 @@ class Sweep:
     ) -> Placed:
         """Draw background points and find the sky.
 
-        Rays on which the supporting plane is as good as the best depth are placed on the plane, within the region in
-        which it was found. Rays that show sky place nothing, nor do those on which any depth will do. The others are
-        placed at their best depth.
+        Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
+        which it was found, and, where the sky is known, everywhere near that is not sky. Rays that show sky place
+        nothing, nor do those on which any depth will do. The others are placed at their best depth.
 
         Args:
             count: Number of points wanted.
@@ -192,40 +193,32 @@ class Sweep:
         """
         if not self.rays:
             return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
-        support = _Support(self.distinct_points(), plane) if plane is not None else None
-        origins, directions, colors, costs, depths, clear, on_support = ([] for _ in range(7))
-        for r in self.rays:
-            center = self.scenes[r.backdrop].camera.center
-            best, usable, above = r.depths, (r.costs < GOOD) & ~r.flat & ~r.sky, np.zeros(r.costs.shape, bool)
-            if plane is not None and support is not None:
-                on_plane, cost = self._on_plane(r, plane)
-                above = np.isfinite(cost) & support(center + r.directions * on_plane[..., None])
-                snapped = (cost <= np.minimum(r.costs + 2 * SAME, GOOD)) & np.isfinite(r.costs) & above
-                best, usable = np.where(snapped, on_plane, best), usable | snapped
-            origins.append(np.broadcast_to(center, r.directions.shape).reshape(-1, 3))
-            directions.append(r.directions.reshape(-1, 3))
-            colors.append(r.colors.reshape(-1, 3))
-            for found, value in ((costs, r.costs), (depths, best), (clear, usable), (on_support, above)):
-                found.append(value.reshape(-1))
-        origin, direction, color = np.concatenate(origins), np.concatenate(directions), np.concatenate(colors)
-        cost, depth = np.concatenate(costs), np.concatenate(depths)
-        usable, supported = np.concatenate(clear), np.concatenate(on_support)
-        seen = sky.fit(
-            direction / np.linalg.norm(direction, axis=1, keepdims=True),
-            color,
-            self._known_rays() & ~supported if find_sky else np.zeros(len(color), bool),
-            self._up(),
-        )
-        if seen is not None:
-            usable &= ~seen[1]
-        points = (origin + direction * depth[:, None])[usable]
+        eyes = [np.broadcast_to(self.scenes[r.backdrop].camera.center, r.directions.shape) for r in self.rays]
+        origin = _flatten(eyes)
+        direction, color = _flatten([r.directions for r in self.rays]), _flatten([r.colors for r in self.rays])
+        depth, cost = _flatten([r.depths for r in self.rays]), _flatten([r.costs for r in self.rays])
+        clear = (cost < GOOD) & ~_flatten([r.flat | r.sky for r in self.rays])
+        plane_depth, plane_cost = np.ones(len(cost)), np.full(len(cost), np.inf)
+        supported = np.zeros(len(cost), bool)
+        if plane is not None:
+            hits = [self._on_plane(r, plane) for r in self.rays]
+            plane_depth, plane_cost = (_flatten([hit[k] for hit in hits]) for k in (0, 1))
+            support = _Support(self.distinct_points(), plane)
+            supported = np.isfinite(plane_cost) & support(origin + direction * plane_depth[:, None])
+        candidates = _flatten([r.known for r in self.rays]) & ~supported & find_sky
+        unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        found = sky.fit(unit, color, candidates, self._up())
+        is_sky = found[1] if found is not None else np.zeros(len(cost), bool)
+        as_good = (plane_cost <= np.minimum(cost + 2 * SAME, GOOD)) & np.isfinite(cost)
+        on_plane = as_good & (supported | ((plane_depth < PLANE_REACH) & (found is not None)))
+        usable = (clear | on_plane) & ~is_sky
+        points = (origin + direction * np.where(on_plane, plane_depth, depth)[:, None])[usable]
+        coefficients = found[0] if found is not None else None
+        if len(points) == 0:
+            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), coefficients)
         weights = 1 / (0.02 + cost[usable])
         chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
-        return Placed(points[chosen], color[usable][chosen], None if seen is None else seen[0])
-
-    def _known_rays(self) -> np.ndarray:
-        """Rays whose colour is known, comparable or not. [P]"""
-        return np.concatenate([r.known.reshape(-1) for r in self.rays])
+        return Placed(points[chosen], color[usable][chosen], coefficients)
 
     def _up(self) -> np.ndarray:
         """Mean upward direction of the cameras, unit. [3]"""
@@ -244,6 +237,11 @@ class Sweep:
         offsets = rays.directions[:, :, None] * depth[..., None, None]
         cost = _smooth(self._compare(rays.backdrop, offsets, rays.colors, rays.neighbours))[..., 0].numpy()
         return depth, np.where(hits, cost, np.inf)
+
+
+def _flatten(grids: Sequence[np.ndarray]) -> np.ndarray:
+    """Values of all rays in one row: grids [h, w, ...] to [P, ...]."""
+    return np.concatenate([grid.reshape(-1, *grid.shape[2:]) for grid in grids])
 
 
 class _Support:
