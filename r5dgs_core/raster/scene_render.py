@@ -3,7 +3,7 @@ pixels.
 
 Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times its shading factor, with d the viewing direction in the world and A
 the map that brought the Gaussian from its bind state. Behind everything lies the scene's sky, the spherical harmonics
-`Scene.background_sh` along each pixel's ray.
+`Scene.background_sh` along each pixel's ray, within [0, 1] as in training.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def render_frame(
         background: "scene" for the sky, None for black, or a colour [3] or image [H, W, 3].
         backend: Rasterizer: "auto", "cpu", "cuda" or "reference".
         features: More channels to blend beside the colour. [N, F]
-        settings: Of the rasterizer.
+        settings: Of the rasterizer; the defaults with the scene's near plane where None.
 
     Returns:
         Colour (not clamped at 1), alpha, depth, features and object ids, tensors without gradient.
@@ -170,7 +170,7 @@ def render_frame(
             camera,
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
             None if background is None else torch.from_numpy(np.ascontiguousarray(background, np.float32)),
-            settings=settings,
+            settings=settings or RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         )
 
@@ -179,10 +179,10 @@ def sky(scene: Scene, camera: Camera) -> np.ndarray:
     """The scene's background as this camera sees it, display-referred sRGB. [H, W, 3] float32"""
     sh = np.asarray(scene.background_sh, np.float64)
     if len(sh) == 1:
-        color = np.maximum(spherical_harmonics.to_rgb(sh, np.zeros(3)), 0)
+        color = np.clip(spherical_harmonics.to_rgb(sh, np.zeros(3)), 0, 1)
         return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
     rays = cameras.pixel_rays(camera)
-    return np.maximum(spherical_harmonics.to_rgb(sh, rays), 0).astype(np.float32)
+    return np.clip(spherical_harmonics.to_rgb(sh, rays), 0, 1).astype(np.float32)
 
 
 def colors(posed: PosedScene, camera: Camera) -> np.ndarray:

@@ -15,6 +15,7 @@ from ..motion.models import MotionModel
 from .cameras import Camera
 
 ROLES = ("pinned", "body", "shadow")
+NEAR_PLANE = 0.01  # of a scene that does not say
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Scene:
         vocabulary_embeddings: One row per word, unit. [V, D] or None
         provenance: Configuration, data hash, versions.
         needs: The needs table: rows of ``name, value, threshold, decision, reason``.
+        near_plane: Gaussians whose centre lies nearer than this depth are not drawn, as in training; world units.
     """
 
     name: str
@@ -133,6 +135,7 @@ class Scene:
     vocabulary_embeddings: np.ndarray | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     needs: tuple[dict[str, Any], ...] = ()
+    near_plane: float = NEAR_PLANE
 
     @property
     def extent(self) -> float:

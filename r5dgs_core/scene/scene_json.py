@@ -12,7 +12,7 @@ import numpy as np
 from .. import __version__, errors
 from ..motion.models import MotionModel
 from .cameras import Camera
-from .scene import MotionGroup, Scene, SceneObject
+from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 
 def dump(scene: Scene, head: dict[str, Any]) -> bytes:
@@ -26,6 +26,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         "t_max": float(scene.t_max),
         "frames_per_unit": float(scene.frames_per_unit),
         "world_convention": scene.world_convention,
+        "near_plane": float(scene.near_plane),
         "objects": [
             {
                 "id": o.id,
@@ -86,6 +87,7 @@ def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
         "vocabulary": tuple(words(data, "vocabulary", place)),
         "provenance": get(data, "provenance", dict, place),
         "needs": tuple(each(data, "needs", lambda row, place: dict(row), place)),
+        "near_plane": get(data, "near_plane", float, place) if "near_plane" in data else NEAR_PLANE,
     }
 
 

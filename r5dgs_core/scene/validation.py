@@ -109,6 +109,8 @@ def _check_times(scene: Scene, place: str) -> None:
         _fail(place, "t_max", f"the last of track_times, {times[-1]!r}", repr(scene.t_max))
     if not (np.isfinite(scene.frames_per_unit) and scene.frames_per_unit > 0):
         _fail(place, "frames_per_unit", "a positive number", scene.frames_per_unit)
+    if not (np.isfinite(scene.near_plane) and scene.near_plane > 0):
+        _fail(place, "near_plane", "a positive depth", scene.near_plane)
     last = scene.track_poses[:, -1]
     off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
     if off.any():

@@ -21,7 +21,7 @@ from ..errors import CheckpointError
 from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
-from ..scene.scene import MotionGroup, Scene, SceneObject
+from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 from . import checkpoint, needs
 from .normalization import Normalization
 from .representation import tracks_of
@@ -146,6 +146,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
             },
         },
         needs=decisions,
+        near_plane=NEAR_PLANE * norm.scale,
     )
 
 

@@ -85,6 +85,13 @@ def test_optional_members_may_be_absent_or_present(tmp_path):
     assert back.provenance == {"seed": 3, "rates": [1.0, 2.0], "nested": {"ok": True, "none": None}}
 
 
+def test_a_file_keeps_its_near_plane_and_one_without_has_the_default(scene, path, tmp_path):
+    near = dataclasses.replace(scene, near_plane=2.5e-4)
+    assert scene_file.read(scene_file.write(near, tmp_path / "near.r5dgs")).near_plane == 2.5e-4
+    older = rewrite(tmp_path / "near.r5dgs", tmp_path / "older.r5dgs", lambda tree: tree.pop("near_plane") and None)
+    assert scene_file.read(older).near_plane == scene_file.read(path).near_plane == 0.01
+
+
 def test_a_scene_without_gaussians_is_a_scene(tmp_path):
     empty = make_scene(n=0, objects=0, unassigned=0)
     assert len(scene_file.read(scene_file.write(empty, tmp_path / "empty.r5dgs")).means) == 0
@@ -191,6 +198,8 @@ def setter(*keys_and_value):
         (setter("t_max", 0.7), "t_max"),
         (setter("t_max", None), "t_max: expected float"),
         (setter("frames_per_unit", 0), "frames_per_unit"),
+        (setter("near_plane", 0), "near_plane: expected a positive depth"),
+        (setter("near_plane", "far"), "near_plane: expected float"),
         (setter("world_convention", "mars"), "world_convention"),
         (setter("name", 5), "name: expected str"),
         (setter("objects", 2, "start", 1), "range"),
@@ -322,7 +331,7 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing(scene, tmp_path, m
         with pytest.raises(errors.SceneFileError, match="No space left"):
             scene_file.write(scene, path)
     with monkeypatch.context() as patch:
-        patch.setattr(scene_file.os, "replace", full_disk)
+        patch.setattr(files.os, "replace", full_disk)
         with pytest.raises(errors.SceneFileError, match="No space left"):
             scene_file.write(scene, path)
     assert path.read_bytes() == before
