@@ -7,8 +7,6 @@ encoding) and obj_id. Other columns and elements are passed over.
 
 from __future__ import annotations
 
-import os
-import secrets
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -17,6 +15,7 @@ import numpy as np
 
 from .. import errors
 from ..motion import rotations
+from . import files
 
 _TYPES = {
     "char": "i1",
@@ -82,17 +81,10 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False) -> Path:
     kinds = {"<f4": "float", "<i4": "int"}
     header = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default"]
     header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        try:
-            with open(temporary, "xb") as stream:
-                stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-                stream.write(data.tobytes())
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with files.replacing(path) as stream:
+            stream.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+            stream.write(data.tobytes())
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     return path

@@ -8,9 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import logging
-import os
-import secrets
 import struct
 import zipfile
 import zlib
@@ -20,10 +17,8 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from . import scene_json, validation
+from . import files, scene_json, validation
 from .scene import Scene
-
-logger = logging.getLogger(__name__)
 
 FORMAT = "r5dgs scene"
 FORMAT_VERSION = 1
@@ -82,19 +77,11 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
     validation.check(scene, f"{path} (not written)")
     if not path.parent.is_dir():
         raise errors.SceneFileError(f"{path}: expected an existing folder, found none; make {path.parent} first")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        try:
-            with open(temporary, "xb") as stream:
-                _write_zip(scene, stream, exact)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with files.replacing(path) as stream:
+            _write_zip(scene, stream, exact)
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
-    _sync_folder(path.parent)
     return path
 
 
@@ -259,17 +246,3 @@ def _read_array(archive: zipfile.ZipFile, name: str, place: str, listed: bool) -
             f"{where}: expected {size} bytes for shape {shape}, found {len(data) - stream.tell()}"
         )
     return _decode(name, np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape))
-
-
-def _sync_folder(folder: Path) -> None:
-    """Put the rename itself on the disk, where the system can (not on Windows)."""
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        logger.debug("%s: fsync of the folder failed: %s", folder, error)
-    finally:
-        os.close(descriptor)

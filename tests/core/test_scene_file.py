@@ -8,7 +8,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.scene import files, playback, scene_file
 from tests.scenes import make_scene
 
 # Half a step of the stored fixed point, and half-precision rounding.

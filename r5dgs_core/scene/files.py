@@ -1,0 +1,65 @@
+"""Files that are replaced whole or not at all: whatever happens on the way, the old content or the new is there."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A stream for the new content of a file, which becomes the file when the block ends without an error.
+
+    The content goes under a hidden temporary name in the same folder, then to the disk, then to its place. After an
+    error the temporary file is gone and the old one untouched.
+
+    Args:
+        path: The file; its folder must exist.
+
+    Raises:
+        OSError: It cannot be written; the caller says what that means.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with open(temporary, "xb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def write(path: str | Path, content: bytes) -> None:
+    """Replace a file by ``content``, see `replacing`."""
+    with replacing(path) as stream:
+        stream.write(content)
+
+
+def leftovers(path: str | Path) -> list[Path]:
+    """Temporary files that `replacing` left beside a file when its process was killed, or is writing right now."""
+    path = Path(path)
+    return [p for p in path.parent.glob(f".{path.name}.*.part") if p.is_file()]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the rename itself on the disk, where the system can (not on Windows)."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        logger.debug("%s: fsync of the folder failed: %s", folder, error)
+    finally:
+        os.close(descriptor)
