@@ -10,6 +10,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError
 from r5dgs_core.motion import rotations
 from r5dgs_core.raster import scene_render
+from r5dgs_core.report import evaluate
 from r5dgs_core.scene import playback, scene_file, validation
 from r5dgs_core.train import bake, checkpoint, normalization, representation, run
 from r5dgs_core.train.trainer import Trainer
@@ -205,3 +206,24 @@ def test_shading_at_the_bind_state_keeps_every_colour():
     np.testing.assert_allclose(
         (baked_sh[:, 1:] * factor(later, baked_shading)[:, None, None])[strong], bands[strong], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_a_scene_of_any_size_is_measured_alike(trained, tiny, baked, tmp_path, scale):
+    data = datasets.read(tiny_datasets.make_dataset(tmp_path / "data", scale=scale).root)
+    state = checkpoint.load(trained.folder)
+    state["scale"] *= scale
+    state["origin"] = [scale * x for x in state["origin"]]
+    made = dataclasses.replace(trained, folder=tmp_path)
+    checkpoint.save(tmp_path, state)
+    scene = bake.bake(made, data)
+    assert scene.near_plane == pytest.approx(scale * baked.near_plane, rel=1e-6)
+    expected = evaluate.evaluate(baked, datasets.read(tiny.root))
+    found = evaluate.evaluate(scene, data)
+    for split in ("val", "test"):
+        one, other = expected["splits"][split]["rigid"], found["splits"][split]["rigid"]
+        for name in ("psnr", "psnr_pooled", "psnr_objects", "ssim", "miou"):
+            assert other[name] == pytest.approx(one[name], rel=1e-3), name
+    for one, other in zip(expected["objects"], found["objects"], strict=True):
+        assert other["position_error"] == pytest.approx(scale * one["position_error"], rel=1e-3)
+        assert other["rotation_error_deg"] == pytest.approx(one["rotation_error_deg"], rel=1e-3)

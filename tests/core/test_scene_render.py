@@ -8,9 +8,10 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from r5dgs_core.motion import rotations  # noqa: E402
-from r5dgs_core.raster import scene_render  # noqa: E402
+from r5dgs_core.raster import RasterSettings, scene_render  # noqa: E402
 from r5dgs_core.raster.scene_render import Instance  # noqa: E402
 from r5dgs_core.scene import playback  # noqa: E402
+from r5dgs_core.train import background  # noqa: E402
 from tests import scenes  # noqa: E402
 
 CAMERA = scenes.orbit_camera(0.7, 48, 40)
@@ -147,3 +148,21 @@ def test_black_and_given_backgrounds(scene):
 def test_impossible_instances_are_refused(scene, instance, message):
     with pytest.raises(ValueError, match=message):
         scene_render.pose_instances(scene, [instance])
+
+
+@pytest.mark.parametrize("bases", [1, 4, 9])
+def test_the_sky_is_the_one_of_training(scene, bases):
+    coefficients = np.random.default_rng(bases).normal(scale=0.3, size=(bases, 3)).astype(np.float32)
+    coefficients[0] = [-3.0, 3.0, 0.2]  # black, white and between
+    shown = scene_render.sky(dataclasses.replace(scene, background_sh=coefficients), CAMERA)
+    assert (shown == 0).any() and (shown == 1).any()  # both ends are reached
+    start = torch.from_numpy(coefficients)
+    trained = background.Background(start, learned=bases > 1).image(CAMERA).detach().numpy()
+    np.testing.assert_allclose(shown, np.broadcast_to(trained, shown.shape), atol=1e-6)
+
+
+def test_the_near_plane_is_the_scene_s(scene):
+    frame = playback.frame(scene, scenes.T_MAX)
+    far = dataclasses.replace(scene, near_plane=100.0)
+    np.testing.assert_array_equal(image(far, frame), scene_render.sky(scene, CAMERA))
+    np.testing.assert_array_equal(image(far, frame, settings=RasterSettings()), image(scene, frame))
