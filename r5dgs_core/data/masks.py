@@ -13,57 +13,73 @@ from .. import errors
 from . import images
 
 MAX_COLORS = 4096
-_GRAY, _PALETTE = 0, 3
+_GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # colour types of PNG
+_ONE_CHANNEL = (_GRAY, _PALETTE, _GRAY_ALPHA)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def read(path: Path, colors: Mapping[int, int] | None = None) -> np.ndarray:
     """Read an object id image.
 
-    One channel holds ids as they are, a palette image holds ids as palette indices, equal R, G and B are one channel.
-    Other RGB images hold one colour per object and need ``colors``. Pixels with alpha 0 are background.
+    Without ``colors`` the image holds ids: one channel as they are, a palette image as palette indices, three equal
+    channels as one. With ``colors`` it holds one colour per object, in whatever form the file keeps them (gray and
+    palette files too, as image tools write them where they lose nothing). Pixels with alpha 0 are background.
 
     Args:
         path: A PNG file.
-        colors: Object id of each packed colour (R << 16 | G << 8 | B); black is 0.
+        colors: Object id of each packed colour (R << 16 | G << 8 | B); what `color_table` found in all masks.
 
     Returns:
         Object ids, 0 = background. [H, W] int32
     """
     path = Path(path)
-    header = _png_header(path)
-    if header is not None and (header[3] == _PALETTE or (header[3] == _GRAY and header[2] < 8)):
+    if not colors and _holds_indices(path):
         return _read_indices(path)
     pixels = images.read_png(path)
-    channels = pixels.shape[2]
-    coded = channels >= 3 and not _is_gray(pixels)
-    ids = _colors_to_ids(path, pixels, colors) if coded else pixels[..., 0].astype(np.int32)
-    if channels in (2, 4):
+    if colors:
+        return _colors_to_ids(path, pixels, colors)
+    if pixels.shape[2] >= 3 and not _is_gray(pixels):
+        raise errors.DatasetError(
+            f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette"
+        )
+    ids = pixels[..., 0].astype(np.int32)
+    if pixels.shape[2] in (2, 4):
         ids[pixels[..., -1] == 0] = 0
     return ids
 
 
 def color_table(paths: Iterable[Path]) -> dict[int, int]:
-    """Number the colours of RGB-coded masks: black is 0, the others 1, 2, ... by packed value.
+    """Decide for all masks of a data set at once whether they are coded by colour, and number the colours.
+
+    They are as soon as one of them shows a colour that is not gray; then black is 0 and the others, grays and white
+    among them, are 1, 2, ... by packed value. Otherwise all of them hold ids.
 
     Returns:
         Object id of each packed colour; empty where no mask of ``paths`` is coded by colour.
     """
     found: set[int] = set()
-    for path in paths:
-        header = _png_header(Path(path))
-        if header is not None and header[3] in (_GRAY, _PALETTE, 4):
-            continue
-        pixels = images.read_png(Path(path))
-        if pixels.shape[2] < 3 or _is_gray(pixels):
-            continue
-        found.update(np.unique(_pack(path, pixels)).tolist())
-        if len(found) > MAX_COLORS:
-            raise errors.DatasetError(
-                f"{path}: expected one flat colour per object, found over {MAX_COLORS} colours in the masks; "
-                "write them without anti-aliasing and without lossy compression"
-            )
-    return {color: i + 1 for i, color in enumerate(sorted(found - {0}))} | ({0: 0} if found else {})
+    gray = []
+    for path in map(Path, paths):
+        header = _png_header(path)
+        pixels = None if header is not None and header[3] in _ONE_CHANNEL else images.read_png(path)
+        if pixels is None or pixels.shape[2] < 3 or _is_gray(pixels):
+            gray.append(path)
+        else:
+            _collect(path, pixels, found)
+    if not found:
+        return {}
+    for path in gray:
+        _collect(path, images.read_png(path), found)
+    return {0: 0} | {color: i + 1 for i, color in enumerate(sorted(found - {0}))}
+
+
+def _collect(path: Path, pixels: np.ndarray, found: set[int]) -> None:
+    found.update(np.unique(_pack(path, pixels)).tolist())
+    if len(found) > MAX_COLORS:
+        raise errors.DatasetError(
+            f"{path}: expected one flat colour per object, found over {MAX_COLORS} colours in the masks; "
+            "write them without anti-aliasing and without lossy compression"
+        )
 
 
 def resize(ids: np.ndarray, width: int, height: int, where: str) -> np.ndarray:
@@ -96,17 +112,18 @@ def _is_gray(pixels: np.ndarray) -> bool:
 
 
 def _pack(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """Colours R << 16 | G << 8 | B; gray is a colour of three equal channels, transparent pixels are black. [H, W]"""
     if pixels.dtype != np.uint8:
-        raise errors.DatasetError(f"{path}: a mask coded by colour must have 8 bits per channel, found {pixels.dtype}")
-    rgb = pixels[..., :3].astype(np.int64)
-    return rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
-
-
-def _colors_to_ids(path: Path, pixels: np.ndarray, colors: Mapping[int, int] | None) -> np.ndarray:
-    if not colors:
         raise errors.DatasetError(
-            f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette"
+            f"{path}: expected 8 bits per channel, as masks of this data set are coded by colour, found {pixels.dtype}"
         )
+    channels = (0, 1, 2) if pixels.shape[2] >= 3 else (0, 0, 0)
+    red, green, blue = (pixels[..., c].astype(np.int64) for c in channels)
+    packed = red << 16 | green << 8 | blue
+    return np.where(pixels[..., -1] == 0, 0, packed) if pixels.shape[2] in (2, 4) else packed
+
+
+def _colors_to_ids(path: Path, pixels: np.ndarray, colors: Mapping[int, int]) -> np.ndarray:
     packed = _pack(path, pixels)
     keys = np.array(sorted(colors), np.int64)
     values = np.array([colors[int(k)] for k in keys], np.int32)
@@ -114,11 +131,18 @@ def _colors_to_ids(path: Path, pixels: np.ndarray, colors: Mapping[int, int] | N
     unknown = keys[at] != packed
     if unknown.any():
         y, x = np.argwhere(unknown)[0]
-        r, g, b = (int(v) for v in pixels[y, x, :3])
+        color = int(packed[y, x])
         raise errors.DatasetError(
-            f"{path}: the colour ({r}, {g}, {b}) at pixel ({x}, {y}) belongs to no object; add it to objects.json"
+            f"{path}: expected one of the {len(keys)} colours that the masks had when the data set was read, found "
+            f"({color >> 16}, {color >> 8 & 255}, {color & 255}) at pixel ({x}, {y}); the mask changed, start again"
         )
     return values[at]
+
+
+def _holds_indices(path: Path) -> bool:
+    """Whether image libraries would expand the stored numbers: a palette, or gray of fewer than 8 bits."""
+    header = _png_header(path)
+    return header is not None and (header[3] == _PALETTE or (header[3] == _GRAY and header[2] < 8))
 
 
 def _png_header(path: Path) -> tuple[int, int, int, int, int] | None:

@@ -111,6 +111,46 @@ def test_colours_get_the_same_ids_in_all_masks(tmp_path):
     np.testing.assert_array_equal(masks.read(paths[1], colors), [[2, 2], [0, 3]])
 
 
+def test_what_a_mask_means_is_decided_for_all_masks_at_once(tmp_path):
+    """A colour-coded mask that happens to show white and gray objects alone is one of colours all the same."""
+    gray, red, white = (90, 90, 90), (200, 0, 0), (255, 255, 255)
+    pictures = {
+        "all.png": np.array([[(0, 0, 0), gray], [red, white]], np.uint8),
+        "white.png": np.array([[(0, 0, 0), white], [white, white]], np.uint8),
+        "one_channel.png": np.array([[0, 90], [255, 90]], np.uint8)[..., None],
+        "empty.png": np.zeros((2, 2, 3), np.uint8),
+    }
+    for name, pixels in pictures.items():
+        images.write_png(tmp_path / name, pixels)
+    colors = masks.color_table([tmp_path / name for name in reversed(pictures)])
+    read = {name: masks.read(tmp_path / name, colors).tolist() for name in pictures}
+    assert read == {
+        "all.png": [[0, 1], [2, 3]],
+        "white.png": [[0, 3], [3, 3]],
+        "one_channel.png": [[0, 1], [3, 1]],
+        "empty.png": [[0, 0], [0, 0]],
+    }
+
+
+def test_a_palette_file_among_coloured_ones_shows_its_colours(tmp_path):
+    write_indexed(tmp_path / "palette.png", IDS)
+    shown = images.read_png(tmp_path / "palette.png")[..., :3]
+    images.write_png(tmp_path / "rgb.png", shown)
+    colors = masks.color_table([tmp_path / "palette.png", tmp_path / "rgb.png"])
+    as_palette, as_rgb = (masks.read(tmp_path / name, colors) for name in ("palette.png", "rgb.png"))
+    np.testing.assert_array_equal(as_palette, as_rgb)
+    assert len(np.unique(as_rgb)) == len(np.unique(IDS))
+
+
+def test_transparent_pixels_of_coloured_masks_are_background(tmp_path):
+    pixels = np.full((2, 3, 4), 255, np.uint8)
+    pixels[0, :, :3] = (10, 20, 30)
+    pixels[1, 1] = (77, 0, 0, 0)
+    images.write_png(tmp_path / "m.png", pixels)
+    colors = masks.color_table([tmp_path / "m.png"])
+    np.testing.assert_array_equal(masks.read(tmp_path / "m.png", colors), [[1, 1, 1], [2, 0, 2]])
+
+
 def test_masks_of_ids_need_no_colours(tmp_path):
     images.write_png(tmp_path / "m.png", IDS.astype(np.uint8))
     assert masks.color_table([tmp_path / "m.png"]) == {}
@@ -120,7 +160,7 @@ def test_a_colour_of_no_object_is_located(tmp_path):
     pixels = np.zeros((4, 4, 3), np.uint8)
     pixels[2, 1] = (9, 8, 7)
     images.write_png(tmp_path / "m.png", pixels)
-    with pytest.raises(errors.DatasetError, match=r"m\.png.*\(9, 8, 7\) at pixel \(1, 2\)"):
+    with pytest.raises(errors.DatasetError, match=r"m\.png.*2 colours.*\(9, 8, 7\) at pixel \(1, 2\)"):
         masks.read(tmp_path / "m.png", {0: 0, 255: 1})
     with pytest.raises(errors.DatasetError, match="one channel"):
         masks.read(tmp_path / "m.png")
