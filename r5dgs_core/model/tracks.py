@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..motion import rotations
+from ..motion import keyframes, rotations
+from ..scene import playback
 
 
 @dataclass(frozen=True)
@@ -81,26 +82,37 @@ class Tracks:
         in_plane = slope - (slope @ n) * n
         return torch.eye(3) - torch.outer(n, n) + torch.outer(in_plane, n)
 
-    def locate(self, t: float) -> tuple[int, int, float]:
-        """The knots around a time and the weight of the second: exact at a knot, held outside the range."""
-        upper = int(np.clip(np.searchsorted(self.times, t), 0, len(self.times) - 1))
-        lower = max(upper - 1, 0)
-        span = self.times[upper] - self.times[lower]
-        weight = float(np.clip((t - self.times[lower]) / span, 0.0, 1.0)) if span > 0 else 0.0
-        if weight > 1 - 1e-9:
-            return upper, upper, 0.0
-        return (lower, lower, 0.0) if weight < 1e-9 else (lower, upper, weight)
+    def knot_weights(self, t: float) -> dict[int, float]:
+        """Weights of the knots at a time: 1 at a knot, held outside the range, between knots those of playback's curve.
+
+        That curve, a cubic Hermite by component with slopes from neighbouring knots, is linear in the knots' values.
+        """
+        k = int(np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 1))
+        near = k if k + 1 == len(self.times) or t - self.times[k] <= self.times[k + 1] - t else k + 1
+        span = self.times[min(k + 1, len(self.times) - 1)] - self.times[k]
+        if abs(t - self.times[near]) <= 1e-9 * max(span, 1.0) or not self.times[0] < t < self.times[-1]:
+            return {near: 1.0}
+        window = np.arange(max(k - 1, 0), min(k + 3, len(self.times)))
+        one = np.eye(len(window))
+        at = k - window[0]
+        slopes = playback.slopes(self.times[window], one)
+        weights = keyframes.hermite(
+            one[at], one[at + 1], slopes[at], slopes[at + 1], span, np.asarray((t - self.times[k]) / span)
+        )
+        return {int(s): float(w) for s, w in zip(window, weights, strict=True) if w != 0.0}
 
     def poses(self, t: float) -> GroupPoses:
-        """Differentiable poses of all groups at a time (between knots: normalised linear interpolation)."""
-        lower, upper, weight = self.locate(t)
-        quats, displacements = self._knot(lower)
-        if weight > 0:
-            other_quats, other_displacements = self._knot(upper)
-            sign = torch.where((quats * other_quats).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-            mixed = (1 - weight) * quats + weight * sign * other_quats
+        """Differentiable poses of all groups at a time."""
+        weights = self.knot_weights(t)
+        quats, displacements = self._knot(next(iter(weights)))
+        if len(weights) > 1:
+            mixed, moved, previous = torch.zeros_like(quats), torch.zeros_like(displacements), quats
+            for s, weight in weights.items():
+                quats, displacements = self._knot(s)
+                previous = torch.where((quats * previous).sum(-1, keepdim=True) < 0, -quats, quats)
+                mixed, moved = mixed + weight * previous, moved + weight * displacements
             quats = mixed / mixed.norm(dim=-1, keepdim=True)
-            displacements = (1 - weight) * displacements + weight * other_displacements
+            displacements = moved
         if len(self.casters):
             followed = displacements[self.casters] @ self.follow_matrix().T
             still = torch.zeros(len(self.casters), 4)

@@ -22,25 +22,10 @@ from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, needs
+from . import checkpoint, needs, representation
 from .normalization import Normalization
-from .representation import tracks_of
 
 MIN_BIND_FACTOR = 0.1
-
-
-@dataclasses.dataclass(frozen=True)
-class _Group:
-    """A motion group on the way into the scene: its canonical centre, tracks [S, 4] and [S, 3], and members."""
-
-    object_id: int
-    role: str
-    center: np.ndarray
-    quats: np.ndarray
-    displacements: np.ndarray
-    members: np.ndarray
-    observed: np.ndarray
-    caster: int | None = None
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
@@ -63,53 +48,49 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}
     if not all(np.isfinite(a).all() for a in g.values()):
         raise CheckpointError(f"{run.folder}: the checkpoint holds values that are not finite; train again")
-    groups = _groups(tensors, state["observed"].numpy(), g["motion_ids"], norm)
-    light = tensors["light"].numpy().astype(np.float64)
-    strength = max(float(np.linalg.norm(light)), 1e-12)
-    light = light / strength
-    labels = (
-        tensors["labels"].numpy()
-        if "labels" in tensors
-        else np.where(g["motion_ids"] < len(tensors["object_ids"]), g["motion_ids"], 0)
-    )
-    object_ids = tensors["object_ids"].numpy()[labels].astype(np.int32)
+    present = tensors["object_ids"].numpy()
+    motion = representation.observed_motion(state["representation"], tensors, present, state["observed"].numpy())
+    light, strength = _unit(motion.light)
+    motion_ids = g["motion_ids"].astype(np.int32)
+    if "labels" in tensors:
+        labels = tensors["labels"].numpy()
+    else:  # an unfinished run has none yet
+        labels = representation.group_classes(motion.groups, present)[motion_ids]
+    object_ids = present[labels].astype(np.int32)
     log_scales = g["log_scales"] + np.log(norm.scale)
     means = norm.points_to_world(g["means"])
     quats = rotations.normalize(g["quats"].astype(np.float64))
     sh = np.concatenate([g["sh"], g["sh_rest"]], axis=1).astype(np.float64)
     shading = strength * g["shading"].astype(np.float64)
-    motion_ids = g["motion_ids"].astype(np.int32)
     opacities = 1 / (1 + np.exp(-g["opacity_logits"].astype(np.float64)))
     rows: list[MotionGroup] = []
     track_poses = []
-    last = len(tensors["tracks.times"]) - 1
-    for index, group in enumerate(groups):
-        q, d, c = group.quats[last], group.displacements[last], group.center
-        members = group.members
-        means[members] = c + rotations.rotate(q, means[members] - c) + d
+    for index, group in enumerate(motion.groups):
+        members = motion_ids == index
+        center = norm.points_to_world(group.center)
+        path = group.displacements * norm.scale
+        q, d = group.quats[-1], path[-1]
+        means[members] = center + rotations.rotate(q, means[members] - center) + d
         quats[members] = rotations.multiply(q, quats[members])
         sh[members], shading[members] = _bind_shading(sh[members], shading[members], q, light)
-        pivot = _pivot(means[members], opacities[members], c + d)
-        relative = rotations.make_continuous(
-            rotations.normalize(rotations.multiply(group.quats, rotations.conjugate(q)))
-        )
-        shift = c + group.displacements + rotations.rotate(relative, pivot - c - d) - pivot
-        relative[last], shift[last] = [1.0, 0, 0, 0], 0.0
-        if group.role == "pinned":
-            shift[:] = 0.0
-        track_poses.append(np.concatenate([relative, shift], axis=1))
-        rows.append(_motion_group(index, group, tensors, pivot, relative, shift, means[members], opacities[members]))
+        pivot = _pivot(means[members], opacities[members], center + d)
+        poses = _relative(group.quats, path, center, pivot)
+        radius = _radius(means[members], opacities[members], pivot)
+        if group.role == "pinned" or (group.role == "body" and needs.is_still(poses, radius)):
+            poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
+        track_poses.append(poses)
+        anchor = _anchor(np.flatnonzero(members), means[members], opacities[members], pivot)
+        rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
     order = np.lexsort((motion_ids, object_ids))
     used_background = _background(tensors["background"].numpy())
-    turning = [bool(np.abs(p[:, 1:4]).max() > 1e-3) for p in track_poses]
-    decisions = needs.decide(rows, track_poses, motion_ids, shading, light, used_background, len(sh[0]), run.config)
-    keep_shading = bool(run.config.train.shading and any(turning) and np.abs(shading).max() > 0)
+    decisions = needs.decide(
+        rows, track_poses, motion_ids, shading, light, used_background, sh.shape[1], "identities" in tensors
+    )
+    keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
     rank = np.argsort(order)
     rows = [
-        dataclasses.replace(r, anchor_index=int(rank[np.flatnonzero(groups[r.id].members)[r.anchor_index]]))
-        if r.anchor_index >= 0
-        else r
-        for r in rows
+        dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
+        for row in rows
     ]
     return Scene(
         name=dataset.name,
@@ -120,11 +101,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         sh=sh[order].astype(np.float32),
         object_ids=object_ids[order],
         motion_ids=motion_ids[order],
-        track_times=tensors["tracks.times"].numpy().astype(np.float64),
+        track_times=motion.times.astype(np.float64),
         track_poses=np.stack(track_poses),
-        objects=_objects(object_ids[order], tensors["object_ids"].numpy(), dataset),
+        objects=_objects(object_ids[order], present, dataset),
         groups=tuple(rows),
-        t_max=float(tensors["tracks.times"][last]),
+        t_max=float(motion.times[-1]),
         frames_per_unit=dataset.frames_per_unit,
         world_convention=dataset.world_convention,
         cameras=dataset.cameras,
@@ -150,58 +131,65 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     )
 
 
-def _groups(tensors: dict[str, Any], observed: np.ndarray, motion_ids: np.ndarray, norm: Normalization) -> list[_Group]:
-    """All motion groups in the world; group 0 and every body and shadow, also those without members."""
-    tracks = tracks_of(tensors)
-    quats = tracks.knot_quats().detach().numpy().astype(np.float64)
-    displacements = tracks.params["translations"].detach().numpy().astype(np.float64) * norm.scale
-    centers = norm.points_to_world(tracks.centers.numpy())
-    follow = tracks.follow_matrix().detach().numpy().astype(np.float64)
-    object_ids = tensors["object_ids"].numpy()
-    steps = len(tracks.times)
-    still = rotations.identity(steps)
-    groups = [_Group(0, "pinned", norm.origin, still, np.zeros((steps, 3)), motion_ids == 0, np.ones(steps, bool))]
-    for body in range(1, tracks.bodies):
-        members = motion_ids == body
-        seen = observed[body - 1]
-        groups.append(
-            _Group(int(object_ids[body]), "body", centers[body], quats[body], displacements[body], members, seen)
-        )
-    for row, caster in enumerate(tracks.casters.numpy()):
-        followed = displacements[caster] @ follow.T
-        members = motion_ids == tracks.bodies + row
-        owner = int(object_ids[caster])
-        groups.append(
-            _Group(owner, "shadow", centers[caster], still, followed, members, observed[caster - 1], int(caster))
-        )
-    return groups
+def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+    """Poses about the pivot relative to the bind state, exactly the identity at the last knot. [S, 7]
+
+    Args:
+        quats: Rotations about ``center``, wxyz. [S, 4]
+        path: Displacements of ``center``, world. [S, 3]
+        center: The canonical centre, world. [3]
+        pivot: The pivot in the bind state, world. [3]
+    """
+    relative = rotations.multiply(quats, rotations.conjugate(quats[-1]))
+    relative = rotations.make_continuous(rotations.normalize(relative))
+    shift = center + path + rotations.rotate(relative, pivot - center - path[-1]) - pivot
+    relative[-1], shift[-1] = [1.0, 0, 0, 0], 0.0
+    return np.concatenate([relative, shift], axis=1)
+
+
+def _radius(means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> float:
+    """Distance from the pivot that holds nine of ten members that can be seen."""
+    if len(means) == 0:
+        return 1.0
+    return max(float(np.quantile(np.linalg.norm(means - pivot, axis=1)[_voters(opacities)], 0.9)), 1e-9)
+
+
+def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> int:
+    """Row of the member nearest to the pivot among those that can be seen, -1 without members."""
+    if len(rows) == 0:
+        return -1
+    distance = np.where(_voters(opacities), np.linalg.norm(means - pivot, axis=1), np.inf)
+    return int(rows[np.argmin(distance)])
+
+
+def _voters(opacities: np.ndarray) -> np.ndarray:
+    """Members that say where a group is: those that can be seen, or all where none can. [N] bool"""
+    seen = opacities > 0.3
+    return seen if seen.any() else np.ones(len(opacities), bool)
 
 
 def _motion_group(
     index: int,
-    group: _Group,
-    tensors: dict[str, Any],
+    group: representation.GroupTrack,
+    times: np.ndarray,
+    poses: np.ndarray,
     pivot: np.ndarray,
-    relative: np.ndarray,
-    shift: np.ndarray,
-    means: np.ndarray,
-    opacities: np.ndarray,
+    radius: float,
+    anchor: int,
 ) -> MotionGroup:
-    distance = np.linalg.norm(means - pivot, axis=1)
-    voters = opacities > 0.3 if (opacities > 0.3).any() else np.ones(len(opacities), bool)
-    anchor = int(np.argmin(np.where(voters, distance, np.inf))) if len(means) else -1
-    radius = float(np.quantile(distance[voters], 0.9)) if len(means) else 1.0
-    radius = max(radius, 1e-9)
-    if group.role == "pinned":
-        return MotionGroup(index, 0, "pinned", anchor, pivot, MotionModel(radius=radius))
-    if group.role == "shadow":
-        follow = tracks_of(tensors).follow_matrix().detach().numpy().astype(np.float64)
-        return MotionGroup(
-            index, group.object_id, "shadow", anchor, pivot, MotionModel(radius=radius), group.caster, follow
-        )
-    times = tensors["tracks.times"].numpy().astype(np.float64)
-    fit = fitting.fit(times, relative, shift, radius=radius, weights=group.observed.astype(np.float64))
-    return MotionGroup(index, group.object_id, "body", anchor, pivot, fit.model)
+    """A row of the scene's table of groups. Tracks move their members rigidly, so that no residual is left."""
+    if group.role == "body" and np.any(poses[:, 1:] != 0):
+        fit = fitting.fit(times, poses[:, :4], poses[:, 4:], radius=radius, weights=group.observed.astype(np.float64))
+        model = fit.model
+    else:
+        model = MotionModel(radius=radius)
+    return MotionGroup(index, group.object_id, group.role, anchor, pivot, model, group.follows, group.follow_matrix)
+
+
+def _unit(vector: np.ndarray) -> tuple[np.ndarray, float]:
+    """Direction and length of a vector; along z where it has no length."""
+    length = float(np.linalg.norm(vector))
+    return (vector / length, length) if length > 1e-12 else (np.array([0.0, 0, 1]), 0.0)
 
 
 def _bind_shading(

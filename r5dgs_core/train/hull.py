@@ -50,7 +50,7 @@ def carve(
         if view.mask is None:
             continue
         columns, rows, valid = pixel_indices(view, points)
-        ids = np.where(valid, view.mask[rows, columns], -1)
+        ids = np.where(valid, view.mask[rows, columns].astype(np.int64), -1)
         here = ids == object_id
         inside += here
         outside += ids == 0

@@ -22,6 +22,8 @@ from .views import TrainView
 
 log = logging.getLogger(__name__)
 
+SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
+
 
 @dataclass(frozen=True)
 class Start:
@@ -197,14 +199,14 @@ def _first_time(places: triangulation.Places, count: int) -> int:
     """The time at which most objects are well seen; of equal ones the middle one, so that drift is least."""
     if len(places.object_ids) == 0:
         return 0
-    total = np.where(places.measured, places.visibility, 0.0).sum(0)
+    total = np.where(places.measured, places.visibility + SEEN_AT_ALL, 0.0).sum(0)
     good = np.flatnonzero(total >= 0.9 * total.max())
     return int(good[np.argmin(np.abs(good - (count - 1) / 2))])
 
 
 def _reference_time(visibility: np.ndarray, measured: np.ndarray, first: int) -> int:
     """The well-seen time of an object that is nearest to the first one."""
-    score = np.where(measured, visibility, 0.0)
+    score = np.where(measured, visibility + SEEN_AT_ALL, 0.0)
     good = np.flatnonzero(score >= 0.75 * score.max())
     return int(good[np.argmin(np.abs(good - first))])
 

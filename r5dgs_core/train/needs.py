@@ -7,13 +7,25 @@ from typing import Any
 
 import numpy as np
 
+from ..motion import rotations
 from ..scene.scene import MotionGroup
-from .config import Config
 
+STILL_QUAT = rotations.identity()
 STILL = 0.0025  # displacement over the observed time, as a share of the group's diameter, below which it is static
 TURN = 0.002  # rotation in radians over the observed time below which a group only slides
 SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
 SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
+
+
+def is_still(poses: np.ndarray, radius: float) -> bool:
+    """Whether a group neither travels nor turns over the observed time. poses [S, 7] relative to the bind state."""
+    travel = np.linalg.norm(poses[:, 4:], axis=1).max() / (2 * radius)
+    return bool(travel <= STILL and rotations.angle_between(poses[:, :4], STILL_QUAT).max() <= TURN)
+
+
+def is_on(table: Sequence[dict[str, Any]], name: str) -> bool:
+    """Decision of a row of the table."""
+    return next(row["decision"] == "on" for row in table if row["name"] == name)
 
 
 def decide(
@@ -24,7 +36,7 @@ def decide(
     light: np.ndarray,
     background_sh: np.ndarray,
     bases: int,
-    config: Config,
+    classified: bool,
 ) -> tuple[dict[str, Any], ...]:
     """The needs table of a baked scene.
 
@@ -36,28 +48,26 @@ def decide(
         light: Light direction. [3]
         background_sh: Sky coefficients that were kept. [Kb, 3]
         bases: Spherical harmonics bases of the colours.
-        config: Configuration of the run.
+        classified: Whether identities and their classifier were trained.
 
     Returns:
         Rows with name, value, threshold, decision ("on" or "off") and reason.
     """
     bodies = [g for g in groups if g.role == "body"]
     travel = [float(np.linalg.norm(track_poses[g.id][:, 4:], axis=1).max()) / (2 * g.model.radius) for g in bodies]
-    turns = [
-        float(2 * np.arcsin(np.clip(np.linalg.norm(track_poses[g.id][:, 1:4], axis=1).max(), 0, 1))) for g in bodies
-    ]
+    turns = [float(rotations.angle_between(track_poses[g.id][:, :4], STILL_QUAT).max()) for g in bodies]
     largest_travel, largest_turn = max(travel, default=0.0), max(turns, default=0.0)
-    moving = sum(a > STILL or b > TURN for a, b in zip(travel, turns, strict=True))
+    moving = sum(not is_still(track_poses[g.id], g.model.radius) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
     rows = [
         ("tracks", largest_travel, STILL, moving > 0, f"{moving} of {len(bodies)} objects move or turn"),
         ("rotation", largest_turn, TURN, largest_turn > TURN, "largest turn in the observed time, rad"),
-        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL and config.train.shading, "largest change of colour"),
+        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, "largest change of colour"),
         ("shadows", shadow_members, 1, shadow_members > 0, "Gaussians that follow a caster on its support"),
         ("view_dependent_colour", bases, 2, bases > 1, "spherical harmonics bases"),
         ("sky_gradient", len(background_sh), 2, len(background_sh) > 1, "spherical harmonics bases of the sky"),
-        ("classifier", len(bodies), 1, len(bodies) > 0 and config.identity.iterations > 0, "objects with masks"),
+        ("classifier", len(bodies), 1, classified, "objects with masks"),
     ]
     return tuple(
         {

@@ -7,21 +7,59 @@ same face.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import CheckpointError
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
 from ..motion import rotations
 from ..scene.cameras import Camera
-from . import posing, triangulation
+from . import initialization, posing, triangulation
 from .config import Config
 
 ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
 REBASE_EVERY = 100
+
+
+@dataclass(frozen=True)
+class GroupTrack:
+    """One motion group over the knots, in training coordinates: x -> c + R (x - c) + d from the canonical state.
+
+    Attributes:
+        object_id: Object that it belongs to; a shadow's caster.
+        role: "pinned", "body" or "shadow".
+        center: The fixed centre c. [3]
+        quats: Rotations at the knots, unit wxyz. [S, 4]
+        displacements: Displacements at the knots. [S, 3]
+        observed: Knots at which the object was seen well enough to be placed. [S] bool
+        follows: Group whose displacement it takes through ``follow_matrix``, or None.
+        follow_matrix: That map. [3, 3]
+    """
+
+    object_id: int
+    role: str
+    center: np.ndarray
+    quats: np.ndarray
+    displacements: np.ndarray
+    observed: np.ndarray
+    follows: int | None = None
+    follow_matrix: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class ObservedMotion:
+    """What a trained representation hands to baking: knots [S], groups by id, and the light of the shading [3]."""
+
+    times: np.ndarray
+    groups: tuple[GroupTrack, ...]
+    light: np.ndarray
 
 
 class Representation(Protocol):
@@ -60,6 +98,17 @@ class Representation(Protocol):
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
+        ...
+
+    @staticmethod
+    def observed_motion(tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray) -> ObservedMotion:
+        """Motion groups out of a checkpoint's `tensors`.
+
+        Args:
+            tensors: By name, as stored.
+            object_ids: Object id of each class, 0 first. [B]
+            observed: Knots at which each object was placed by its masks. [B - 1, S] bool
+        """
         ...
 
 
@@ -156,6 +205,70 @@ class TracksRepresentation:
         """Go on from `tensors`."""
         self.tracks = tracks_of(tensors)
         self.light = tensors["light"].clone().requires_grad_(True)
+
+    @staticmethod
+    def observed_motion(tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray) -> ObservedMotion:
+        """See `Representation.observed_motion`: the pinned group, one body per object, then the shadows."""
+        tracks = tracks_of(tensors)
+        quats = tracks.knot_quats().detach().numpy().astype(np.float64)
+        displacements = tracks.params["translations"].detach().numpy().astype(np.float64)
+        centers = tracks.centers.numpy().astype(np.float64)
+        follow = tracks.follow_matrix().detach().numpy().astype(np.float64)
+        still, nowhere = rotations.identity(len(tracks.times)), np.zeros((len(tracks.times), 3))
+        groups = [GroupTrack(0, "pinned", centers[0], still, nowhere, np.ones(len(tracks.times), bool))]
+        for body in range(1, tracks.bodies):
+            groups.append(
+                GroupTrack(
+                    int(object_ids[body]),
+                    "body",
+                    centers[body],
+                    quats[body],
+                    displacements[body],
+                    observed[body - 1],
+                )
+            )
+        for caster in tracks.casters.tolist():
+            groups.append(
+                GroupTrack(
+                    int(object_ids[caster]),
+                    "shadow",
+                    centers[caster],
+                    still,
+                    displacements[caster] @ follow.T,
+                    observed[caster - 1],
+                    caster,
+                    follow,
+                )
+            )
+        return ObservedMotion(tracks.times, tuple(groups), tensors["light"].numpy().astype(np.float64))
+
+
+REPRESENTATIONS: dict[str, type[TracksRepresentation]] = {TracksRepresentation.name: TracksRepresentation}
+
+
+def make(start: initialization.Start, config: Config) -> Representation:
+    """The representation that the configuration asks for, at the start of training."""
+    return REPRESENTATIONS[config.train.representation](start.tracks, start.places, config)
+
+
+def observed_motion(
+    name: str, tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray
+) -> ObservedMotion:
+    """Motion groups out of a checkpoint of the representation ``name``.
+
+    Raises:
+        CheckpointError: This version has no such representation.
+    """
+    if name not in REPRESENTATIONS:
+        known = ", ".join(REPRESENTATIONS)
+        raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
+    return REPRESENTATIONS[name].observed_motion(tensors, object_ids, observed)
+
+
+def group_classes(groups: Sequence[GroupTrack], object_ids: np.ndarray) -> np.ndarray:
+    """Class that a group's Gaussians have where no mask says otherwise: a body's object, else the background. [G]"""
+    row = {int(object_id): k for k, object_id in enumerate(object_ids)}
+    return np.array([row[g.object_id] if g.role == "body" else 0 for g in groups], np.int64)
 
 
 def tracks_of(tensors: dict[str, Tensor]) -> Tracks:

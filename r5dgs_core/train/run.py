@@ -14,7 +14,7 @@ import torch
 
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted
-from . import checkpoint, identity
+from . import checkpoint, identity, representation
 from .config import Config
 from .posing import Splats
 from .trainer import Trainer
@@ -124,9 +124,9 @@ def _trim_log(path: Path, iteration: int) -> None:
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
     """Labels and identity encodings on the finished geometry, then the last checkpoint."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
-    g = trainer.gaussians
-    bodies = len(trainer.object_ids)
-    fallback = torch.where(g.motion_ids < bodies, g.motion_ids, 0)
+    motion = trainer.motion.observed_motion(trainer.motion.tensors(), trainer.object_ids, trainer.places.measured)
+    group_classes = representation.group_classes(motion.groups, trainer.object_ids)
+    fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
     extra: dict[str, torch.Tensor] = {"labels": fallback}
     if any(v.mask is not None for v in trainer.views):
 

@@ -24,6 +24,7 @@ from .views import TrainView
 
 MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
+MAX_FRAMES = 31  # of one camera, for the median
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
 PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
@@ -43,7 +44,9 @@ class Backdrop:
 def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     """Median over time of the unmasked pixels, one per distinct camera."""
     result = []
-    for group in by_camera(views):
+    for group in by_camera(views, MAX_BACKDROPS):
+        if len(group) > MAX_FRAMES:
+            group = [group[i] for i in np.linspace(0, len(group) - 1, MAX_FRAMES).round().astype(int)]
         images = np.stack([v.image for v in group]).astype(np.float32) / 255
         free = np.stack([_free(v) for v in group])
         known = np.asarray(free.any(0))
@@ -54,14 +57,14 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     return result
 
 
-def by_camera(views: Sequence[TrainView]) -> list[list[TrainView]]:
-    """Views that share pose and lens; a spread of 24 cameras where there are more."""
+def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
+    """Views that share pose and lens; a spread of ``limit`` cameras where there are more."""
     groups: dict[bytes, list[TrainView]] = {}
     for view in views:
         groups.setdefault(camera_key(view.camera), []).append(view)
     found = list(groups.values())
-    if len(found) > MAX_BACKDROPS:
-        found = [found[i] for i in np.linspace(0, len(found) - 1, MAX_BACKDROPS).round().astype(int)]
+    if len(found) > limit:
+        found = [found[i] for i in np.linspace(0, len(found) - 1, limit).round().astype(int)]
     return found
 
 

@@ -16,19 +16,19 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset
-from ..errors import TrainingError
+from ..errors import CheckpointError, DatasetError, TrainingError
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, normalization, posing, sweep, views
+from . import densification, initialization, losses, normalization, posing, representation, sweep, views
 from .config import Config
-from .representation import Representation, TracksRepresentation
 
 log = logging.getLogger(__name__)
 
 TARGET_BYTES = 1 << 30
+FLOATER_CAMERAS = 256  # cameras that are asked whether they see what floats before another
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits")
 
@@ -52,8 +52,13 @@ class Trainer:
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
         start = initialization.start(self.views, config, behind is None, np.random.default_rng(config.train.seed))
+        if len(start.gaussians) == 0:
+            raise DatasetError(
+                f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
+                "camera alone or is all sky. Remedy: give masks, or more cameras"
+            )
         self.gaussians: Gaussians = start.gaussians
-        self.motion: Representation = TracksRepresentation(start.tracks, start.places, config)
+        self.motion = representation.make(start, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
@@ -73,7 +78,7 @@ class Trainer:
         self._pixel_size = normalization.TARGET_DISTANCE / focal
         width = float(np.median([v.camera.width for v in self.views]))
         self._width_limit = config.densify.prune_width * width * self._pixel_size
-        self._eyes = [group[0].camera for group in sweep.by_camera(self.views)]
+        self._eyes = [group[0].camera for group in sweep.by_camera(self.views, FLOATER_CAMERAS)]
         self.cap = config.densify.max_gaussians or int(min(60000, 0.75 * np.median(sizes)))
         self.optimizer = self._make_optimizer()
         self.gradients = densification.ScreenGradients(len(self.gaussians))
@@ -271,6 +276,11 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
+        if state["representation"] != self.motion.name:
+            raise CheckpointError(
+                f"the checkpoint was trained with representation '{state['representation']}', "
+                f"the configuration asks for '{self.motion.name}'"
+            )
         tensors = {name: tensor.clone() for name, tensor in state["tensors"].items()}  # training changes them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])

@@ -7,7 +7,8 @@ import torch
 from hypothesis import strategies as st
 
 from r5dgs_core.model.tracks import Tracks
-from r5dgs_core.motion import rotations
+from r5dgs_core.motion import keyframes, rotations
+from r5dgs_core.scene import playback
 
 TIMES = np.array([0.0, 0.1, 0.25, 0.3, 0.7])
 
@@ -97,14 +98,23 @@ def test_the_sign_of_a_knots_quaternion_does_not_matter():
         torch.testing.assert_close(tracks.poses(t).rotmats, other.poses(t).rotmats, atol=1e-6, rtol=0)
 
 
-def test_halfway_between_knots_lies_the_middle_pose():
+@pytest.mark.parametrize("t", [0.03, 0.1001, 0.17, 0.26, 0.5, 0.69])
+def test_between_knots_tracks_follow_the_curve_of_playback(t):
     tracks = random_tracks()
-    poses = [tracks.poses(t) for t in (0.3, 0.5, 0.7)]
-    torch.testing.assert_close(poses[1].displacements, (poses[0].displacements + poses[2].displacements) / 2)
-    first, half, last = (p.quats[1] for p in poses)
-    there = rotations.multiply(half, rotations.conjugate(first))
-    back = rotations.multiply(last, rotations.conjugate(half))
-    torch.testing.assert_close(rotations.quats_to_rotmats(there), rotations.quats_to_rotmats(back), atol=1e-5, rtol=0)
+    values = np.concatenate(
+        [
+            rotations.make_continuous(tracks.knot_quats()[1].detach().numpy().astype(np.float64)),
+            tracks.params["translations"][1].detach().numpy().astype(np.float64),
+        ],
+        axis=1,
+    )
+    k = int(np.searchsorted(TIMES, t)) - 1
+    rates, h = playback.slopes(TIMES, values), TIMES[k + 1] - TIMES[k]
+    expected = keyframes.hermite(values[k], values[k + 1], rates[k], rates[k + 1], h, (t - TIMES[k]) / h)
+    poses = tracks.poses(t)
+    np.testing.assert_allclose(poses.displacements[1].detach().numpy(), expected[4:], atol=1e-5)
+    rotmat = rotations.quats_to_rotmats(rotations.normalize(expected[:4]))
+    np.testing.assert_allclose(poses.rotmats[1].detach().numpy(), rotmat, atol=1e-5)
 
 
 def test_a_shadow_follows_its_caster_linearly_and_does_not_turn():
