@@ -137,7 +137,7 @@ def make_scene(
         shading=(0.2 * rng.normal(size=(n, 3))).astype(np.float32) if shading else None,
         light_direction=light / np.linalg.norm(light) if shading else None,
         provenance={"generator": "tests/scenes.py", "seed": seed},
-        needs=({"name": "motion", "value": 0.5, "threshold": 0.01, "decision": "on", "reason": "bodies move"},),
+        needs=({"name": "tracks", "value": 0.5, "threshold": 0.01, "decision": "on", "reason": "bodies move"},),
     )
 
 
