@@ -25,25 +25,59 @@ def relative_to(path: str, blend_path: str) -> str:
         return path
 
 
+_open_file: list[tuple[str, dict[int, str]]] = []  # before saving: the open .blend, and the paths in it by session_uid
+
+
 @persistent
 def _relink_before_save(target, *_):
     """Turn the stored paths so that they hold from where the .blend is about to lie."""
     target = target if isinstance(target, str) and target else bpy.data.filepath
+    _open_file.clear()
     if not target:
         return
-    for collection in bpy.data.collections:
-        if collection.r5dgs.is_scene and collection.library is None:
-            found = Path(bpy.path.abspath(collection.r5dgs.filepath))
-            if found.is_file():
-                collection.r5dgs.filepath = relative_to(str(found.resolve()), target)
+    scenes = _own_scenes()
+    _open_file.append((bpy.data.filepath, {scene.session_uid: scene.r5dgs.filepath for scene in scenes}))
+    for collection in scenes:
+        found = Path(bpy.path.abspath(collection.r5dgs.filepath))
+        if found.is_file():
+            collection.r5dgs.filepath = relative_to(str(found.resolve()), target)
+
+
+@persistent
+def _restore_after_save(target, *_):
+    """Where the open .blend is still another file (*Save Copy*, a failed save), turn its paths back."""
+    if not _open_file:
+        return
+    open_file, paths = _open_file.pop()
+    if bpy.data.filepath != open_file or target == open_file:
+        return
+    for collection in _own_scenes():
+        stored = paths.get(collection.session_uid)
+        if stored is not None:
+            collection.r5dgs.filepath = stored
+
+
+def _own_scenes() -> list[bpy.types.Collection]:
+    return [c for c in bpy.data.collections if c.r5dgs.is_scene and c.library is None]
+
+
+def _hooks():
+    handlers = bpy.app.handlers
+    return (
+        (handlers.save_pre, _relink_before_save),
+        (handlers.save_post, _restore_after_save),
+        (handlers.save_post_fail, _restore_after_save),
+    )
 
 
 def register():
     """Listen to saving."""
-    bpy.app.handlers.save_pre.append(_relink_before_save)
+    for events, handler in _hooks():
+        events.append(handler)
 
 
 def unregister():
     """Undo `register`."""
-    if _relink_before_save in bpy.app.handlers.save_pre:
-        bpy.app.handlers.save_pre.remove(_relink_before_save)
+    for events, handler in _hooks():
+        if handler in events:
+            events.remove(handler)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -218,6 +219,34 @@ def test_saving_reloading_and_scrubbing_keeps_everything(blender, scene_path, tm
     assert_plays_like_the_core(blender, collection, scene, TIMES)
     assert collection.r5dgs.filepath == "//../synthetic.r5dgs"
     assert collection.r5dgs.table["mug"].aliases == "cup"
+
+
+def open_path(bpy):
+    collection = next(c for c in bpy.data.collections if c.r5dgs.is_scene)
+    return Path(bpy.path.abspath(collection.r5dgs.filepath))
+
+
+def test_a_saved_copy_and_the_open_file_both_find_the_scene(blender, scene_path, tmp_path):
+    load(blender, scene_path)
+    near, far = tmp_path / "near.blend", tmp_path / "deep" / "er" / "copy.blend"
+    far.parent.mkdir(parents=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(far), copy=True)  # from a file that was never saved
+    assert open_path(blender) == scene_path
+    blender.ops.wm.save_as_mainfile(filepath=str(near))
+    blender.ops.wm.save_as_mainfile(filepath=str(far), copy=True)
+    assert open_path(blender) == scene_path
+    blender.ops.wm.save_mainfile()
+    for blend in (near, far):
+        blender.ops.wm.open_mainfile(filepath=str(blend))
+        assert open_path(blender).resolve() == scene_path.resolve(), blend
+
+
+def test_a_save_that_failed_changes_no_path(blender, scene_path, tmp_path):
+    collection = load(blender, scene_path)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "open.blend"))
+    with pytest.raises(RuntimeError):
+        blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "absent" / "open.blend"))
+    assert collection.r5dgs.filepath == "//synthetic.r5dgs"
 
 
 def test_one_undo_takes_back_the_whole_scene_and_redo_brings_it(blender, scene_path):
