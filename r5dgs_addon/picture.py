@@ -131,9 +131,9 @@ def _camera(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, scene_wo
             "Perspective"
         )
     render_settings = scene.render
-    share = render_settings.resolution_percentage / 100
-    width = max(int(render_settings.resolution_x * share), 1)
-    height = max(int(render_settings.resolution_y * share), 1)
+    # Whole numbers, as Blender does it: 100 * (29 / 100) is less than 29 in floating point.
+    width = max(render_settings.resolution_x * render_settings.resolution_percentage // 100, 1)
+    height = max(render_settings.resolution_y * render_settings.resolution_percentage // 100, 1)
     evaluated = camera.evaluated_get(depsgraph)
     projection = evaluated.calc_matrix_camera(
         depsgraph,

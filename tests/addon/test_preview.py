@@ -169,6 +169,21 @@ def test_the_camera_projects_as_blenders_own(blender, loaded, fit, size):
         assert z == pytest.approx(distance, abs=1e-4)
 
 
+def test_the_picture_has_the_size_that_blender_renders(blender, loaded, tmp_path):
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    render = blender.context.scene.render
+    render.engine = "CYCLES"
+    blender.context.scene.cycles.samples = 1
+    render.filepath = str(tmp_path / "rendered.png")
+    for size in [(100, 100, 29), (100, 50, 57), (33, 77, 29), (64, 48, 100)]:
+        render.resolution_x, render.resolution_y, render.resolution_percentage = size
+        blender.ops.render.render(write_still=True)
+        rendered = blender.data.images.load(render.filepath)
+        seen = picture.shown(blender.context, loaded).camera
+        assert (seen.width, seen.height) == tuple(rendered.size), size
+        blender.data.images.remove(rendered)
+
+
 def test_pixel_aspect_is_part_of_the_camera(blender, loaded):
     picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
     square = picture.shown(blender.context, loaded).camera.intrinsics
