@@ -41,7 +41,7 @@ def fit(
     distance = np.zeros(len(directions))
     for _ in range(ROUNDS):
         # A little damping keeps bands that the rays do not reach at zero.
-        system = basis[inliers].T @ basis[inliers] + 1e-3 * inliers.sum() * np.diag(_damping())
+        system = basis[inliers].T @ basis[inliers] + 1e-5 * inliers.sum() * np.diag(_damping())
         coefficients = np.linalg.solve(system, basis[inliers].T @ (colors[inliers] - 0.5))
         distance = np.abs(basis @ coefficients + 0.5 - colors).max(1)
         inliers = candidates & (distance < 2 * AGREES)

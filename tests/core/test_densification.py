@@ -1,11 +1,13 @@
 """Densification: grows where the image asks, within its cap, and removes what nobody sees."""
 
+import numpy as np
 import pytest
 import torch
 
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.train import densification
 from r5dgs_core.train.config import DensifySection
+from tests import scenes
 
 PIXEL = 0.05
 SECTION = DensifySection(share=0.25, split_pixels=1.0, prune_opacity=0.01)
@@ -33,7 +35,7 @@ def gradients(values):
 
 def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=10.0, seed=0):
     densification.densify(
-        gaussians, optimizer, found, section, cap, PIXEL, width_limit, torch.Generator().manual_seed(seed)
+        gaussians, optimizer, found, section, cap, PIXEL, width_limit, [], torch.Generator().manual_seed(seed)
     )
 
 
@@ -112,3 +114,21 @@ def test_the_same_draws_give_the_same_gaussians():
         densify(gaussians, optimizer, gradients(torch.linspace(0.1, 1, 40)), seed=5)
         results.append(gaussians.means.detach())
     assert torch.equal(*results)
+
+
+def test_background_close_before_a_camera_that_no_other_sees_goes():
+    eyes = [scenes.orbit_camera(angle, 48, 36) for angle in (0.0, 1.5, 3.0)]
+    before_first = torch.tensor(eyes[0].center + 0.5 * eyes[0].forward).float()
+    middle = torch.tensor(eyes[0].center + np.linalg.norm(eyes[0].center) * eyes[0].forward).float()
+    gaussians, _ = make(n=4)
+    with torch.no_grad():
+        gaussians.means.copy_(torch.stack([before_first, before_first, middle, -50 * before_first]))
+    gaussians.motion_ids = torch.tensor([0, 1, 0, 0])  # the second belongs to a body
+    assert densification.floaters(gaussians, eyes, 1.0).tolist() == [True, False, False, False]
+    assert not densification.floaters(gaussians, eyes[:2], 1.0).any()  # no second opinion
+
+
+def test_nothing_grows_under_the_gradient_of_the_configuration():
+    gaussians, optimizer = make()
+    densify(gaussians, optimizer, gradients(torch.full((40,), 0.9 * SECTION.gradient)))
+    assert len(gaussians) == 40

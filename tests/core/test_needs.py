@@ -7,12 +7,11 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup
 from r5dgs_core.train import needs
-from r5dgs_core.train.config import Config
 
 RADIUS = 0.4
 
 
-def table(travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bodies=1, config=None):
+def table(travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bodies=1, classified=True):
     """The decisions for bodies of which the first moves by ``travel`` diameters and turns by ``turn`` radians."""
     poses = [np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1)) for _ in range(bodies + 2)]
     if bodies:
@@ -24,9 +23,7 @@ def table(travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bo
         groups.append(MotionGroup(bodies + 1, 1, "shadow", 0, np.zeros(3), MotionModel(), 1, np.eye(3)))
     ids = np.array([0] * 5 + [1] * 5 * (bodies > 0) + [bodies + 1] * 5 * shadow)
     gradients = np.full((len(ids), 3), shading)
-    rows = needs.decide(
-        groups, poses, ids, gradients, np.array([0, 0, 1.0]), np.zeros((sky, 3)), bases, config or Config()
-    )
+    rows = needs.decide(groups, poses, ids, gradients, np.array([0, 0, 1.0]), np.zeros((sky, 3)), bases, classified)
     return {row["name"]: row for row in rows}
 
 
@@ -73,15 +70,26 @@ def test_the_numbers_are_those_of_the_motion():
     assert rows["rotation"]["value"] == pytest.approx(0.7)
 
 
-def test_without_objects_there_is_nothing_to_classify():
-    found = decisions(bodies=0)
-    assert found["tracks"] == found["classifier"] == "off"
+def test_without_objects_nothing_moves():
+    assert decisions(bodies=0)["tracks"] == "off"
 
 
-def test_what_the_configuration_leaves_out_stays_out():
-    config = Config().replace(**{"train.shading": False, "identity.iterations": 0})
-    found = decisions(turn=1.0, shading=0.5, config=config)
-    assert found["shading"] == found["classifier"] == "off"
+def test_a_classifier_is_on_where_one_was_trained():
+    assert decisions(classified=False)["classifier"] == "off"
+
+
+def test_what_is_off_is_not_in_the_scene(baked):
+    found = {row["name"]: row["decision"] for row in baked.needs}
+    assert (found["shading"] == "on") == (baked.shading is not None)
+    assert (found["classifier"] == "on") == (baked.identities is not None)
+    assert (found["sky_gradient"] == "on") == (len(baked.background_sh) > 1)
+
+
+def test_a_group_that_hardly_moves_is_still():
+    poses = np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1))
+    assert needs.is_still(poses, RADIUS)
+    poses[0, 5] = 3 * needs.STILL * 2 * RADIUS
+    assert not needs.is_still(poses, RADIUS)
 
 
 def test_the_tiny_scene_is_judged_by_what_it_shows(baked):

@@ -76,7 +76,8 @@ def test_the_supporting_plane_is_the_floor_and_points_are_put_onto_it(floor):
     assert plane is not None
     normal, height = plane
     assert np.degrees(np.arccos(normal[2])) < 2 and abs(height) < 0.5 * depth_step(288)
-    points, colors = search.points(150, plane, np.random.default_rng(0))
+    placed = search.place(150, plane, False, np.random.default_rng(0))
+    points, colors = placed.points, placed.colors
     assert points.shape == colors.shape == (150, 3)
     assert np.mean(np.abs(points @ normal - height) < 1e-6) > 0.7
     assert colors.min() >= 0 and colors.max() <= 1
@@ -84,20 +85,22 @@ def test_the_supporting_plane_is_the_floor_and_points_are_put_onto_it(floor):
 
 def test_the_same_draws_give_the_same_points(floor):
     search = sweep.Sweep(sweep.backdrops(floor), 150, 48)
-    a, b = (search.points(100, None, np.random.default_rng(3))[0] for _ in range(2))
+    a, b = (search.place(100, None, False, np.random.default_rng(3)).points for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
 def test_a_constant_sky_places_nothing():
     search = sweep.Sweep(sweep.backdrops(constant_views()), 200, 48)
-    points, colors = search.points(200, None, np.random.default_rng(0))
-    assert points.shape == colors.shape == (0, 3)
+    for find_sky in (False, True):
+        placed = search.place(200, None, find_sky, np.random.default_rng(0))
+        assert placed.points.shape == placed.colors.shape == (0, 3)
+        assert (placed.sky is not None) == find_sky
 
 
 def test_without_parallax_or_neighbours_nothing_is_placed(floor):
     for seen in (floor[:1], [floor[0]] * 3):
-        points, _ = sweep.Sweep(sweep.backdrops(seen), 200, 48).points(200, None, np.random.default_rng(0))
-        assert len(points) == 0
+        placed = sweep.Sweep(sweep.backdrops(seen), 200, 48).place(200, None, True, np.random.default_rng(0))
+        assert len(placed.points) == 0
 
 
 def test_a_backdrop_is_what_lies_behind_the_objects(floor):
