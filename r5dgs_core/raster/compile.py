@@ -7,15 +7,22 @@ from several threads at once are safe, and results cannot depend on a threading 
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import logging
 import os
+import stat
 import sys
+import tempfile
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numba
+
+log = logging.getLogger(__name__)
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -26,9 +33,10 @@ def kernel(function) -> Any:
     """Compile at the first call, without the interpreter lock, and keep the machine code for the next process."""
     with _lock:
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        numba.config.CACHE_DIR = _cache_folder(before)  # type: ignore[attr-defined]
+        folder = _cache_folder(before)
+        numba.config.CACHE_DIR = folder or before  # type: ignore[attr-defined]
         try:
-            return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+            return numba.njit(nogil=True, cache=folder is not None, error_model="numpy")(function)
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
 
@@ -86,23 +94,68 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pool)
 
 
-def _cache_folder(chosen: str) -> str:
-    """Folder for machine code: under the user's choice or the user's cache, apart for each state of the kernels.
+@functools.cache
+def _cache_folder(chosen: str) -> str | None:
+    """Folder for machine code, apart for each state of the kernels; None where no place can be written.
 
     Numba looks only at the file of the compiled function, not at those of the functions it calls, hence the digest.
     """
     digest = hashlib.sha256()
-    folder = Path(__file__).parent
-    for source in sorted([*folder.glob("cpu_*.py"), folder / "lanes.py"]):
+    sources = Path(__file__).parent
+    for source in sorted([*sources.glob("cpu_*.py"), sources / "lanes.py"]):
         digest.update(source.read_bytes())
-    return str((Path(chosen) if chosen else _user_cache()) / f"r5dgs-{digest.hexdigest()[:12]}")
+    tried = []
+    for base in _bases(chosen):
+        folder = base / f"r5dgs-{digest.hexdigest()[:12]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            tried.append(f"{base} ({error.strerror})")
+            continue
+        return str(folder)
+    log.warning(
+        "rasterizer: no place to keep compiled code, so every process compiles again; tried %s; "
+        "remedy: set NUMBA_CACHE_DIR to a folder that can be written",
+        ", ".join(tried) or "none",
+    )
+    return None
 
 
-def _user_cache() -> Path:
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+def _bases(chosen: str) -> Iterator[Path]:
+    """Places for machine code, best first: the user's choice, the user's cache, an own temporary folder."""
+    if chosen:
+        yield Path(chosen)
+    user_cache = _user_cache()
+    if user_cache is not None:
+        yield user_cache
+    temporary = _own_temporary()
+    if temporary is not None:
+        yield temporary
+
+
+def _user_cache() -> Path | None:
+    try:
+        if sys.platform == "win32":
+            base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+        elif sys.platform == "darwin":
+            base = Path.home() / "Library" / "Caches"
+        else:
+            base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:  # no HOME, and the user is in no table
+        return None
     return Path(base) / "r5dgs" / "numba"
+
+
+def _own_temporary() -> Path | None:
+    """A folder of this user alone: machine code that others could replace is not loaded."""
+    try:
+        if not hasattr(os, "getuid"):  # Windows: the temporary folder is the user's
+            return Path(tempfile.gettempdir()) / "r5dgs"
+        folder = Path(tempfile.gettempdir()) / f"r5dgs-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    own = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return folder if own else None

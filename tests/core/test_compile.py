@@ -1,0 +1,104 @@
+"""Where compiled kernels are kept."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("numba")
+
+from r5dgs_core.raster import compile as compilation  # noqa: E402
+
+TOY = """
+from r5dgs_core.raster.compile import kernel
+
+@kernel
+def double(x):
+    return 2 * x
+
+print(double(21), sum(double.stats.cache_hits.values()), sum(double.stats.cache_misses.values()))
+"""
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    compilation._cache_folder.cache_clear()
+    yield
+    compilation._cache_folder.cache_clear()
+
+
+def blocked(tmp_path: Path) -> Path:
+    """A place in which nobody, root included, can make a folder."""
+    path = tmp_path / "a file"
+    path.write_text("")
+    return path
+
+
+def run_toy(tmp_path, **environment):
+    (tmp_path / "toy.py").write_text(TOY)
+    kept = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "TMPDIR")}
+    root = str(Path(__file__).resolve().parents[2])
+    return subprocess.run(
+        [sys.executable, "toy.py"],
+        cwd=tmp_path,
+        env={**kept, "PYTHONPATH": root, **{k: str(v) for k, v in environment.items()}},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the other systems' user caches follow other variables")
+def test_a_home_that_cannot_be_written_moves_the_cache_to_an_own_temporary_folder(tmp_path):
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    first, second = (run_toy(tmp_path, HOME=blocked(tmp_path), TMPDIR=temporary).stdout.split() for _ in range(2))
+    assert first == ["42", "0", "1"] and second == ["42", "1", "0"]  # compiled by one process, found by the next
+    (folder,) = temporary.iterdir()
+    assert folder.name == f"r5dgs-{os.getuid()}" and folder.stat().st_mode & 0o077 == 0
+
+
+def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(compilation, "_user_cache", lambda: tmp_path / "user")
+    assert Path(compilation._cache_folder("")).parent == tmp_path / "user"
+    assert Path(compilation._cache_folder(str(tmp_path / "chosen"))).parent == tmp_path / "chosen"
+    assert Path(compilation._cache_folder(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
+@pytest.mark.parametrize("kind", ["writable by others", "a link", "a file"])
+def test_a_temporary_folder_that_others_could_fill_is_not_used(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(compilation.tempfile, "gettempdir", lambda: str(tmp_path))
+    folder = tmp_path / f"r5dgs-{os.getuid()}"
+    if kind == "a link":
+        (tmp_path / "elsewhere").mkdir()
+        folder.symlink_to(tmp_path / "elsewhere")
+    elif kind == "a file":
+        folder.write_text("")
+    else:
+        folder.mkdir()
+        folder.chmod(0o777)
+    assert compilation._own_temporary() is None
+
+
+def test_without_any_place_nothing_is_kept_and_one_line_says_so(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(compilation, "_user_cache", lambda: blocked(tmp_path))
+    monkeypatch.setattr(compilation, "_own_temporary", lambda: None)
+    with caplog.at_level("WARNING"):
+        kernels = [compilation.kernel(function) for function in (lambda x: 2 * x, lambda x: 3 * x)]
+    assert [kernel(21) for kernel in kernels] == [42, 63]
+    assert len(caplog.records) == 1 and "NUMBA_CACHE_DIR" in caplog.text and "a file" in caplog.text
+
+
+def test_no_home_is_no_error(tmp_path, monkeypatch):
+    def unknown():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setattr(compilation.Path, "home", staticmethod(unknown))
+    monkeypatch.setattr(compilation.tempfile, "gettempdir", lambda: str(tmp_path))
+    assert compilation._user_cache() is None
+    assert Path(compilation._cache_folder("")).is_relative_to(tmp_path)
