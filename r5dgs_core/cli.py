@@ -52,7 +52,7 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
 
     from .data import dataset as datasets
     from .report import evaluate, table
-    from .scene import playback, scene_file
+    from .scene import files, playback, scene_file
     from .train import bake, checkpoint
 
     for mode in modes:
@@ -73,7 +73,7 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
         default = target.with_suffix(".evaluation.json")
     result = evaluate.evaluate(scene, dataset, modes=modes, train=scene.provenance.get("train"))
     path = json_path or default
-    checkpoint.write_atomic(path, json.dumps(result, indent=2).encode())
+    files.write(path, json.dumps(result, indent=2).encode())
     Console().print(table.make(result))
     print(f"written: {path}")
     return result

@@ -40,8 +40,8 @@ def run_demo(
     from .data import dataset as datasets
     from .progress import make
     from .report import contact_sheet, evaluate, table
-    from .scene import scene_file
-    from .train import bake, checkpoint, config, run
+    from .scene import files, scene_file
+    from .train import bake, config, run
 
     began = time.monotonic()
     data = bundled_data()
@@ -52,7 +52,7 @@ def run_demo(
     scene = bake.bake(trained, dataset)
     scene_path = scene_file.write(scene, out / "demo.r5dgs")
     result = evaluate.evaluate(scene, dataset, train=scene.provenance["train"])
-    checkpoint.write_atomic(out / "evaluation.json", json.dumps(result, indent=2).encode())
+    files.write(out / "evaluation.json", json.dumps(result, indent=2).encode())
     sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")
     if progress_kind != "json":
         Console().print(table.make(result))

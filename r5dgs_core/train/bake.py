@@ -11,7 +11,6 @@ from __future__ import annotations
 import colorsys
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,13 +42,13 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     """
     dataset = dataset if dataset is not None else datasets.read(run.dataset_root)
     state = checkpoint.load(run.folder)
-    tensors: dict[str, Any] = state["tensors"]
-    norm = Normalization(np.array(state["origin"]), state["scale"])
+    tensors = state.tensors
+    norm = Normalization(np.array(state.origin), state.scale)
     g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}
     if not all(np.isfinite(a).all() for a in g.values()):
         raise CheckpointError(f"{run.folder}: the checkpoint holds values that are not finite; train again")
     present = tensors["object_ids"].numpy()
-    motion = representation.observed_motion(state["representation"], tensors, present, state["observed"].numpy())
+    motion = representation.observed_motion(state.representation, tensors, present, state.observed.numpy())
     light, strength = _unit(motion.light)
     motion_ids = g["motion_ids"].astype(np.int32)
     if "labels" in tensors:
@@ -120,10 +119,10 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
             "dataset_digest": run.digest,
             "versions": run.versions,
             "train": {
-                "seconds": state["seconds"],
-                "iterations": state["iteration"],
+                "seconds": state.seconds,
+                "iterations": state.iteration,
                 "gaussians": len(means),
-                "finished": state["finished"],
+                "finished": state.finished,
             },
         },
         needs=decisions,

@@ -6,19 +6,24 @@ A run folder holds ``run.json`` (configuration, data set, versions), ``checkpoin
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
-import os
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from .. import __version__
 from ..data.dataset import Dataset
 from ..errors import CheckpointError
+from ..model.gaussians import PARAMETERS
+from ..scene import files
 from . import config as configs
 from .config import Config
 
@@ -43,6 +48,42 @@ class Run:
     digest: str
     config: Config
     versions: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that the next step and `bake` depend on.
+
+    Attributes:
+        tensors: By name: ``gaussians.NAME`` of N Gaussians, ``object_ids`` [B] (0 first), ``background`` [Kb, 3], those
+            of the representation, of the optimizer (``adam.NAME.MOMENT``), of the growth (``gradients.NAME``), the
+            state of the ``generator``; of a finished run also ``labels`` [N] and, where there are masks, ``identities``
+            [N, 16] with ``classifier.weight`` and ``classifier.bias``.
+        representation: Name of the representation, as in the configuration.
+        iteration: Steps taken.
+        entered: First and last observed time that take part, as indices.
+        first_time: Index of the time that training began with.
+        queue: Views that are still to be drawn, the next one last.
+        running_loss: Smoothed loss, nan before the first step.
+        origin: World point that is the origin of training coordinates. [3]
+        scale: World units per unit of training coordinates.
+        observed: Times at which each object was placed by its masks. [B - 1, S] bool
+        finished: Whether labels and identities are made too.
+        seconds: Wall time of all sittings together.
+    """
+
+    tensors: dict[str, Tensor]
+    representation: str
+    iteration: int
+    entered: tuple[int, int]
+    first_time: int
+    queue: tuple[int, ...]
+    running_loss: float
+    origin: tuple[float, float, float]
+    scale: float
+    observed: Tensor
+    finished: bool = False
+    seconds: float = 0.0
 
 
 def versions() -> dict[str, str]:
@@ -78,7 +119,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         "config": config.to_dict(),
         "versions": run.versions,
     }
-    write_atomic(folder / RUN_FILE, json.dumps(text, indent=2).encode())
+    files.write(folder / RUN_FILE, json.dumps(text, indent=2).encode())
     return run
 
 
@@ -107,37 +148,83 @@ def open_run(folder: Path) -> Run:
         raise CheckpointError(f"{path}: damaged ({type(error).__name__}: {error}); train again") from None
 
 
-def save(folder: Path, state: dict[str, Any]) -> None:
-    """Replace the checkpoint of a run; the old one stays until the new one is whole on the disk."""
+def save(folder: Path, state: Checkpoint) -> None:
+    """Replace the checkpoint of a run; the old one stays until the new one is whole on the disk.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
     path = Path(folder) / CHECKPOINT_FILE
-    temporary = path.with_suffix(".tmp")
-    with open(temporary, "wb") as stream:
-        torch.save({"format_version": FORMAT_VERSION, **state}, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, path)
+    content = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
+    try:
+        buffer = io.BytesIO()
+        torch.save({"format_version": FORMAT_VERSION, **content}, buffer)
+        with files.replacing(path) as stream:
+            stream.write(buffer.getbuffer())
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: cannot be written: {error}; the checkpoint before it is kept. Make room and go on with --resume"
+        ) from error
 
 
-def load(folder: Path) -> dict[str, Any]:
+def load(folder: Path) -> Checkpoint:
     """Read the checkpoint of a run.
 
     Raises:
-        CheckpointError: There is none, or it is damaged or of another version.
+        CheckpointError: There is none, or it is damaged, incomplete or of another version.
     """
     path = Path(folder) / CHECKPOINT_FILE
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no checkpoint yet; train without --resume") from None
     except Exception as error:  # torch raises many kinds for a damaged file
         raise CheckpointError(f"{path}: damaged ({type(error).__name__}); train again") from error
-    if not isinstance(state, dict) or state.get("format_version") != FORMAT_VERSION:
+    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(f"{path}: expected a checkpoint of format_version {FORMAT_VERSION}")
-    return state
+    for name, (good, expected) in _RULES.items():
+        if name not in content:
+            raise CheckpointError(f"{path}: expected '{name}', found none; train again")
+        if not good(content[name]):
+            found = type(content[name]).__name__
+            raise CheckpointError(f"{path}: '{name}': expected {expected}, found {found}; train again")
+    for name in TENSORS:
+        if name not in content["tensors"]:
+            raise CheckpointError(f"{path}: expected the tensor '{name}', found none; train again")
+    values: dict[str, Any] = {name: content[name] for name in _RULES}
+    return Checkpoint(**values)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name and rename it."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:
+    """A test for a row of numbers of some kinds, of a length if one is given."""
+    return lambda value: (
+        isinstance(value, list | tuple)
+        and (length is None or len(value) == length)
+        and all(isinstance(x, kinds) and not isinstance(x, bool) for x in value)
+    )
+
+
+def _is(kinds: type | tuple[type, ...]) -> Callable[[Any], bool]:
+    """A test for a number of some kinds."""
+    return lambda value: _are(kinds, 1)([value])
+
+
+def _are_tensors(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(t, Tensor) for n, t in value.items())
+
+
+TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "tensors": (_are_tensors, "tensors by name"),
+    "representation": (lambda value: isinstance(value, str), "a name"),
+    "iteration": (_is(int), "a whole number"),
+    "entered": (_are(int, 2), "two whole numbers"),
+    "first_time": (_is(int), "a whole number"),
+    "queue": (_are(int), "whole numbers"),
+    "running_loss": (_is((int, float)), "a number"),
+    "origin": (_are((int, float), 3), "three numbers"),
+    "scale": (lambda value: _is((int, float))(value) and value > 0, "a positive number"),
+    "observed": (lambda value: isinstance(value, Tensor) and value.dtype == torch.bool, "a tensor of truth values"),
+    "finished": (lambda value: isinstance(value, bool), "true or false"),
+    "seconds": (_is((int, float)), "a number"),
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import time
@@ -14,6 +15,7 @@ import torch
 
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted
+from ..scene import files
 from . import checkpoint, identity, representation
 from .config import Config
 from .posing import Splats
@@ -65,14 +67,14 @@ def train(
     state = None
     if resume and (run.folder / checkpoint.CHECKPOINT_FILE).exists():
         state = checkpoint.load(folder)
-        if state["finished"]:
-            progress({"event": "done", "gaussians": len(state["tensors"]["gaussians.means"])})
+        if state.finished:
+            progress({"event": "done", "gaussians": len(state.tensors["gaussians.means"])})
             return run
     trainer = Trainer(dataset, config)
     if state is not None:
         trainer.restore(state)
         _trim_log(run.folder / checkpoint.LOG_FILE, trainer.iteration)
-        began -= state["seconds"]
+        began -= state.seconds
     _optimise(trainer, run, began, progress)
     _finish(trainer, run, began, progress)
     progress({"event": "done", "gaussians": len(trainer.gaussians)})
@@ -118,7 +120,7 @@ def _trim_log(path: Path, iteration: int) -> None:
     if path.exists():
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
         kept = [line for line in lines if json.loads(line)["iteration"] <= iteration]
-        checkpoint.write_atomic(path, "".join(line + "\n" for line in kept).encode())
+        files.write(path, "".join(line + "\n" for line in kept).encode())
 
 
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
@@ -160,16 +162,9 @@ def _save(
     extra: dict[str, torch.Tensor] | None = None,
 ) -> None:
     state = trainer.state()
-    state["tensors"] |= extra or {}
-    norm = trainer.normalization
-    state |= {
-        "finished": finished,
-        "seconds": time.monotonic() - began,
-        "origin": [float(x) for x in norm.origin],
-        "scale": float(norm.scale),
-        "observed": torch.from_numpy(trainer.places.measured.copy()),
-    }
-    checkpoint.save(run.folder, state)
+    tensors = {**state.tensors, **(extra or {})}
+    seconds = time.monotonic() - began
+    checkpoint.save(run.folder, dataclasses.replace(state, tensors=tensors, finished=finished, seconds=seconds))
 
 
 @contextmanager

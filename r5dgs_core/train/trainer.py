@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import densification, initialization, losses, normalization, posing, representation, sweep, views
+from .checkpoint import Checkpoint
 from .config import Config
 
 log = logging.getLogger(__name__)
@@ -252,8 +252,8 @@ class Trainer:
                 "kept. Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
             )
 
-    def state(self) -> dict[str, Any]:
-        """Everything that the next step depends on: named tensors, numbers and text."""
+    def state(self) -> Checkpoint:
+        """Everything that the next step depends on."""
         tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
         tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
         tensors |= self.motion.tensors()
@@ -264,24 +264,28 @@ class Trainer:
         for group in self.optimizer.param_groups:
             moments = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
-        return {
-            "tensors": {n: t.detach().clone() for n, t in tensors.items()},
-            "representation": self.motion.name,
-            "iteration": self.iteration,
-            "entered": list(self.entered),
-            "first_time": self.first_time,
-            "queue": list(self.queue),
-            "running_loss": self.running_loss,
-        }
+        x, y, z = (float(v) for v in self.normalization.origin)
+        return Checkpoint(
+            tensors={n: t.detach().clone() for n, t in tensors.items()},
+            representation=self.motion.name,
+            iteration=self.iteration,
+            entered=self.entered,
+            first_time=self.first_time,
+            queue=tuple(self.queue),
+            running_loss=self.running_loss,
+            origin=(x, y, z),
+            scale=float(self.normalization.scale),
+            observed=torch.from_numpy(self.places.measured.copy()),
+        )
 
-    def restore(self, state: dict[str, Any]) -> None:
+    def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        if state["representation"] != self.motion.name:
+        if state.representation != self.motion.name:
             raise CheckpointError(
-                f"the checkpoint was trained with representation '{state['representation']}', "
+                f"the checkpoint was trained with representation '{state.representation}', "
                 f"the configuration asks for '{self.motion.name}'"
             )
-        tensors = {name: tensor.clone() for name, tensor in state["tensors"].items()}  # training changes them in place
+        tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training changes them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
         self.motion.restore(tensors)
@@ -297,8 +301,8 @@ class Trainer:
             moments = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
             if moments:
                 self.optimizer.state[group["params"][0]] = moments
-        self.iteration = state["iteration"]
-        self.entered = (state["entered"][0], state["entered"][1])
-        self.first_time = state["first_time"]
-        self.queue = list(state["queue"])
-        self.running_loss = state["running_loss"]
+        self.iteration = state.iteration
+        self.entered = state.entered
+        self.first_time = state.first_time
+        self.queue = list(state.queue)
+        self.running_loss = state.running_loss

@@ -64,7 +64,7 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
     if overrides[0] == "train.sh_degree=2":  # strong harmonics, so that a wrong frame would be seen
         state = checkpoint.load(made.folder)
         draws = torch.Generator().manual_seed(1)
-        rest = state["tensors"]["gaussians.sh_rest"]
+        rest = state.tensors["gaussians.sh_rest"]
         rest += 0.2 * torch.randn(rest.shape, generator=draws)
         checkpoint.save(made.folder, state)
     scene = bake.bake(made)
@@ -74,8 +74,8 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
 
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
     state = checkpoint.load(trained.folder)
-    tracks = representation.tracks_of(state["tensors"])
-    norm = normalization.Normalization(np.array(state["origin"]), state["scale"])
+    tracks = representation.tracks_of(state.tensors)
+    norm = normalization.Normalization(np.array(state.origin), state.scale)
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
     for t in tracks.times:
@@ -144,7 +144,7 @@ def test_a_scaled_and_shifted_world_gives_the_scaled_and_shifted_scene(tiny, tmp
 
 def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_path):
     state = checkpoint.load(trained.folder)
-    tensors = state["tensors"]
+    tensors = state.tensors
     keep = (tensors["gaussians.motion_ids"] != 2) & (tensors["labels"] != 2)
     for name in [n for n in tensors if n.startswith("gaussians.")] + ["labels", "identities"]:
         tensors[name] = tensors[name][keep]
@@ -179,7 +179,7 @@ def test_without_masks_the_scene_is_all_background(tmp_path):
 
 def test_values_that_are_not_finite_are_refused(trained, tmp_path):
     state = checkpoint.load(trained.folder)
-    state["tensors"]["gaussians.means"][5] = float("nan")
+    state.tensors["gaussians.means"][5] = float("nan")
     made = dataclasses.replace(trained, folder=tmp_path)
     checkpoint.save(tmp_path, state)
     with pytest.raises(CheckpointError, match="not finite"):
@@ -212,8 +212,8 @@ def test_shading_at_the_bind_state_keeps_every_colour():
 def test_a_scene_of_any_size_is_measured_alike(trained, tiny, baked, tmp_path, scale):
     data = datasets.read(tiny_datasets.make_dataset(tmp_path / "data", scale=scale).root)
     state = checkpoint.load(trained.folder)
-    state["scale"] *= scale
-    state["origin"] = [scale * x for x in state["origin"]]
+    x, y, z = (scale * v for v in state.origin)
+    state = dataclasses.replace(state, scale=scale * state.scale, origin=(x, y, z))
     made = dataclasses.replace(trained, folder=tmp_path)
     checkpoint.save(tmp_path, state)
     scene = bake.bake(made, data)

@@ -1,5 +1,6 @@
 """Run folders and checkpoints: whole or not at all, and a damaged one is named instead of half-loaded."""
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -11,7 +12,19 @@ import torch
 from r5dgs_core.errors import CheckpointError
 from r5dgs_core.train import checkpoint, config
 
-STATE = {"tensors": {"a": torch.arange(1000.0), "empty": torch.zeros(0, 3)}, "iteration": 7, "queue": [3, 1], "x": 0.1}
+STATE = checkpoint.Checkpoint(
+    tensors={**dict.fromkeys(checkpoint.TENSORS, torch.zeros(0, 3)), "a": torch.arange(1000.0)},
+    representation="tracks",
+    iteration=7,
+    entered=(0, 2),
+    first_time=1,
+    queue=(3, 1),
+    running_loss=0.1,
+    origin=(0.1, -2.0, 1e9),
+    scale=0.3,
+    observed=torch.tensor([[True, False, True]]),
+    seconds=12.5,
+)
 
 
 class Gift:
@@ -22,14 +35,14 @@ def dataset(root="/data"):
     return SimpleNamespace(root=Path(root), digest="d1")
 
 
-def same(a, b):
-    return all(torch.equal(a["tensors"][n], b["tensors"][n]) for n in a["tensors"]) and a["queue"] == b["queue"]
-
-
 def test_what_is_saved_is_loaded_to_the_bit(tmp_path):
     checkpoint.save(tmp_path, STATE)
     loaded = checkpoint.load(tmp_path)
-    assert same(STATE, loaded) and loaded["iteration"] == 7 and loaded["x"] == 0.1
+    assert loaded.tensors.keys() == STATE.tensors.keys()
+    assert all(torch.equal(loaded.tensors[n], t) for n, t in STATE.tensors.items())
+    assert torch.equal(loaded.observed, STATE.observed)
+    for name in {f.name for f in dataclasses.fields(STATE)} - {"tensors", "observed"}:
+        assert getattr(loaded, name) == getattr(STATE, name), name
     assert os.listdir(tmp_path) == [checkpoint.CHECKPOINT_FILE]
 
 
@@ -62,6 +75,32 @@ def test_foreign_files_and_other_versions_are_named(tmp_path):
             checkpoint.load(tmp_path)
 
 
+NAMES = [field.name for field in dataclasses.fields(checkpoint.Checkpoint)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [None, b"x", [0.5, "y"], {"a": 1}])
+def test_a_missing_or_wrong_entry_is_named(tmp_path, name, value):
+    checkpoint.save(tmp_path, STATE)
+    path = tmp_path / checkpoint.CHECKPOINT_FILE
+    content = torch.load(path, weights_only=True)
+    if value is None:
+        del content[name]
+    else:
+        content[name] = value
+    torch.save(content, path)
+    with pytest.raises(CheckpointError, match=f"checkpoint.pt: .*'{name}'.* found .*train again"):
+        checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize("name", checkpoint.TENSORS)
+def test_a_missing_tensor_is_named(tmp_path, name):
+    tensors = {n: t for n, t in STATE.tensors.items() if n != name}
+    checkpoint.save(tmp_path, dataclasses.replace(STATE, tensors=tensors))
+    with pytest.raises(CheckpointError, match=f"checkpoint.pt: expected the tensor '{name}'"):
+        checkpoint.load(tmp_path)
+
+
 @pytest.mark.parametrize("moment", ["save", "fsync", "replace"])
 def test_the_old_checkpoint_survives_a_crash_while_the_new_one_is_written(tmp_path, monkeypatch, moment):
     checkpoint.save(tmp_path, STATE)
@@ -72,12 +111,13 @@ def test_the_old_checkpoint_survives_a_crash_while_the_new_one_is_written(tmp_pa
         raise OSError("power is gone")
 
     monkeypatch.setattr(torch if moment == "save" else os, moment, crash)
-    with pytest.raises(OSError, match="power"):
-        checkpoint.save(tmp_path, {**STATE, "iteration": 8})
+    with pytest.raises(CheckpointError, match="checkpoint.pt: cannot be written: power is gone.*--resume"):
+        checkpoint.save(tmp_path, dataclasses.replace(STATE, iteration=8))
     monkeypatch.undo()
-    assert checkpoint.load(tmp_path)["iteration"] == 7
-    checkpoint.save(tmp_path, {**STATE, "iteration": 9})  # and what the crash left is no obstacle
-    assert checkpoint.load(tmp_path)["iteration"] == 9
+    assert os.listdir(tmp_path) == [checkpoint.CHECKPOINT_FILE]
+    assert checkpoint.load(tmp_path).iteration == 7
+    checkpoint.save(tmp_path, dataclasses.replace(STATE, iteration=9))  # and what the crash left is no obstacle
+    assert checkpoint.load(tmp_path).iteration == 9
 
 
 def test_a_run_is_opened_as_it_was_made(tmp_path):

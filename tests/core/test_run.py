@@ -1,5 +1,6 @@
 """Runs that are killed or stopped go on to the numbers of an unbroken one."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -34,12 +35,12 @@ def arguments(tiny, folder):
 
 def assert_equal_runs(folder, reference):
     ours, theirs = checkpoint.load(folder), checkpoint.load(reference)
-    assert ours["finished"] and ours["tensors"].keys() == theirs["tensors"].keys()
-    for name, tensor in theirs["tensors"].items():
-        assert torch.equal(ours["tensors"][name], tensor), name
-    assert {k: v for k, v in ours.items() if k not in ("tensors", "seconds", "observed")} == {
-        k: v for k, v in theirs.items() if k not in ("tensors", "seconds", "observed")
-    }
+    assert ours.finished and ours.tensors.keys() == theirs.tensors.keys()
+    for name, tensor in theirs.tensors.items():
+        assert torch.equal(ours.tensors[name], tensor), name
+    assert torch.equal(ours.observed, theirs.observed)
+    for name in {field.name for field in dataclasses.fields(ours)} - {"tensors", "seconds", "observed"}:
+        assert getattr(ours, name) == getattr(theirs, name), name
 
 
 def log_of(folder):
@@ -60,13 +61,13 @@ def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys
                 break
         _, complaint = process.communicate(timeout=120)
     stopped = checkpoint.load(folder)
-    assert not stopped["finished"] and 40 <= stopped["iteration"] < STEPS
+    assert not stopped.finished and 40 <= stopped.iteration < STEPS
     if number == signal.SIGKILL:
-        assert process.returncode == -signal.SIGKILL and stopped["iteration"] % 20 == 0
+        assert process.returncode == -signal.SIGKILL and stopped.iteration % 20 == 0
     else:
         assert process.returncode == 130
         assert complaint == (
-            f"r5dgs: stopped at step {stopped['iteration']}; go on with: r5dgs train {tiny.root.resolve()} "
+            f"r5dgs: stopped at step {stopped.iteration}; go on with: r5dgs train {tiny.root.resolve()} "
             f"--out {folder} --resume\n"
         )
     assert cli.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
@@ -85,7 +86,7 @@ def test_a_run_killed_before_its_last_labels_only_makes_these(tiny, unbroken, tm
     with pytest.raises(KeyboardInterrupt):
         run.train(tiny.root, folder, settings)
     monkeypatch.undo()
-    assert checkpoint.load(folder)["iteration"] == STEPS
+    assert checkpoint.load(folder).iteration == STEPS
     events = []
     run.train(tiny.root, folder, settings, resume=True, progress=events.append)
     assert "step" not in {event["event"] for event in events}

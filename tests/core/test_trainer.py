@@ -1,5 +1,7 @@
 """Training recovers a known motion, goes on from a state as if nothing had happened, and stops at the first NaN."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -28,12 +30,13 @@ def mean_loss(trainer):
 
 
 def assert_same_state(a, b):
-    assert a["tensors"].keys() == b["tensors"].keys()
-    for name, tensor in a["tensors"].items():
-        assert torch.equal(tensor, b["tensors"][name]), name
-    for name in set(a) - {"tensors", "running_loss"}:
-        assert a[name] == b[name], name
-    assert a["running_loss"] == b["running_loss"] or np.isnan([a["running_loss"], b["running_loss"]]).all()
+    assert a.tensors.keys() == b.tensors.keys()
+    for name, tensor in a.tensors.items():
+        assert torch.equal(tensor, b.tensors[name]), name
+    assert torch.equal(a.observed, b.observed)
+    for name in {field.name for field in dataclasses.fields(a)} - {"tensors", "running_loss", "observed"}:
+        assert getattr(a, name) == getattr(b, name), name
+    assert a.running_loss == b.running_loss or np.isnan([a.running_loss, b.running_loss]).all()
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +123,8 @@ def test_a_gradient_that_is_not_finite_stops_before_it_does_harm(tiny, name):
     params[name].register_hook(lambda gradient: gradient * float("nan"))
     with pytest.raises(TrainingError, match=rf"step 3, view train/r_\d+: gradient of {name} is not finite"):
         trainer.step()
-    for key, tensor in trainer.state()["tensors"].items():
-        assert key == "generator" or torch.equal(tensor, before["tensors"][key]), key
+    for key, tensor in trainer.state().tensors.items():
+        assert key == "generator" or torch.equal(tensor, before.tensors[key]), key
 
 
 def test_a_parameter_that_is_not_finite_is_a_training_error(tiny):
