@@ -25,13 +25,11 @@ class ScreenGradients:
     def __init__(self, count: int):
         self.total = torch.zeros(count)
         self.views = torch.zeros(count)
-        self.pixel_sizes = torch.zeros(count)
 
-    def add(self, grad_norm: Tensor, visible: Tensor, radii: Tensor) -> None:
-        """Add one view: gradient norms per half image width [N], visibility [N], radii in pixels [N]."""
+    def add(self, grad_norm: Tensor, visible: Tensor) -> None:
+        """Add one view: gradient norms per half image width [N] and visibility [N]."""
         self.total += torch.where(visible, grad_norm, 0.0)
         self.views += visible
-        self.pixel_sizes = torch.maximum(self.pixel_sizes, torch.where(visible, radii, 0.0))
 
     def mean(self) -> Tensor:
         """Mean screen gradient. [N]"""

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 TARGET_BYTES = 1 << 30
 FLOATER_CAMERAS = 256  # cameras that are asked whether they see what floats before another
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
-APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits")
+APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
 
 class Trainer:
@@ -141,9 +141,9 @@ class Trainer:
         if not math.isfinite(value + float(torch.stack(sums).sum())):
             self._check_finite(value, view.name)
         self.optimizer.step()
-        if stats.grad_norm is not None and stats.visible is not None and stats.radii is not None:
+        if stats.grad_norm is not None and stats.visible is not None:
             half_width = 0.5 * view.camera.width
-            self.gradients.add(half_width * stats.grad_norm, stats.visible, stats.radii)
+            self.gradients.add(half_width * stats.grad_norm, stats.visible)
         self.iteration += 1
         self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
         self._maintain()
@@ -260,7 +260,7 @@ class Trainer:
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
-        tensors |= {f"gradients.{n}": getattr(self.gradients, n) for n in ("total", "views", "pixel_sizes")}
+        tensors |= {f"gradients.{n}": getattr(self.gradients, n) for n in ("total", "views")}
         for group in self.optimizer.param_groups:
             moments = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
@@ -293,7 +293,7 @@ class Trainer:
         self.object_ids = tensors["object_ids"].numpy()
         self.generator.set_state(tensors["generator"])
         self.gradients = densification.ScreenGradients(len(self.gaussians))
-        for name in ("total", "views", "pixel_sizes"):
+        for name in ("total", "views"):
             setattr(self.gradients, name, tensors[f"gradients.{name}"])
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:

@@ -29,7 +29,7 @@ def make(n=40, size=0.5 * PIXEL, seed=0):
 
 def gradients(values):
     found = densification.ScreenGradients(len(values))
-    found.add(torch.as_tensor(values), torch.ones(len(values), dtype=torch.bool), torch.ones(len(values)))
+    found.add(torch.as_tensor(values), torch.ones(len(values), dtype=torch.bool))
     return found
 
 
@@ -41,10 +41,9 @@ def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=
 
 def test_the_mean_counts_only_views_that_show_the_gaussian():
     found = densification.ScreenGradients(3)
-    found.add(torch.tensor([2.0, 5, 7]), torch.tensor([True, True, False]), torch.tensor([1.0, 3, 9]))
-    found.add(torch.tensor([4.0, 5, 7]), torch.tensor([True, False, False]), torch.tensor([2.0, 9, 9]))
+    found.add(torch.tensor([2.0, 5, 7]), torch.tensor([True, True, False]))
+    found.add(torch.tensor([4.0, 5, 7]), torch.tensor([True, False, False]))
     assert found.mean().tolist() == [3, 5, 0]
-    assert found.pixel_sizes.tolist() == [2, 3, 0]
 
 
 def test_small_ones_with_the_largest_gradients_are_cloned():
