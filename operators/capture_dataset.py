@@ -123,11 +123,17 @@ class R5DGS_OT_capture_dataset(bpy.types.Operator):
         self._timer = manager.event_timer_add(0.05, window=context.window)
         return {"RUNNING_MODAL"}
 
+    def cancel(self, context):
+        """Blender ends the operator: the file browser is closed, or a window or the file while images render."""
+        if getattr(self, "_timer", None) is not None:
+            self._running.close()
+            self._end(context, {"CANCELLED"})
+
     def modal(self, context, event):
         if event.type == "ESC":
-            self._running.close()
+            self.cancel(context)
             self.report({"INFO"}, "Capture stopped; nothing was written")
-            return self._end(context, {"CANCELLED"})
+            return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
         try:
@@ -164,8 +170,10 @@ class R5DGS_OT_capture_dataset(bpy.types.Operator):
 
     def _end(self, context, result):
         context.window_manager.event_timer_remove(self._timer)
+        self._timer = None
         context.window_manager.progress_end()
-        context.workspace.status_text_set(None)
+        if context.workspace is not None:
+            context.workspace.status_text_set(None)
         return result
 
 

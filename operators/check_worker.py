@@ -12,6 +12,13 @@ class R5DGS_OT_check_worker(bpy.types.Operator):
     bl_idname = "r5dgs.check_worker"
     bl_label = "Test Worker"
 
+    @classmethod
+    def poll(cls, context):
+        if worker.busy():
+            cls.poll_message_set("A preview is being rendered; Esc stops it")
+            return False
+        return True
+
     def execute(self, context):
         try:
             worker.stop()

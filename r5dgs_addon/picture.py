@@ -33,7 +33,7 @@ class Shown:
 
 
 def preview(context: bpy.types.Context, collection: bpy.types.Collection) -> tuple[bpy.types.Image, float]:
-    """Render what Blender shows into the image `R5DGS Preview`.
+    """Render what Blender shows into the image `R5DGS Preview`, and wait for it.
 
     Args:
         context: Its scene has the camera, the resolution and the frame.
@@ -43,7 +43,16 @@ def preview(context: bpy.types.Context, collection: bpy.types.Collection) -> tup
         The image, and the milliseconds that the worker took to pose and rasterize.
     """
     seen = shown(context, collection)
-    result, arrays = render(collection, seen)
+    return finish(*render(collection, seen))
+
+
+def start(context: bpy.types.Context, collection: bpy.types.Collection) -> worker.Job:
+    """Begin a `preview` without waiting; give the job's answer to `finish`."""
+    return worker.start(_steps(collection, shown(context, collection), (), True))
+
+
+def finish(result: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[bpy.types.Image, float]:
+    """Put the worker's answer into the image `R5DGS Preview`; returns what `preview` does."""
     return write_image(IMAGE, arrays["color"]), result["ms_motion"] + result["ms_raster"]
 
 
@@ -51,20 +60,29 @@ def render(
     collection: bpy.types.Collection, seen: Shown, want: tuple[str, ...] = (), background: bool = True
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Have the worker render: its result and the arrays ``color`` [H, W, 3] and those wanted (alpha, depth, ids)."""
+    answer: tuple[dict[str, Any], dict[str, np.ndarray]] = {}, {}
+    for _, command, arguments in _steps(collection, seen, want, background):
+        answer = worker.request(command, **arguments)
+    return answer
+
+
+def _steps(
+    collection: bpy.types.Collection, seen: Shown, want: tuple[str, ...], background: bool
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """The worker's requests for a picture; the last one's answer is the picture."""
     camera = seen.camera
-    worker.request("load", path=str(scene_path(collection)))
-    return worker.request(
-        "render",
-        camera={
+    view = {
+        "camera": {
             "width": camera.width,
             "height": camera.height,
             "intrinsics": camera.intrinsics.tolist(),
             "T_cam_world": camera.T_cam_world.tolist(),
         },
-        instances=[{"start": s, "count": n, "matrix": m.tolist()} for s, n, m in seen.instances],
-        background=background,
-        want=list(want),
-    )
+        "instances": [{"start": s, "count": n, "matrix": m.tolist()} for s, n, m in seen.instances],
+        "background": background,
+        "want": list(want),
+    }
+    return [("loading the scene", "load", {"path": str(scene_path(collection))}), ("rendering", "render", view)]
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:

@@ -12,6 +12,7 @@ import os
 import queue
 import subprocess
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,13 @@ STDERR_LINES = 12
 
 
 class Worker:
-    """One running worker process.
+    """One running worker process; `greet` it before the first request.
 
     Args:
         python: Path of the Python to run it with.
 
     Raises:
-        BackendError: It cannot be started, or that Python lacks what rendering needs.
+        BackendError: It cannot be started.
     """
 
     def __init__(self, python: str):
@@ -68,11 +69,20 @@ class Worker:
         ]
         for reader in self._readers:
             reader.start()
+
+    def greet(self) -> None:
+        """Wait until it answers, once.
+
+        Raises:
+            BackendError: It does not, or its Python lacks what rendering needs.
+        """
+        if self.hello:
+            return
         try:
             self.hello, _ = self.request("hello", timeout_s=START_TIMEOUT_S)
             if self.hello.get("missing"):
                 raise errors.BackendError(
-                    f"worker: {python} lacks {', '.join(self.hello['missing'])}; install the core there "
+                    f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
                     "('pip install r5dgs') or choose another 'Worker Python' in the add-on's preferences"
                 )
         except BaseException:
@@ -133,11 +143,8 @@ class Worker:
     def close(self) -> None:
         """Stop the process and wait until it is gone."""
         process = self._process
-        if process.stdin is not None:
-            with contextlib.suppress(OSError):
-                process.stdin.close()  # the worker ends by itself when its input ends
         if process.poll() is None:
-            process.terminate()
+            process.terminate()  # before its input is closed: closing waits for a request that is being written
             try:
                 process.wait(timeout=2.0)
             except subprocess.TimeoutExpired:
@@ -145,9 +152,10 @@ class Worker:
                 process.wait()
         for reader in self._readers:
             reader.join(timeout=2.0)
-        for pipe in (process.stdout, process.stderr):
+        for pipe in (process.stdin, process.stdout, process.stderr):
             if pipe is not None:
-                pipe.close()
+                with contextlib.suppress(OSError):
+                    pipe.close()
 
     def _death(self) -> errors.BackendError:
         self.close()
@@ -196,16 +204,75 @@ def _error_of(header: dict[str, Any]) -> errors.R5dgsError:
     return errors.BackendError(f"worker: {report.get('kind', 'error')}: {message}")
 
 
+class Job:
+    """Requests that wait for their answers in a thread of their own, so that Blender's window stays free.
+
+    Args:
+        running: The worker; nobody else may ask it until the job is done.
+        timeout_s: Seconds to wait for each answer.
+        steps: What the sidebar says while it waits, the command, and its arguments; one after the other.
+    """
+
+    def __init__(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]):
+        self.doing = "starting the worker"
+        self._started = time.monotonic()
+        self._answer: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(
+            target=self._run, args=(running, timeout_s, steps), name="r5dgs worker job", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def done(self) -> bool:
+        """Whether `answer` returns at once."""
+        return not self._thread.is_alive()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since it started."""
+        return time.monotonic() - self._started
+
+    def join(self) -> None:
+        """Wait until it has ended, whatever came of it."""
+        self._thread.join()
+
+    def answer(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Wait for the last step's result and arrays. Raises what a step raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        assert self._answer is not None
+        return self._answer
+
+    def _run(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]) -> None:
+        try:
+            running.greet()
+            for self.doing, command, arguments in steps:
+                self._answer = running.request(command, timeout_s, **arguments)
+        except BaseException as error:  # raised again where the answer is asked for
+            self._error = error
+
+
 _worker: Worker | None = None
+_job: Job | None = None
 
 
 def current(python: str | None = None) -> Worker:
     """The running worker; it is started where none runs or another Python is wanted.
 
     Raises:
-        BackendError: It cannot be started.
+        BackendError: It cannot be started, or works on a job.
     """
+    running = _running(python)
+    running.greet()
+    return running
+
+
+def _running(python: str | None = None) -> Worker:
     global _worker
+    if busy():
+        raise errors.BackendError("worker: it still renders a preview; wait for it, or stop it with Esc")
     python = python or preferences.worker_python()
     if _worker is not None and (not _worker.alive or _worker.python != python):
         stop()
@@ -219,12 +286,31 @@ def request(command: str, **arguments: Any) -> tuple[dict[str, Any], dict[str, n
     return current().request(command, preferences.worker_timeout_s(), **arguments)
 
 
+def start(steps: list[tuple[str, str, dict[str, Any]]]) -> Job:
+    """Begin a `Job` on the current worker, with the timeout of the preferences.
+
+    Raises:
+        BackendError: The worker cannot be started, or works on another job.
+    """
+    global _job
+    _job = Job(_running(), preferences.worker_timeout_s(), steps)
+    return _job
+
+
+def busy() -> bool:
+    """Whether a job has not ended yet."""
+    return _job is not None and not _job.done
+
+
 def stop() -> None:
-    """Stop the worker, if one runs."""
-    global _worker
+    """Stop the worker, if one runs; a job that waits for it ends with an error."""
+    global _worker, _job
     if _worker is not None:
         worker, _worker = _worker, None
         worker.close()
+    if _job is not None:
+        job, _job = _job, None
+        job.join()
 
 
 def register():

@@ -557,6 +557,25 @@ def test_the_operator_reports_an_error_of_the_user(blender, scene, tmp_path):
         blender.ops.r5dgs.capture_dataset()
 
 
+def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, tmp_path):
+    """As when the file or the window is closed; bpy has no window, so the operator's own method is called."""
+    operator = importlib.import_module("r5dgs.operators.capture_dataset").R5DGS_OT_capture_dataset
+    before = fingerprint(blender)
+    running = service.capture.steps(blender.context, settings_for(service, tmp_path / "set", rig="ARC"))
+    next(running)
+    removed = []
+    manager = SimpleNamespace(event_timer_remove=removed.append, progress_end=lambda: removed.append("progress"))
+    context = SimpleNamespace(window_manager=manager, workspace=None)
+    methods = {name: vars(operator)[name] for name in ("cancel", "_end")}
+    rendering = type("Operator", (), {**methods, "_running": running, "_timer": "timer"})()
+    rendering.cancel(context)
+    assert fingerprint(blender) == before and list(tmp_path.iterdir()) == []
+    assert removed == ["timer", "progress"]
+    choosing = type("Operator", (), methods)()  # its file browser is closed: nothing has begun
+    choosing.cancel(context)
+    assert removed == ["timer", "progress"]
+
+
 def test_the_operator_has_the_defaults_of_the_settings(service, blender):
     properties = blender.ops.r5dgs.capture_dataset.get_rna_type().properties
     for field in dataclasses.fields(service.capture.CaptureSettings):

@@ -6,6 +6,7 @@ import signal
 import stat
 import sys
 import time
+import types
 
 import numpy as np
 import pytest
@@ -211,6 +212,68 @@ def test_a_moved_scene_file_is_found_beside_the_blend_or_missed_by_name(blender,
     (folder / scene_path.name).unlink()
     with pytest.raises(RuntimeError, match="scene.r5dgs.*Scene File"):
         blender.ops.r5dgs.preview()
+
+
+class Window:
+    """As much of Blender's window and operator as `modal` touches: bpy has no window to run one in."""
+
+    def __init__(self, bpy, operator, job):
+        self.workspace, self.window, self.windows, self.said, self.removed = self, self, [], [], []
+        self.window_manager, self.r5dgs = self, bpy.context.window_manager.r5dgs
+        self.status_text_set, self.event_timer_remove = self.said.append, self.removed.append
+        self.reports = []
+        members = {"_job": job, "_timer": "timer", "report": lambda _, kind, text: self.reports.append((kind, text))}
+        methods = {name: vars(operator)[name] for name in ("modal", "cancel", "_leave", "_done")}
+        self.operator = type("Operator", (), {**methods, **members})()
+
+    def send(self, kind):
+        return self.operator.modal(self, types.SimpleNamespace(type=kind))
+
+
+@pytest.fixture
+def windowed(blender, loaded):
+    """Starts a preview as the window does."""
+    operator = importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    return lambda: Window(blender, operator, picture.start(blender.context, loaded))
+
+
+def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, loaded, worker, windowed):
+    expected = preview(blender)
+    blender.data.images.remove(blender.data.images["R5DGS Preview"])
+    os.kill(worker.current().pid, signal.SIGSTOP)  # so that the job is seen at work
+    window = windowed()
+    assert worker.busy() and not blender.ops.r5dgs.preview.poll() and not blender.ops.r5dgs.check_worker.poll()
+    assert window.send("MOUSEMOVE") == {"PASS_THROUGH"} and window.said == []
+    assert window.send("TIMER") == {"PASS_THROUGH"} and "Esc stops" in window.said[-1]
+    with pytest.raises(errors.BackendError, match="still renders a preview"):
+        worker.current()
+    os.kill(worker._worker.pid, signal.SIGCONT)
+    window.operator._job.join()
+    assert window.send("TIMER") == {"FINISHED"}
+    assert window.said[-1] is None and window.removed == ["timer"] and not worker.busy()
+    np.testing.assert_array_equal(pixels_of(blender.data.images["R5DGS Preview"]), expected)
+
+
+def test_escape_stops_a_preview_and_the_next_one_works(blender, loaded, worker, windowed):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    window = windowed()
+    assert window.send("ESC") == {"CANCELLED"}
+    assert not running.alive and not worker.busy()
+    assert window.said == [None] and window.removed == ["timer"]
+    assert {kind for report, _ in window.reports for kind in report} == {"INFO"}
+    preview(blender)
+
+
+def test_an_error_of_a_preview_in_the_window_is_reported(blender, loaded, worker, windowed):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    window = windowed()
+    os.kill(running.pid, signal.SIGKILL)
+    window.operator._job.join()
+    assert window.send("TIMER") == {"CANCELLED"} and window.removed == ["timer"]
+    assert "ended unexpectedly" in window.reports[-1][1]
 
 
 def test_a_worker_that_died_is_started_again_by_the_next_preview(blender, loaded, worker):
