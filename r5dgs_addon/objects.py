@@ -273,5 +273,6 @@ def _describe(
     for item in scene.objects:
         entry = state.table.add()
         entry.name, entry.object_id = item.name, item.id
-        entry.aliases = ", ".join(item.aliases)
+        for alias in item.aliases:
+            entry.aliases.add().name = alias
         entry.caption, entry.count = item.caption, item.count

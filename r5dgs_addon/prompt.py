@@ -29,7 +29,7 @@ def search(collection: bpy.types.Collection, text: str) -> list[Match]:
 def remembered(collection: bpy.types.Collection) -> list[lookup.Label]:
     """What the objects of a loaded scene answer to; the unassigned Gaussians answer to nothing."""
     return [
-        lookup.Label(entry.object_id, entry.name, tuple(a.strip() for a in entry.aliases.split(",") if a.strip()))
+        lookup.Label(entry.object_id, entry.name, tuple(alias.name for alias in entry.aliases))
         for entry in collection.r5dgs.table
         if entry.object_id >= 0
     ]

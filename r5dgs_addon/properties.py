@@ -37,11 +37,15 @@ class R5DGS_PG_object(bpy.types.PropertyGroup):
     pivot: FloatVectorProperty(name="Pivot", description="Point that the motion turns about, scene coordinates", size=3)
 
 
+class R5DGS_PG_alias(bpy.types.PropertyGroup):
+    """Another word that finds an object: its `name`."""
+
+
 class R5DGS_PG_entry(bpy.types.PropertyGroup):
     """One object of the scene's table; `name` is the object's name."""
 
     object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
-    aliases: StringProperty(name="Aliases", description="Other words that find it, separated by commas")
+    aliases: CollectionProperty(name="Aliases", description="Other words that find it", type=R5DGS_PG_alias)
     caption: StringProperty(name="Caption", description="A sentence about it")
     count: IntProperty(name="Gaussians", description="Number of Gaussians")
 
@@ -85,7 +89,7 @@ class R5DGS_PG_session(bpy.types.PropertyGroup):
     preview_size: StringProperty(name="Preview Size", description="Size of the last preview")
 
 
-CLASSES = (R5DGS_PG_object, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_match, R5DGS_PG_session)
+CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_match, R5DGS_PG_session)
 
 
 def register():

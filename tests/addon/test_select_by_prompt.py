@@ -1,5 +1,8 @@
 """Words select objects by the table that the .blend file keeps."""
 
+import dataclasses
+import importlib
+
 import pytest
 
 from r5dgs_core.scene import scene_file
@@ -32,6 +35,19 @@ def test_a_name_selects_the_clouds_and_the_anchor_of_its_object(blender, loaded)
 def test_aliases_plurals_and_typos_find_it(blender, loaded, text, object_id):
     ask(blender, text)
     assert selected_ids(blender) == {object_id}
+
+
+def test_what_an_object_answers_to_is_kept_word_for_word(blender, tmp_path):
+    made = scenes.make_scene(n=100, objects=1)
+    words = ("cup, blue", "", " mug ", "tasse")
+    table = tuple(dataclasses.replace(item, aliases=words) if item.id == 1 else item for item in made.objects)
+    path = scene_file.write(dataclasses.replace(made, objects=table), tmp_path / "words.r5dgs")
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "words.blend"))
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "words.blend"))
+    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    prompt = importlib.import_module("r5dgs.r5dgs_addon.prompt")
+    assert [label.aliases for label in prompt.remembered(collection) if label.object_id == 1] == [words]
 
 
 def test_several_wishes_select_several_objects_ranked_in_the_panel(blender, loaded):
