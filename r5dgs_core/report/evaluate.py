@@ -28,6 +28,7 @@ METRICS = (
     "psnr_pooled",
     "psnr_objects",
     "ssim",
+    "ssim_objects",
     "flip",
     "lpips",
     "miou",
@@ -229,13 +230,16 @@ class _Tally:
     def add(self, rendering: Rendering, truth: np.ndarray, mask: np.ndarray | None) -> None:
         self.errors.append(metrics.mse(rendering.color, truth))
         self.values["psnr"].append(metrics.psnr_of_mse(self.errors[-1]))
-        self.values["ssim"].append(metrics.ssim(rendering.color, truth))
+        similarity = metrics.ssim_map(rendering.color, truth)
+        self.values["ssim"].append(float(similarity.mean()))
         flip = metrics.flip(rendering.color, truth)
         if flip is not None:
             self.values["flip"].append(flip)
         if mask is not None:
             self.masked = True
             self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, mask > 0))
+            if (mask > 0).any():
+                self.values["ssim_objects"].append(float(similarity[mask > 0].mean()))
             for object_id in sorted(set(np.unique(mask[mask > 0]).tolist()) - set(self.ids)):
                 # An object that the scene lacks counts as missed; so far it was in no truth and in no prediction.
                 self.counts = np.insert(np.insert(self.counts, len(self.ids), 0, axis=0), len(self.ids), 0, axis=1)
@@ -246,7 +250,7 @@ class _Tally:
 
     def result(self) -> dict[str, Any]:
         out: dict[str, Any] = dict.fromkeys(METRICS)
-        for name in ("psnr", "psnr_objects", "ssim", "flip"):
+        for name in ("psnr", "psnr_objects", "ssim", "ssim_objects", "flip"):
             out[name] = _mean(self.values[name])
         for name in ("ms_motion", "ms_raster"):
             out[name] = float(np.median(self.values[name])) if self.values[name] else None

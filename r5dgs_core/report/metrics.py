@@ -54,17 +54,22 @@ def psnr_pooled(errors: Sequence[float]) -> float:
 
 
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity as 3D Gaussian Splatting computes it.
+    """Structural similarity as 3D Gaussian Splatting computes it: the mean of `ssim_map`, 1 for equal images."""
+    return float(ssim_map(image, truth).mean())
 
-    Window 11 x 11, Gaussian of sigma 1.5, zero padding, constants 0.01 and 0.03, mean over pixels and channels.
-    Packages that pad by reflection or leave the border out give other values (differences up to 0.007).
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Structural similarity of the windows around each pixel.
+
+    Window 11 x 11, Gaussian of sigma 1.5, zero padding, constants 0.01 and 0.03. Packages that pad by reflection or
+    leave the border out give other means (differences up to 0.007).
 
     Args:
         image: Rendered. [H, W, 3]
         truth: Ground truth. [H, W, 3]
 
     Returns:
-        The mean similarity, 1 for equal images.
+        Similarity per pixel and channel. [H, W, 3]
 
     Source: Wang et al. 2004, Eq. 13, with the padding of the 3DGS code.
     """
@@ -74,7 +79,7 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
     var_x, var_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
     denominator = (mean_x**2 + mean_y**2 + SSIM_C1) * (var_x + var_y + SSIM_C2)
-    return float((numerator / denominator).mean())
+    return numerator / denominator
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> float | None:

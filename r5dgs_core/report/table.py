@@ -12,6 +12,7 @@ _ROWS = (
     ("psnr_pooled", "PSNR of the pooled error (dB)", "{:.2f}"),
     ("psnr_objects", "PSNR on object pixels (dB)", "{:.2f}"),
     ("ssim", "SSIM", "{:.4f}"),
+    ("ssim_objects", "SSIM on object pixels", "{:.4f}"),
     ("flip", "FLIP (less is better)", "{:.4f}"),
     ("lpips", "LPIPS (less is better)", "{:.4f}"),
     ("miou", "mIoU, same ids", "{:.3f}"),
