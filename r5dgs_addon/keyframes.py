@@ -69,11 +69,7 @@ def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float) -> Curv
     if t_end <= scene.t_max:
         return observed
     future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius)
-    ready = [
-        _hold(first, scene.t_max) if len(first.times) == 1 and len(second.times) > 1 else first
-        for first, second in ((observed.location, future.location), (observed.rotation, future.rotation))
-    ]
-    return reduction.join(Curves(*ready), future)
+    return reduction.join(observed, future)
 
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
@@ -150,12 +146,6 @@ def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     start, stop, leave, arrive = keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1]
     slopes = 6 * (u - u * u) * (stop - start) / h + (1 - 4 * u + 3 * u * u) * leave + (3 * u * u - 2 * u) * arrive
     return reduction.hermite(start, stop, leave, arrive, h, u), slopes
-
-
-def _hold(keys: Keys, t: float) -> Keys:
-    """A constant curve with a second key at t, so that what comes after it does not bend it."""
-    still = np.zeros_like(keys.values[[0, 0]])
-    return Keys(np.array([keys.times[0], t]), keys.values[[0, 0]], still, still)
 
 
 def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:

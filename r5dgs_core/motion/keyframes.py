@@ -107,9 +107,18 @@ def reduce(
 
 
 def join(first: Curves, second: Curves) -> Curves:
-    """Curves of two motions that meet: the end of ``first`` is the start of ``second``; the kink between them stays."""
+    """Curves of two motions that meet: the end of ``first`` is the start of ``second``; the kink between them stays.
+
+    A curve of one key is constant: it is held until the other motion starts, and stays one key where that is constant
+    too.
+    """
 
     def chain(a: Keys, b: Keys, flip: float) -> Keys:
+        if len(a.times) == 1 and a.times[0] < b.times[0]:
+            if len(b.times) == 1:
+                return a
+            still = np.zeros_like(a.values[[0, 0]])
+            a = Keys(np.array([a.times[0], b.times[0]]), a.values[[0, 0]], still, still)
         values, left, right = b.values * flip, b.left_slopes * flip, b.right_slopes * flip
         if a.times[-1] != b.times[0]:
             return Keys(

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -110,6 +111,25 @@ def test_joined_curves_keep_the_kink_and_both_sides():
     np.testing.assert_allclose(joined.location.right_slopes[1], [0, 2, 0])
     np.testing.assert_allclose(keyframes.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
     assert keyframes.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
+
+
+def test_what_rests_before_it_moves_rests_until_the_join():
+    moving = MotionModel("ballistic_spin", velocity=[1, 0, 0], angular_velocity=[0, 0, 2.0])
+    rest = keyframes.reduce(keyframes.model_sampler(models.STATIC, 0.0), 0.0, 1.0, TOLERANCE, RADIUS)
+    joined = keyframes.join(rest, keyframes.reduce(keyframes.model_sampler(moving, 1.0), 1.0, 2.0, TOLERANCE, RADIUS))
+    times = np.linspace(0, 1, 31)
+    assert (keyframes.evaluate(joined.location, times) == 0).all()
+    assert (keyframes.evaluate(joined.rotation, times, unit=True) == [1, 0, 0, 0]).all()
+    later = keyframes.Curves(*(dataclasses.replace(k, times=k.times - 1) for k in (joined.location, joined.rotation)))
+    assert largest_error(later, moving, np.linspace(0, 1, 301)) <= TOLERANCE
+
+
+def test_rest_joined_to_rest_is_one_key():
+    first, second = (
+        keyframes.reduce(keyframes.model_sampler(models.STATIC, 0.0), t, t + 1, TOLERANCE, RADIUS) for t in (0.0, 1.0)
+    )
+    joined = keyframes.join(first, second)
+    assert joined.location.times.tolist() == joined.rotation.times.tolist() == [0.0]
 
 
 def test_joining_keeps_quaternion_signs_continuous():
