@@ -71,6 +71,7 @@ def test_a_wrong_future_costs_on_test_and_not_on_val(scene, data):
     assert result["splits"]["val"]["rigid"]["psnr"] == 100.0
     assert result["splits"]["test"]["rigid"]["psnr"] < 40
     assert result["splits"]["test"]["rigid"]["psnr_objects"] < result["splits"]["test"]["rigid"]["psnr"]
+    assert result["splits"]["test"]["rigid"]["ssim_objects"] < result["splits"]["test"]["rigid"]["ssim"]
     assert result["splits"]["test"]["rigid"]["miou"] < 0.95
     errors = {row["id"]: row for row in result["objects"]}
     assert errors[2]["position_error"] == pytest.approx(2.0 * 0.25, abs=1e-6)
