@@ -138,7 +138,7 @@ def read(root: Path) -> Dataset:
     if not entries["train"]:
         raise errors.DatasetError(f"{root / 'transforms_train.json'}: expected at least one frame, found none")
 
-    camera_names = _CameraNames()
+    camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]])
     views = {split: _make_views(root, split, entries[split], camera_names) for split in SPLITS}
     views = _attach_mask_colors(views)
     every = [view for split in SPLITS for view in views[split]]
@@ -237,19 +237,39 @@ def load_split(
 
 
 class _CameraNames:
-    """Gives views of equal camera one name: the file's, or cam0, cam1, ...; a camera that moves gets @1, @2, ..."""
+    """Gives views of equal camera one name: the file's, or cam0, cam1, ...; a camera that moves gets @1, @2, ...
 
-    def __init__(self) -> None:
+    Cameras are equal where they agree to a millionth: of the image's size, of a radian, and of the distance between
+    cameras, so that neither the unit of the world nor its origin matters.
+
+    Args:
+        entries: All views of the data set; a made name is none of those that they give.
+    """
+
+    def __init__(self, entries: list[transforms.Entry]) -> None:
+        centers = np.array([entry.matrix[:3, 3] for entry in entries], np.float64)
+        middle = np.median(centers, axis=0)
+        apart = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+        self.step = max(1e-6 * apart, 1e-9 * float(np.linalg.norm(middle)), 1e-300)
+        self.taken = {entry.camera for entry in entries if entry.camera}
         self.by_key: dict[tuple, str] = {}
         self.uses: dict[str, int] = {}
 
     def name(self, given: str, camera: cameras.Camera) -> str:
-        numbers = np.concatenate([camera.intrinsics.ravel(), camera.T_cam_world.ravel()])
-        key = (given, camera.width, camera.height, np.round(numbers, 6).tobytes())
+        lens, turn = camera.intrinsics.ravel() / camera.width, camera.T_cam_world[:3, :3].ravel()
+        numbers = np.round(np.concatenate([lens / 1e-6, turn / 1e-6, camera.center / self.step]))
+        key = (given, camera.width, camera.height, (numbers + 0.0).tobytes())  # one zero: -0.0 has other bytes
         if key not in self.by_key:
             count = self.uses.get(given, 0)
+            name = given
+            while not given or count:
+                name = f"{given}@{count}" if given else f"cam{count}"
+                if name not in self.taken:
+                    break
+                count += 1
             self.uses[given] = count + 1
-            self.by_key[key] = (f"{given}@{count}" if count else given) if given else f"cam{count}"
+            self.taken.add(name)
+            self.by_key[key] = name
         return self.by_key[key]
 
 

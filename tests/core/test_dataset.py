@@ -105,6 +105,44 @@ def test_named_cameras_keep_their_name_and_moving_ones_are_told_apart(flat):
     assert [view.camera.name for view in data.train] == ["left", "walk", "left", "walk", "left", "walk@1"]
 
 
+def test_made_names_are_none_of_the_given_ones(flat):
+    names = ["cam0", "", "walk@1", "walk", "cam1", "walk"]
+
+    def edit(content):
+        for i, (frame, name) in enumerate(zip(content["frames"], names, strict=True)):
+            frame["transform_matrix"] = camera_matrix(0.3 * i)
+            if name:
+                frame["view"] = name
+
+    change(flat, edit)
+    data = dataset.read(flat)
+    assert [view.camera.name for view in data.train] == ["cam0", "cam2", "walk@1", "walk", "cam1", "walk@2"]
+    assert len({camera.name for camera in data.cameras}) == len(data.cameras)
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1.0, 1e5])
+@pytest.mark.parametrize("shift", [0.0, 20.0])
+def test_which_cameras_are_one_does_not_depend_on_the_unit_or_the_origin(flat, scale, shift):
+    """Two cameras stand a hundredth of their distance from the scene apart; a third repeats one up to rounding."""
+    positions = [
+        (4.0, 0.0, 2.0),
+        (4.0, 0.04, 2.0),
+        (4.0, 1e-10, 2.0),
+        (0.0, 4.0, 2.0),
+        (-4.0, 0.0, 2.0),
+        (0, -4.0, 2.0),
+    ]
+
+    def edit(content):
+        for frame, position in zip(content["frames"], positions, strict=True):
+            matrix = np.array(camera_matrix(0.0))
+            matrix[:3, 3] = scale * (np.array(position) + shift)
+            frame["transform_matrix"] = matrix.tolist()
+
+    change(flat, edit)
+    assert [view.camera.name for view in dataset.read(flat).train] == ["cam0", "cam1", "cam0", "cam2", "cam3", "cam4"]
+
+
 def test_the_nested_layout_gives_the_same_views(flat, tmp_path_factory):
     root = tmp_path_factory.mktemp("nested")
     shutil.copytree(flat, root, dirs_exist_ok=True)
