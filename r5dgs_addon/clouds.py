@@ -55,13 +55,6 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
 
 
-def read_positions(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Positions of the points in the object's own space. [N, 3] float32"""
-    positions = np.empty(3 * len(cloud.points), np.float32)
-    cloud.attributes["position"].data.foreach_get("vector", positions)
-    return positions.reshape(-1, 3)
-
-
 def material(name: str) -> bpy.types.Material:
     """A material that shows `display_color` as it is, without light."""
     result = bpy.data.materials.new(name)

@@ -19,6 +19,7 @@ from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
 from r5dgs_core.train import config
+from tests import scenes
 
 T_MAX = 0.75
 OBSERVED = np.linspace(0.0, T_MAX, 6)
@@ -201,7 +202,7 @@ def orbit_camera(angle_rad: float, width: int, height: int) -> cameras.Camera:
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
-    return cameras.from_field_of_view(matrix, FIELD_OF_VIEW, width, height)
+    return scenes.camera_from_field_of_view(matrix, FIELD_OF_VIEW, width, height)
 
 
 def _floor(rng: np.random.Generator):

@@ -150,9 +150,18 @@ def orbit_camera(angle_rad: float, width: int = 96, height: int = 72) -> cameras
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
-    return cameras.from_field_of_view(matrix, 0.9, width, height, f"orbit_{angle_rad:.2f}")
+    return camera_from_field_of_view(matrix, 0.9, width, height, f"orbit_{angle_rad:.2f}")
 
 
 def _name(object_id: int) -> str:
     turn, index = divmod(object_id - 1, len(NAMES))
     return NAMES[index] if turn == 0 else f"{NAMES[index]} {turn + 1}"
+
+
+def camera_from_field_of_view(
+    matrix_world: np.ndarray, angle_x_rad: float, width: int, height: int, name: str = ""
+) -> cameras.Camera:
+    """A camera with square pixels from its pose (camera to world, OpenGL axes) and horizontal field of view."""
+    focal = 0.5 * width / np.tan(0.5 * angle_x_rad)
+    intrinsics = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return cameras.Camera(width, height, intrinsics, cameras.opengl_to_cam_world(matrix_world), name)

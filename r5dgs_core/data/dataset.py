@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -195,45 +194,6 @@ def load_mask(view: View) -> np.ndarray | None:
         return None
     ids = masks.read(view.mask_path, view.mask_colors)
     return masks.resize(ids, view.camera.width, view.camera.height, str(view.mask_path))
-
-
-def load_split(
-    dataset: Dataset,
-    split: str,
-    background: np.ndarray | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Load all images and masks of a split whose views have one size.
-
-    Args:
-        dataset: The data set.
-        split: "train", "val" or "test".
-        background: Colour behind transparent pixels, sRGB, white where None. [3]
-        progress: Called with images loaded and their number.
-
-    Returns:
-        Images, 8 bits, rounded [V, H, W, 3] uint8; object ids, -1 in views without mask [V, H, W] int32.
-    """
-    views = dataset.views(split)
-    if not views:
-        return np.zeros((0, 0, 0, 3), np.uint8), np.zeros((0, 0, 0), np.int32)
-    width, height = views[0].camera.width, views[0].camera.height
-    for view in views:
-        if (view.camera.width, view.camera.height) != (width, height):
-            raise errors.DatasetError(
-                f"{view.image_path}: {view.camera.width}x{view.camera.height}, but {views[0].image_path.name} is "
-                f"{width}x{height}; bring the images of a split to one size"
-            )
-    colors = np.empty((len(views), height, width, 3), np.uint8)
-    ids = np.full((len(views), height, width), -1, np.int32)
-    for i, view in enumerate(views):
-        colors[i] = images.to_uint8(load_image(view, background))
-        mask = load_mask(view)
-        if mask is not None:
-            ids[i] = mask
-        if progress is not None:
-            progress(i + 1, len(views))
-    return colors, ids
 
 
 class _CameraNames:

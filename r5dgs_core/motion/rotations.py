@@ -253,18 +253,6 @@ def quat_rates(quats: Array, angular_velocities: Array) -> Array:
     return 0.5 * multiply(pure, quats)
 
 
-def wxyz_to_xyzw(quats: Array) -> Array:
-    """Order of scipy, glTF and ROS. [..., 4]"""
-    xp = array_namespace(quats)
-    return xp.concatenate([quats[..., 1:], quats[..., :1]], -1)
-
-
-def xyzw_to_wxyz(quats: Array) -> Array:
-    """Our order from that of scipy, glTF and ROS. [..., 4]"""
-    xp = array_namespace(quats)
-    return xp.concatenate([quats[..., 3:], quats[..., :3]], -1)
-
-
 def identity(*shape: int) -> np.ndarray:
     """Identity quaternions, float64 numpy. [*shape, 4]"""
     quats = np.zeros((*shape, 4))

@@ -152,12 +152,6 @@ def miou_matched(counts: np.ndarray) -> float:
     return float(table[rows, columns].sum() / present.sum())
 
 
-def miou_macro(per_image: Sequence[np.ndarray]) -> float:
-    """Mean over images of `miou`, images without objects left out; NaN where there are none."""
-    values = [value for value in map(miou, per_image) if not math.isnan(value)]
-    return float(np.mean(values)) if values else math.nan
-
-
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """Rotation nearest to a matrix, or to the mean of rotations (chordal mean). [..., 3, 3]"""
     u, _, vt = np.linalg.svd(matrix)

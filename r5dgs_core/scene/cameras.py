@@ -42,30 +42,6 @@ class Camera:
         return self.T_cam_world[2, :3].copy()
 
 
-def from_field_of_view(
-    matrix_world: np.ndarray,  # [4, 4]
-    angle_x_rad: float,
-    width: int,
-    height: int,
-    name: str = "",
-) -> Camera:
-    """Make a camera from a camera-to-world matrix with OpenGL axes (Blender, D-NeRF) and a horizontal field of view.
-
-    Args:
-        matrix_world: Camera to world, OpenGL camera axes; a uniform scale is removed. [4, 4]
-        angle_x_rad: Horizontal field of view.
-        width: Image width in pixels.
-        height: Image height in pixels.
-        name: Name of the view.
-
-    Returns:
-        The camera, with square pixels and its principal point in the middle.
-    """
-    focal = 0.5 * width / np.tan(0.5 * angle_x_rad)
-    intrinsics = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
-    return Camera(width, height, intrinsics, opengl_to_cam_world(matrix_world), name)
-
-
 def opengl_to_cam_world(matrix_world: np.ndarray) -> np.ndarray:
     """Turn a camera-to-world matrix with OpenGL axes into ``T_cam_world`` with OpenCV axes. [4, 4] -> [4, 4]"""
     T_world_cam = np.asarray(matrix_world, np.float64) @ OPENGL_TO_OPENCV

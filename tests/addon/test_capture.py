@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from r5dgs_core import errors
 from r5dgs_core.data import dataset, images
 from r5dgs_core.scene import cameras
+from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytestmark = pytest.mark.blender
@@ -148,7 +149,7 @@ def test_every_rig_camera_looks_at_the_target_from_its_distance(service, kind, o
     assert [len(group) for group in groups] == [observed, novel]
     centers = []
     for pose in (*groups[0], *groups[1]):
-        camera = cameras.from_field_of_view(pose, 0.8, 64, 64)
+        camera = scenes.camera_from_field_of_view(pose, 0.8, 64, 64)
         pixel, depth = cameras.project(camera, target)
         np.testing.assert_allclose(pixel, [32, 32], atol=1e-9)
         assert depth == pytest.approx(7.0)

@@ -3,12 +3,12 @@ import pytest
 
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene import cameras
-from tests.scenes import orbit_camera
+from tests import scenes
 
 
 @pytest.fixture
 def camera():
-    return orbit_camera(0.7, 160, 90)
+    return scenes.orbit_camera(0.7, 160, 90)
 
 
 def test_conversion_to_opengl_and_back_is_exact():
@@ -22,7 +22,7 @@ def test_conversion_to_opengl_and_back_is_exact():
 
 
 def test_an_opengl_camera_looks_along_minus_z_with_y_up():
-    camera = cameras.from_field_of_view(np.eye(4), np.pi / 2, 100, 60)
+    camera = scenes.camera_from_field_of_view(np.eye(4), np.pi / 2, 100, 60)
     np.testing.assert_allclose(camera.forward, [0, 0, -1])
     np.testing.assert_allclose(camera.center, [0, 0, 0])
     # 90 degrees across 100 pixels: a point one to the right at depth one lies on the right edge; up is a smaller row.

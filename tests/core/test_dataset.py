@@ -222,16 +222,13 @@ def test_absent_splits_are_empty(flat):
     (flat / "transforms_test.json").unlink()
     data = dataset.read(flat)
     assert data.val == data.test == ()
-    assert dataset.load_split(data, "val")[0].shape[0] == 0
 
 
 def test_masks_are_optional_view_by_view(flat):
     (flat / "object_mask" / "train" / "r_001.png").unlink()
     data = dataset.read(flat)
     assert dataset.load_mask(data.train[1]) is None
-    colors, ids = dataset.load_split(data, "train")
-    assert colors.shape == (6, HEIGHT, WIDTH, 3) and colors.dtype == np.uint8
-    assert (ids[1] == -1).all() and set(np.unique(ids[0])) == {0, 1}
+    assert set(np.unique(dataset.load_mask(data.train[0]))) == {0, 1}
     shutil.rmtree(flat / "object_mask")
     assert all(view.mask_path is None for view in dataset.read(flat).train)
 
@@ -405,13 +402,6 @@ def test_a_folder_that_is_no_data_set_is_told_apart(tmp_path):
     write_json(tmp_path / "transforms.json", {})
     with pytest.raises(errors.DatasetError, match=r"split transforms\.json"):
         dataset.read(tmp_path)
-
-
-def test_images_of_different_sizes_cannot_be_stacked(flat):
-    images.write_png(flat / "train" / "r_004.png", np.zeros((HEIGHT, 2 * WIDTH, 3), np.uint8))
-    data = dataset.read(flat)
-    with pytest.raises(errors.DatasetError, match=r"r_004\.png: 24x8, but r_000\.png is 12x8"):
-        dataset.load_split(data, "train")
 
 
 def test_an_image_that_changed_since_reading_is_noticed(flat):

@@ -28,7 +28,7 @@ def looking(position, forward):
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
-    return cameras.from_field_of_view(matrix, 0.8, 32, 24)
+    return scenes.camera_from_field_of_view(matrix, 0.8, 32, 24)
 
 
 def test_the_focus_becomes_the_origin_and_the_cameras_stand_at_four_units():

@@ -127,8 +127,6 @@ def test_numpy_and_torch_agree_to_rounding():
         (rot.slerp, (p, q, f)),
         (rot.angle_between, (p, q)),
         (rot.quat_rates, (p, v)),
-        (rot.wxyz_to_xyzw, (p,)),
-        (rot.xyzw_to_wxyz, (p,)),
         (rot.cross, (v, v[::-1].copy())),
     ]
     for function, arguments in calls:
@@ -169,9 +167,3 @@ def test_rates_are_the_derivative():
 
 def test_the_zero_quaternion_becomes_the_identity():
     assert rot.normalize(np.zeros(4)).tolist() == [1.0, 0.0, 0.0, 0.0]
-
-
-def test_orders_convert_back():
-    q = random_quats(5)
-    np.testing.assert_array_equal(rot.xyzw_to_wxyz(rot.wxyz_to_xyzw(q)), q)
-    assert rot.wxyz_to_xyzw(np.array([1.0, 2, 3, 4])).tolist() == [2, 3, 4, 1]

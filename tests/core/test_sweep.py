@@ -42,7 +42,7 @@ def steep_camera(angle):
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
-    return cameras.from_field_of_view(matrix, 0.8, 64, 48)
+    return scenes.camera_from_field_of_view(matrix, 0.8, 64, 48)
 
 
 @pytest.fixture(scope="module")
