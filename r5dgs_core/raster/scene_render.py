@@ -1,9 +1,9 @@
 """A posed scene to a picture: the one place where evaluation, the worker and export turn Gaussians of a `Scene` into
 pixels.
 
-Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times its shading factor, with d the viewing direction in the world and A
-the map that brought the Gaussian from its bind state. Behind everything lies the scene's sky, the spherical harmonics
-`Scene.background_sh` along each pixel's ray, within [0, 1] as in training.
+Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times max(0, shading factor) as in training, with d the viewing
+direction in the world and A the map that brought the Gaussian from its bind state. Behind everything lies the scene's
+sky, the spherical harmonics `Scene.background_sh` along each pixel's ray, within [0, 1] as in training.
 """
 
 from __future__ import annotations
@@ -166,10 +166,11 @@ def render_frame(
         background = sky(scene, camera)
     with torch.no_grad():
         return rasterize(
-            _Gaussians(posed, camera),
+            _Gaussians(posed),
             camera,
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
             None if background is None else torch.from_numpy(np.ascontiguousarray(background, np.float32)),
+            colors=_tensor(colors(posed, camera)),
             settings=settings or RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         )
@@ -208,14 +209,13 @@ def to_numpy(value: Any, dtype: type) -> np.ndarray:
 
 
 class _Gaussians:
-    """What `rasterize` reads: the posed Gaussians, their final colour as harmonics of degree 0."""
+    """What `rasterize` reads of the posed Gaussians, beside their colours."""
 
-    def __init__(self, posed: PosedScene, camera: Camera):
+    def __init__(self, posed: PosedScene):
         self.means = _tensor(posed.means)
         self.quats = _tensor(posed.quats)
         self.log_scales = _tensor(posed.log_scales)
         self.opacity_logits = _tensor(posed.opacity_logits)
-        self.sh = _tensor(spherical_harmonics.rgb_to_dc(colors(posed, camera))[:, None, :])
         self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
 
 

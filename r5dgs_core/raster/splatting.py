@@ -77,6 +77,7 @@ def rasterize(
     features: torch.Tensor | None = None,  # [N, F]
     background: torch.Tensor | None = None,  # [3] or [H, W, 3]
     *,
+    colors: torch.Tensor | None = None,  # [N, 3]
     ids: bool = True,
     settings: RasterSettings | None = None,
     backend: str = "auto",
@@ -86,10 +87,11 @@ def rasterize(
 
     Args:
         gaussians: Anything with ``means``, ``quats``, ``log_scales``, ``opacity_logits``, ``sh`` [N, K, 3] and, if it
-            has them, ``object_ids`` [N] and ``shading_factor`` [N], which multiplies the colour.
+            has them, ``object_ids`` [N].
         camera: The view.
         features: Further values to blend, e.g. identity encodings. [N, F]
         background: Colour behind the Gaussians; black where None. [3] or [H, W, 3]
+        colors: Final colours, where the caller knows them better than `seen_colors`; ``sh`` is then not read. [N, 3]
         ids: Whether to find the object of each pixel where ``object_ids`` exist.
         settings: As in `rasterize_splats`, like ``backend`` and ``stats``.
 
@@ -98,7 +100,7 @@ def rasterize(
     """
     means = gaussians.means
     object_ids = getattr(gaussians, "object_ids", None) if ids else None
-    channels = shaded_colors(gaussians, camera)
+    channels = seen_colors(gaussians, camera) if colors is None else colors
     n_features = 0 if features is None else features.shape[-1]
     if features is not None and n_features:
         if features.ndim != 2 or len(features) != len(means):
@@ -142,17 +144,14 @@ def warm_up() -> float:
     return time.perf_counter() - start
 
 
-def shaded_colors(gaussians: Any, camera: Camera) -> torch.Tensor:
-    """Display-referred colour of each Gaussian from this camera: max(0, factor (0.5 + harmonics)). [N, 3]"""
+def seen_colors(gaussians: Any, camera: Camera) -> torch.Tensor:
+    """Display-referred colour of each Gaussian from this camera: max(0, 0.5 + harmonics). [N, 3]"""
     means, sh = gaussians.means, gaussians.sh
     if sh.shape[-2] == 1:
         colors = spherical_harmonics.dc_to_rgb(sh[:, 0])
     else:
         offsets = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
         colors = spherical_harmonics.to_rgb(sh, torch.nn.functional.normalize(offsets, dim=-1))
-    factor = getattr(gaussians, "shading_factor", None)
-    if factor is not None:
-        colors = colors * factor[:, None]
     return colors.clamp_min(0.0)
 
 

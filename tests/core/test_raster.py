@@ -401,14 +401,19 @@ def test_features_in_the_same_pass_equal_those_of_their_own():
     assert rasterize(scene, view, ids=False).ids is None
 
 
-def test_shading_multiplies_the_colour():
-    scene, view = gaussians(k=1), camera()
-    plain = rasterize(scene, view).color
-    scene.shading_factor = torch.full((300,), 0.5, requires_grad=True)
-    shaded = rasterize(scene, view).color
-    torch.testing.assert_close(shaded, 0.5 * plain)
-    shaded.sum().backward()
-    torch.testing.assert_close(scene.shading_factor.grad.sum(), plain.sum(), rtol=1e-4, atol=1e-4)
+def test_final_colours_take_the_place_of_the_harmonics():
+    scene, view = gaussians(k=4), camera()
+    colors = torch.rand(300, 3, requires_grad=True)
+    shown = rasterize(scene, view, colors=colors).color
+    expected = rasterize_splats(
+        scene.means, scene.quats, scene.log_scales.exp(), scene.opacity_logits.sigmoid(), colors, view
+    )
+    torch.testing.assert_close(shown, expected.image)
+    shown.sum().backward()
+    assert colors.grad.abs().sum() > 0
+    torch.testing.assert_close(
+        rasterize(scene, view, colors=splatting.seen_colors(scene, view)).color, rasterize(scene, view).color
+    )
 
 
 # Bad input

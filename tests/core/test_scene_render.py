@@ -166,3 +166,20 @@ def test_the_near_plane_is_the_scene_s(scene):
     far = dataclasses.replace(scene, near_plane=100.0)
     np.testing.assert_array_equal(image(far, frame), scene_render.sky(scene, CAMERA))
     np.testing.assert_array_equal(image(far, frame, settings=RasterSettings()), image(scene, frame))
+
+
+def test_neither_dark_colours_nor_turned_shading_give_light(scene):
+    """max(0, colour) times max(0, factor): two negatives are black, as in training."""
+    rng = np.random.default_rng(0)
+    dark = dataclasses.replace(
+        scene,
+        sh=rng.normal(scale=3.0, size=(300, 1, 3)).astype(np.float32),
+        shading=rng.normal(scale=3.0, size=(300, 3)).astype(np.float32),
+    )
+    frame = playback.frame(dark, 0.1)
+    rgb = 0.5 + 0.28209479177387814 * dark.sh[:, 0].astype(np.float64)
+    rotmats = rotations.quats_to_rotmats(frame.group_quats)[frame.motion_ids]
+    factor = 1 + ((np.swapaxes(rotmats, 1, 2) @ dark.light_direction - dark.light_direction) * dark.shading).sum(-1)
+    assert ((rgb < 0).any(-1) & (factor < 0)).any()
+    expected = np.maximum(rgb, 0) * np.maximum(factor, 0)[:, None]
+    np.testing.assert_allclose(scene_render.colors(scene_render.pose_frame(dark, frame), CAMERA), expected, atol=1e-4)
