@@ -110,9 +110,8 @@ def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
     count = len(scene.groups)
     quats, displacements = rotations.identity(count), np.zeros((count, 3))
     tau = t - scene.t_max
-    for g, group in enumerate(scene.groups):
-        if group.follows is None and not group.model.is_static:
-            quats[g], displacements[g] = models.evaluate(group.model, tau)
+    leaders = [g for g, group in enumerate(scene.groups) if group.follows is None]
+    quats[leaders], displacements[leaders] = models.evaluate_all([scene.groups[g].model for g in leaders], tau)
     for g, group in enumerate(scene.groups):
         if group.follows is not None and group.follow_matrix is not None:
             displacements[g] = group.follow_matrix @ displacements[group.follows]

@@ -45,6 +45,23 @@ def test_the_motion_converges_to_the_fitted_curve(name):
     assert rotations.angle_between(quats, expected) < 1e-12
 
 
+@pytest.mark.parametrize("tau", [0.0, 0.013, 1.7])
+def test_many_models_at_once_are_each_by_itself(tau):
+    group = [m for case in CASES.values() for m in (case, with_offsets(case), with_offsets(models.STATIC))]
+    # A kind ignores the rates that are not its own.
+    group.append(MotionModel("translation", velocity=[1, 2, 3], angular_velocity=[3, 2, 1], center_offset=[1, 1, 1]))
+    group.append(MotionModel("static", velocity=[1, 2, 3], angular_velocity=[3, 2, 1]))
+    assert {model.kind for model in group} == set(models.KINDS)
+    quats, displacements = models.evaluate_all(group, tau)
+    for model, quat, displacement in zip(group, quats, displacements, strict=True):
+        expected = models.evaluate(model, tau)
+        np.testing.assert_allclose(quat, expected[0], atol=1e-12)
+        np.testing.assert_allclose(displacement, expected[1], atol=1e-12)
+    assert [len(x) for x in models.evaluate_all([], tau)] == [0, 0]
+    with pytest.raises(ValueError, match="tau"):
+        models.evaluate_all(group, -0.1)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_rates_are_the_exact_derivative(name):
     model, tau, h = with_offsets(CASES[name]), np.array([0.01, 0.4, 1.7]), 1e-6
