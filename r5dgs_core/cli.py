@@ -7,25 +7,33 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 from pathlib import Path
 from typing import Any
 
 from . import __version__, errors
 
+log = logging.getLogger(__name__)
+
 
 def run_train(
-    data: Path, out: Path, *, config_path: Path | None, overrides: list[str], resume: bool, progress_kind: str
+    data: Path,
+    out: Path,
+    *,
+    config_path: Path | None,
+    overrides: list[str],
+    resume: bool,
+    overwrite: bool,
+    progress_kind: str,
 ) -> None:
     """Train a run folder from a data set (see `train.run.train`)."""
     from .progress import make
-    from .train import config, run
+    from .train import run
 
-    if resume and (config_path or overrides) and (out / "run.json").exists():
-        raise errors.ConfigError("--resume goes on with the run's own configuration; leave out --config and --set")
-    settings = config.load(config_path, overrides)
+    settings = run.settings(out, config_path, overrides, resume=resume)
     with make(progress_kind) as progress:
-        run.train(data, out, settings, resume=resume, progress=progress)
+        run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
 
 
 def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
@@ -36,7 +44,9 @@ def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
     print(f"{out}: {len(scene.means)} Gaussians, {sum(o.id > 0 for o in scene.objects)} objects, t_max {scene.t_max:g}")
 
 
-def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path: Path | None) -> dict[str, Any]:
+def run_evaluate(
+    target: Path, data: Path | None, *, modes: list[str], json_path: Path | None, progress_kind: str = "none"
+) -> dict[str, Any]:
     """Measure a run or scene file on its data set's held-out views; writes ``evaluation.json`` beside it.
 
     Args:
@@ -44,6 +54,7 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
         data: The data set; by default the one a run was trained on.
         modes: Playback modes.
         json_path: Where the result goes instead.
+        progress_kind: How progress is shown (`progress.make`).
 
     Returns:
         The evaluation, in the shape of ``evaluation.json``.
@@ -51,18 +62,24 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
     from rich.console import Console
 
     from .data import dataset as datasets
+    from .progress import make
     from .report import evaluate, table
-    from .scene import files, playback, scene_file
+    from .scene import playback, scene_file
     from .train import bake, checkpoint
 
     for mode in modes:
         if mode not in playback.MODES:
             raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.MODES)}")
+    if json_path is not None and (json_path.is_dir() or not json_path.parent.is_dir()):
+        expected = "a file" if json_path.is_dir() else f"the folder {json_path.parent} to exist; make it first"
+        raise errors.ConfigError(f"--json {json_path}: expected {expected}")
+    trained_on = None
     if target.is_dir():
         run = checkpoint.open_run(target)
         dataset = datasets.read(data if data is not None else run.dataset_root)
         scene = bake.bake(run, dataset)
-        default = target / "evaluation.json"
+        trained_on = run.digest
+        default = target / checkpoint.EVALUATION_FILE
     else:
         scene = scene_file.read(target)
         if data is None:
@@ -70,12 +87,24 @@ def run_evaluate(target: Path, data: Path | None, *, modes: list[str], json_path
                 f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR"
             )
         dataset = datasets.read(data)
+        trained_on = scene.provenance.get("dataset_digest")
         default = target.with_suffix(".evaluation.json")
-    result = evaluate.evaluate(scene, dataset, modes=modes, train=scene.provenance.get("train"))
+    if trained_on is not None and trained_on != dataset.digest:
+        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+    with make(progress_kind) as progress:
+        result = evaluate.evaluate(
+            scene,
+            dataset,
+            modes=modes,
+            train=scene.provenance.get("train"),
+            progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
+        )
     path = json_path or default
-    files.write(path, json.dumps(result, indent=2).encode())
-    Console().print(table.make(result))
-    print(f"written: {path}")
+    if progress_kind != "json":
+        Console().print(table.make(result))
+    evaluate.write(result, path)
+    if progress_kind != "json":
+        print(f"written: {path}")
     return result
 
 
@@ -114,17 +143,21 @@ def parser() -> argparse.ArgumentParser:
         p.add_argument(
             "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key; may be repeated"
         )
+        add_progress(p)
+        again = p.add_mutually_exclusive_group()
+        again.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+        again.add_argument("--overwrite", action="store_true", help="begin again where there is a run")
+
+    def add_progress(p: argparse.ArgumentParser) -> None:
         p.add_argument("--progress", choices=("auto", "json", "none"), default="auto", help="how progress is shown")
 
     demo = commands.add_parser("demo", help="train, bake and measure the bundled data set")
     demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="run folder (default: demo)")
-    demo.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     add_training(demo)
 
     train = commands.add_parser("train", help="train a data set into a run folder")
     train.add_argument("data", type=Path, help="data set folder with transforms_train.json")
     train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
-    train.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
     add_training(train)
 
     bake = commands.add_parser("bake", help="turn a run into a scene file")
@@ -137,6 +170,7 @@ def parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
     evaluate.add_argument("--mode", action="append", metavar="MODE", help="playback mode; may be repeated")
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
+    add_progress(evaluate)
 
     info = commands.add_parser("info", help="say what is in a scene file")
     info.add_argument("file", type=Path, help=".r5dgs file")
@@ -170,6 +204,7 @@ def _dispatch(args: argparse.Namespace) -> None:
             config_path=args.config,
             overrides=args.set,
             resume=args.resume,
+            overwrite=args.overwrite,
             progress_kind=args.progress,
         )
     elif args.command == "train":
@@ -179,12 +214,15 @@ def _dispatch(args: argparse.Namespace) -> None:
             config_path=args.config,
             overrides=args.set,
             resume=args.resume,
+            overwrite=args.overwrite,
             progress_kind=args.progress,
         )
     elif args.command == "bake":
         run_bake(args.run, args.out, args.data)
     elif args.command == "evaluate":
-        run_evaluate(args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json)
+        run_evaluate(
+            args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress
+        )
     else:
         run_info(args.file, as_json=args.json)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,18 @@ def bundled_data() -> Path:
 
 
 def run_demo(
-    out: Path, *, config_path: Path | None, overrides: list[str], resume: bool, progress_kind: str
+    out: Path,
+    *,
+    config_path: Path | None,
+    overrides: list[str],
+    resume: bool,
+    overwrite: bool = False,
+    progress_kind: str,
 ) -> dict[str, Any]:
     """Train, bake and measure the bundled data set.
 
-    Writes into ``out``: the run, ``demo.r5dgs``, ``evaluation.json`` and ``contact_sheet.png``; prints the table.
+    Writes into ``out``: the run, ``demo.r5dgs``, ``evaluation.json`` and ``contact_sheet.png``; prints the table. Where
+    ``out`` holds a demo already, it begins again, unless it is to ``resume``; any other run takes ``overwrite``.
 
     Returns:
         The evaluation.
@@ -40,22 +48,51 @@ def run_demo(
     from .data import dataset as datasets
     from .progress import make
     from .report import contact_sheet, evaluate, table
-    from .scene import files, scene_file
-    from .train import bake, config, run
+    from .scene import scene_file
+    from .train import bake, checkpoint, run, stopping
 
     began = time.monotonic()
     data = bundled_data()
-    settings = config.load(config_path, overrides)
+    settings = run.settings(out, config_path, overrides, resume=resume)
+    go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
-        trained = run.train(data, out, settings, resume=resume, progress=progress)
-    dataset = datasets.read(data)
-    scene = bake.bake(trained, dataset)
-    scene_path = scene_file.write(scene, out / "demo.r5dgs")
-    result = evaluate.evaluate(scene, dataset, train=scene.provenance["train"])
-    files.write(out / "evaluation.json", json.dumps(result, indent=2).encode())
-    sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")
+        trained = run.train(
+            data,
+            out,
+            settings,
+            resume=resume,
+            overwrite=overwrite or _is_demo(out / checkpoint.RUN_FILE),
+            go_on=go_on,
+            progress=progress,
+        )
+        with stopping.at_once(f"stopped after training; go on with: {go_on}"):
+            progress({"event": "bake", "text": "motion models and scene file"})
+            dataset = datasets.read(data)
+            scene = bake.bake(trained, dataset)
+            scene_path = scene_file.write(scene, out / "demo.r5dgs")
+            result = evaluate.evaluate(
+                scene,
+                dataset,
+                train=scene.provenance["train"],
+                progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
+            )
     if progress_kind != "json":
         Console().print(table.make(result))
-        print(f"scene:         {scene_path}\ncontact sheet: {sheet}\ntable:         {out / 'evaluation.json'}")
+    with make(progress_kind) as progress, stopping.at_once(f"stopped before the contact sheet; go on with: {go_on}"):
+        json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)
+        progress({"event": "sheet", "text": "contact sheet"})
+        sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")
+        if progress_kind == "json":
+            progress({"event": "written", "scene": str(scene_path), "table": str(json_path), "sheet": str(sheet)})
+    if progress_kind != "json":
+        print(f"scene:         {scene_path}\ncontact sheet: {sheet}\ntable:         {json_path}")
         print(f"{time.monotonic() - began:.0f} s in all; open the scene in Blender: File > Import > R5DGS scene")
     return result
+
+
+def _is_demo(run_file: Path) -> bool:
+    """Whether a run was trained on the bundled data set, of this or an earlier version."""
+    try:
+        return Path(json.loads(run_file.read_text(encoding="utf-8"))["dataset"]).name == NAME
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -12,6 +12,7 @@ from typing import Any
 Event = dict[str, Any]
 Progress = Callable[[Event], None]
 PLAIN_EVERY_S = 10.0
+LABELS = {"step": "train", "identity": "identities"}  # of the bars; others are called like their event
 
 
 @contextmanager
@@ -34,28 +35,34 @@ def make(kind: str) -> Iterator[Progress]:
 
 @contextmanager
 def _rich() -> Iterator[Progress]:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
     columns = [
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
+        TextColumn("{task.fields[count]}"),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     ]
     with Progress(*columns) as bars:
-        tasks: dict[str, Any] = {}
+        tasks: dict[str, TaskID] = {}
+        waiting: list[TaskID] = []
+        steps = [0]
 
         def show(event: Event) -> None:
-            if event["event"] == "start":
-                tasks["step"] = bars.add_task("train", total=event["iterations"], note="preparing")
-            elif event["event"] in ("step", "identity"):
-                name = event["event"]
+            name, position = str(event["event"]), count_of(event)
+            for task in waiting:  # what had no measure is over when the next thing is told
+                bars.update(task, total=1, completed=1)
+            waiting.clear()
+            if name == "start":
+                steps[0] = event["iterations"]
+            elif position is not None:
+                done, total = position[0], position[1] or steps[0]
                 if name not in tasks:
-                    tasks[name] = bars.add_task("identities", total=event["iterations"], note="")
-                bars.update(tasks[name], completed=event["iteration"], note=describe(event))
+                    tasks[name] = bars.add_task(LABELS.get(name, name), total=total, count="", note="")
+                bars.update(tasks[name], completed=done, count=f"{done}/{total}", note=describe(event))
+            elif "text" in event:
+                waiting.append(bars.add_task(name, total=None, count="", note=event["text"]))
 
         yield show
 
@@ -64,19 +71,30 @@ def _plain() -> Progress:
     last = [0.0]
 
     def show(event: Event) -> None:
-        now = time.monotonic()
-        if event["event"] not in ("step", "identity"):
+        now, position = time.monotonic(), count_of(event)
+        if position is None:
             print(f"{event['event']}: {describe(event)}", flush=True)
         elif now - last[0] >= PLAIN_EVERY_S:
             last[0] = now
-            print(f"{event['event']} {event['iteration']}: {describe(event)}", flush=True)
+            print(f"{event['event']} {position[0]}: {describe(event)}", flush=True)
 
     return show
+
+
+def count_of(event: Event) -> tuple[int, int | None] | None:
+    """How far something with a measure is, and where it ends if the event says; None for other events."""
+    if "iteration" in event:
+        return event["iteration"], event.get("iterations")
+    if "done" in event:
+        return event["done"], event["total"]
+    return None
 
 
 def describe(event: Event) -> str:
     """An event in a few words."""
     parts = []
+    if "text" in event:
+        parts.append(event["text"])
     if "loss" in event:
         parts.append(f"loss {event['loss']:.4f}")
     if "gaussians" in event:
@@ -85,4 +103,6 @@ def describe(event: Event) -> str:
         parts.append(f"{event['seconds_left']:.0f} s left")
     if "iterations" in event and "loss" not in event:
         parts.append(f"{event['iterations']} steps")
+    if "total" in event:
+        parts.append(f"of {event['total']} images")
     return ", ".join(parts)

@@ -6,19 +6,22 @@ to 8 bits before they are measured, as a file would hold them.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..data import dataset as datasets
 from ..data import images
+from ..errors import ConfigError
 from ..motion import rotations
 from ..raster import scene_render
-from ..scene import playback
+from ..scene import files, playback
 from ..scene.cameras import Camera
 from ..scene.scene import MotionGroup, Scene
 from . import metrics
@@ -108,6 +111,19 @@ def evaluate(
         "gaussians": given.get("gaussians", len(scene.means)),
     }
     return result
+
+
+def write(evaluation: dict[str, Any], path: Path) -> Path:
+    """Write an evaluation as JSON; returns ``path``.
+
+    Raises:
+        ConfigError: It cannot be written there.
+    """
+    try:
+        files.write(path, json.dumps(evaluation, indent=2).encode())
+    except OSError as error:
+        raise ConfigError(f"{path}: the evaluation cannot be written: {error}") from error
+    return path
 
 
 def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:

@@ -249,6 +249,11 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None) -> Scene
 
     run = checkpoint.open_run(folder)
     dataset = datasets.read(dataset_root if dataset_root is not None else run.dataset_root)
+    if dataset.digest != run.digest:
+        raise CheckpointError(
+            f"{dataset.root}: is not the data that {folder} was trained on, or has changed since; "
+            "name that data with --data, or train again"
+        )
     scene = bake(run, dataset)
     scene_file.write(scene, out)
     return scene

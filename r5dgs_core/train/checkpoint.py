@@ -21,14 +21,14 @@ from torch import Tensor
 
 from .. import __version__
 from ..data.dataset import Dataset
-from ..errors import CheckpointError
+from ..errors import CheckpointError, ConfigError
 from ..model.gaussians import PARAMETERS
 from ..scene import files
 from . import config as configs
 from .config import Config
 
 FORMAT_VERSION = 1
-RUN_FILE, CHECKPOINT_FILE, LOG_FILE = "run.json", "checkpoint.pt", "log.jsonl"
+RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = "run.json", "checkpoint.pt", "log.jsonl", "evaluation.json"
 
 
 @dataclass(frozen=True)
@@ -99,19 +99,33 @@ def versions() -> dict[str, str]:
     }
 
 
-def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
-    """Make a run folder and write its ``run.json``.
+def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
+    """The run that `create_run` would make; nothing is written.
 
     Raises:
         CheckpointError: The folder exists and holds something else than a run.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not (folder / RUN_FILE).exists())):
+    try:
+        half_written = files.leftovers(folder / RUN_FILE)  # all that a kill at the very start leaves
+        foreign = folder.exists() and (
+            not folder.is_dir()
+            or (not (folder / RUN_FILE).exists() and any(path not in half_written for path in folder.iterdir()))
+        )
+    except OSError as error:
+        raise CheckpointError(f"{folder}: cannot be read: {error}; choose another --out") from error
+    if foreign:
         raise CheckpointError(f"{folder}: exists and is not a run folder; choose another --out")
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in (CHECKPOINT_FILE, LOG_FILE):
-        (folder / old).unlink(missing_ok=True)
-    run = Run(folder, Path(dataset.root).resolve(), dataset.digest, config, versions())
+    return Run(folder, Path(dataset.root).resolve(), dataset.digest, config, versions())
+
+
+def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
+    """Make a run folder, or empty one of what an earlier run left, and write its ``run.json``.
+
+    Raises:
+        CheckpointError: The folder exists and holds something else than a run, or cannot be written.
+    """
+    run = plan_run(folder, dataset, config)
     text = {
         "format_version": FORMAT_VERSION,
         "dataset": str(run.dataset_root),
@@ -119,8 +133,34 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         "config": config.to_dict(),
         "versions": run.versions,
     }
-    files.write(folder / RUN_FILE, json.dumps(text, indent=2).encode())
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        for name in (CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE):
+            (run.folder / name).unlink(missing_ok=True)
+        remove_leftovers(run.folder)
+        files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
+    except OSError as error:
+        raise CheckpointError(f"{run.folder}: cannot be made or written: {error}; choose another --out") from error
     return run
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a kill in the middle of writing left in a run folder."""
+    for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE):
+        for path in files.leftovers(Path(folder) / name):
+            path.unlink(missing_ok=True)
+
+
+def refuse_to_lose(folder: Path) -> None:
+    """Raise CheckpointError where a folder holds a run that a new one would replace."""
+    folder = Path(folder)
+    if not ((folder / RUN_FILE).exists() and (folder / CHECKPOINT_FILE).exists()):
+        return
+    try:
+        found = f"a run at step {load(folder).iteration}; add --resume to go on, or"
+    except CheckpointError:
+        found = "a run whose checkpoint cannot be read; add"
+    raise CheckpointError(f"{folder}: holds {found} --overwrite to begin again")
 
 
 def open_run(folder: Path) -> Run:
@@ -132,20 +172,29 @@ def open_run(folder: Path) -> Run:
     path = Path(folder) / RUN_FILE
     try:
         text = json.loads(path.read_text(encoding="utf-8"))
-        version = text["format_version"]
-        if version != FORMAT_VERSION:
-            raise CheckpointError(f"{path}: expected format_version {FORMAT_VERSION}, got {version}")
-        return Run(
-            Path(folder),
-            Path(text["dataset"]),
-            text["digest"],
-            configs.from_dict(text["config"]),
-            text["versions"],
-        )
-    except FileNotFoundError:
+        found, made_by = text["format_version"], text["versions"]
+        place, digest, settings = Path(text["dataset"]), text["digest"], text["config"]
+    except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'") from None
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path}: damaged ({type(error).__name__}: {error}); train again") from None
+        raise CheckpointError(
+            f"{path}: damaged ({type(error).__name__}: {error}); train again with --overwrite"
+        ) from None
+    if found != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{path}: expected format_version {FORMAT_VERSION}, got {found}; train again with --overwrite, "
+            "or use the version of r5dgs that made it"
+        )
+    try:
+        return Run(Path(folder), place, digest, configs.from_dict(settings), made_by)
+    except (ConfigError, AttributeError) as error:
+        by = made_by.get("r5dgs", "another version") if isinstance(made_by, dict) else "another version"
+        raise CheckpointError(
+            f"{path}: the configuration is not one of r5dgs {__version__} (made by {by}): {error}; "
+            "train again with --overwrite, or use the version that made it"
+        ) from error
 
 
 def save(folder: Path, state: Checkpoint) -> None:
@@ -177,20 +226,22 @@ def load(folder: Path) -> Checkpoint:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise CheckpointError(f"{path}: no checkpoint yet; train without --resume") from None
+        raise CheckpointError(f"{path}: no checkpoint yet; go on with 'r5dgs train ... --resume'") from None
+    except PermissionError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
     except Exception as error:  # torch raises many kinds for a damaged file
-        raise CheckpointError(f"{path}: damaged ({type(error).__name__}); train again") from error
+        raise CheckpointError(f"{path}: damaged ({type(error).__name__}); train again with --overwrite") from error
     if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(f"{path}: expected a checkpoint of format_version {FORMAT_VERSION}")
     for name, (good, expected) in _RULES.items():
         if name not in content:
-            raise CheckpointError(f"{path}: expected '{name}', found none; train again")
+            raise CheckpointError(f"{path}: expected '{name}', found none; train again with --overwrite")
         if not good(content[name]):
             found = type(content[name]).__name__
-            raise CheckpointError(f"{path}: '{name}': expected {expected}, found {found}; train again")
+            raise CheckpointError(f"{path}: '{name}': expected {expected}, found {found}; train again with --overwrite")
     for name in TENSORS:
         if name not in content["tensors"]:
-            raise CheckpointError(f"{path}: expected the tensor '{name}', found none; train again")
+            raise CheckpointError(f"{path}: expected the tensor '{name}', found none; train again with --overwrite")
     values: dict[str, Any] = {name: content[name] for name in _RULES}
     return Checkpoint(**values)
 

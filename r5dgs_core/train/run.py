@@ -4,25 +4,40 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import signal
+import logging
+import shlex
 import time
-from collections.abc import Callable
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 
 from ..data import dataset as datasets
-from ..errors import CheckpointError, Interrupted
+from ..errors import CheckpointError, ConfigError, Interrupted
+from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, identity, representation
+from . import checkpoint, identity, representation, stopping
+from . import config as configs
 from .config import Config
 from .posing import Splats
 from .trainer import Trainer
 from .views import TrainView
 
+log = logging.getLogger(__name__)
+
 Progress = Callable[[dict[str, Any]], None]
+
+
+def settings(folder: Path, config_path: Path | None, overrides: Sequence[str], *, resume: bool) -> Config:
+    """Configuration for `train`: a file and overrides, which a run that is resumed does not take.
+
+    Raises:
+        ConfigError: Something cannot be used, or is given for a run that has its own configuration.
+    """
+    if resume and (config_path or overrides) and (Path(folder) / checkpoint.RUN_FILE).exists():
+        raise ConfigError("--resume goes on with the run's own configuration; leave out --config and --set")
+    return configs.load(config_path, tuple(overrides))
 
 
 def train(
@@ -31,6 +46,8 @@ def train(
     config: Config,
     *,
     resume: bool = False,
+    overwrite: bool = False,
+    go_on: str | None = None,
     progress: Progress | None = None,
 ) -> checkpoint.Run:
     """Train a run folder from a data set.
@@ -40,54 +57,70 @@ def train(
         folder: Run folder; made, or gone on with.
         config: Configuration; with ``resume`` the folder's own is used.
         resume: Go on from the last checkpoint; where training is finished, nothing is done.
-        progress: Called with a dictionary per logged step.
+        overwrite: Begin again where the folder holds a run; its files stay until the first step can be taken.
+        go_on: The command that resumes this run, for messages; by default that of ``r5dgs train``.
+        progress: Called with a dictionary per event (docs/training.md).
 
     Returns:
         The run.
 
     Raises:
         DatasetError, CheckpointError, TrainingError: As their messages say.
-        Interrupted: SIGINT or SIGTERM came; the checkpoint is written.
+        Interrupted: SIGINT or SIGTERM came; everything is kept that is needed to go on.
     """
     progress = progress or (lambda event: None)
+    folder = Path(folder)
+    if resume and not (folder / checkpoint.RUN_FILE).exists():
+        log.warning("%s: no run to go on with; starting a new one", folder)
+        resume = False
+    if not resume and not overwrite:
+        checkpoint.refuse_to_lose(folder)
     dataset = datasets.read(dataset_root)
-    if resume and (Path(folder) / checkpoint.RUN_FILE).exists():
+    go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
+    state, replaces = None, False
+    if resume:
         run = checkpoint.open_run(folder)
-        config = run.config
         if run.digest != dataset.digest:
             raise CheckpointError(
                 f"{folder}: was trained on other data than {dataset_root} now holds; "
                 "restore the data set or train into another folder"
             )
+        state = checkpoint.load(folder) if (folder / checkpoint.CHECKPOINT_FILE).exists() else None
     else:
-        resume = False
-        run = checkpoint.create_run(folder, dataset, config)
-    progress({"event": "start", "iterations": config.train.iterations, "dataset": str(dataset_root)})
+        replaces = (folder / checkpoint.CHECKPOINT_FILE).exists()
+        run = (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config)
+    iterations = run.config.train.iterations
+    progress({"event": "start", "iterations": iterations, "dataset": str(dataset_root)})
     began = time.monotonic()
-    state = None
-    if resume and (run.folder / checkpoint.CHECKPOINT_FILE).exists():
-        state = checkpoint.load(folder)
-        if state.finished:
-            progress({"event": "done", "gaussians": len(state.tensors["gaussians.means"])})
-            return run
-    trainer = Trainer(dataset, config)
+    if state is not None and state.finished:
+        progress({"event": "done", "gaussians": len(state.tensors["gaussians.means"])})
+        return run
+    kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
+    with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
+        progress({"event": "prepare", "text": "kernels; the first run compiles them"})
+        warm_up()
+        progress({"event": "prepare", "text": "images, objects, background"})
+        trainer = Trainer(dataset, run.config)
+    if replaces:
+        run = checkpoint.create_run(folder, dataset, config)
     if state is not None:
         trainer.restore(state)
-        _trim_log(run.folder / checkpoint.LOG_FILE, trainer.iteration)
         began -= state.seconds
-    _optimise(trainer, run, began, progress)
-    _finish(trainer, run, began, progress)
+    _clean_up(folder, trainer.iteration)
+    _optimise(trainer, run, began, go_on, progress)
+    with stopping.at_once(f"stopped after the last step, before the labels are made; go on with: {go_on}"):
+        _finish(trainer, run, began, progress)
     progress({"event": "done", "gaussians": len(trainer.gaussians)})
     return run
 
 
-def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
+def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, go_on: str, progress: Progress) -> None:
+    """Take all steps that are left, with a line in the log now and then and a checkpoint now and then."""
     section = trainer.config.train
     last, last_time = trainer.iteration, time.monotonic()
-    with (
-        _signals() as asked,
-        open(run.folder / checkpoint.LOG_FILE, "a", encoding="utf-8") as log,
-    ):
+    path = run.folder / checkpoint.LOG_FILE
+    after = _identity_steps(trainer)
+    with stopping.collected() as asked, _open_log(path) as stream:
         while not trainer.done:
             trainer.step()
             if trainer.iteration % section.log_every == 0 or trainer.done:
@@ -100,27 +133,63 @@ def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, progress: Pro
                     "loss": trainer.running_loss,
                     "gaussians": len(trainer.gaussians),
                     "seconds": now - began,
-                    "seconds_left": rate * (section.iterations - trainer.iteration),
+                    "seconds_left": rate * (section.iterations - trainer.iteration + after),
                 }
-                log.write(json.dumps(event) + "\n")
-                log.flush()
+                _append(path, stream, event)
                 progress(event)
             stop = bool(asked)
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
                 _save(trainer, run, began, finished=False)
             if stop:
-                raise Interrupted(
-                    f"stopped at step {trainer.iteration}; go on with: r5dgs train {run.dataset_root} "
-                    f"--out {run.folder} --resume"
-                )
+                raise Interrupted(f"stopped at step {trainer.iteration}; go on with: {go_on}")
 
 
-def _trim_log(path: Path, iteration: int) -> None:
-    """Drop the lines of steps that were taken after the checkpoint and will be taken again."""
-    if path.exists():
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
-        kept = [line for line in lines if json.loads(line)["iteration"] <= iteration]
-        files.write(path, "".join(line + "\n" for line in kept).encode())
+def _identity_steps(trainer: Trainer) -> int:
+    """Steps that the identity encodings will take; each costs about what one of training does."""
+    masked = any(view.mask is not None for view in trainer.views)
+    return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
+
+
+def _open_log(path: Path) -> TextIO:
+    try:
+        return open(path, "a", encoding="utf-8")
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written: {error}") from error
+
+
+def _append(path: Path, stream: TextIO, event: dict[str, Any]) -> None:
+    try:
+        stream.write(json.dumps(event) + "\n")
+        stream.flush()
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written: {error}; make room and go on with --resume") from error
+
+
+def _clean_up(folder: Path, iteration: int) -> None:
+    """Drop the log's lines of steps that will be taken again, a torn line, and half-written files."""
+    path = folder / checkpoint.LOG_FILE
+    kept = []
+    try:
+        checkpoint.remove_leftovers(folder)
+        if not path.exists():
+            return
+        for line in path.read_bytes().splitlines():
+            event = _parse(line)
+            if event is None or event["iteration"] > iteration:
+                break
+            kept.append(line + b"\n")
+        files.write(path, b"".join(kept))
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written: {error}") from error
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    """A line of the log, None where a kill tore it."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) and isinstance(event.get("iteration"), int) else None
 
 
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
@@ -136,13 +205,17 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
         def pose(view: TrainView) -> Splats:
             return trainer.splats(view.camera, view.t)
 
+        progress({"event": "prepare", "text": "labels, by a vote of the masks"})
         extra["labels"] = identity.vote(trainer.views, pose, classes, fallback)
         section = trainer.config.identity
-        if section.iterations > 0 and len(classes) > 1:
+        steps, started = _identity_steps(trainer), time.monotonic()
+        if steps > 0:
 
             def report(step: int, loss: float) -> None:
-                if step % trainer.config.train.log_every == 0 or step == section.iterations:
-                    progress({"event": "identity", "iteration": step, "iterations": section.iterations, "loss": loss})
+                if step % trainer.config.train.log_every == 0 or step == steps:
+                    left = (time.monotonic() - started) / step * (steps - step)
+                    event = {"event": "identity", "iteration": step, "iterations": steps, "loss": loss}
+                    progress({**event, "seconds_left": left})
 
             # A generator of its own: a run resumed here draws what an unbroken one draws.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
@@ -165,25 +238,3 @@ def _save(
     tensors = {**state.tensors, **(extra or {})}
     seconds = time.monotonic() - began
     checkpoint.save(run.folder, dataclasses.replace(state, tensors=tensors, finished=finished, seconds=seconds))
-
-
-@contextmanager
-def _signals():
-    """Collect SIGINT and SIGTERM instead of dying of them; a second one of the same kind kills."""
-    asked: list[int] = []
-    previous: dict[int, Any] = {}
-
-    def note(number, frame):
-        asked.append(number)
-        signal.signal(number, previous[number])
-
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.signal(number, note)
-    except ValueError:  # not the main thread: the caller handles signals
-        previous.clear()
-    try:
-        yield asked
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

@@ -8,12 +8,16 @@ from r5dgs_core import progress
 
 EVENTS = [
     {"event": "start", "iterations": 100, "dataset": "data"},
+    {"event": "prepare", "text": "kernels"},
     *[
         {"event": "step", "iteration": i, "loss": 0.5 / i, "gaussians": 10 * i, "seconds_left": 100.0 - i}
         for i in range(1, 101)
     ],
     {"event": "identity", "iteration": 5, "iterations": 5, "loss": 0.1},
     {"event": "done", "gaussians": 1000},
+    {"event": "bake", "text": "motion models"},
+    {"event": "evaluate", "done": 3, "total": 9},
+    {"event": "sheet", "text": "contact sheet"},
 ]
 
 
@@ -43,22 +47,32 @@ def test_a_log_gets_few_lines(capsys, monkeypatch):
     monkeypatch.setattr(progress.time, "monotonic", clock)
     show("auto")
     lines = capsys.readouterr().out.splitlines()
-    assert 5 <= len(lines) <= 2 + len(EVENTS) / progress.PLAIN_EVERY_S + 1
-    assert lines[0] == "start: 100 steps" and lines[-1] == "done: 1000 Gaussians"
-    assert lines[1] == "step 1: loss 0.5000, 10 Gaussians, 99 s left"
+    told = [line for line in lines if ":" in line and not line.startswith(("step ", "identity ", "evaluate "))]
+    assert told == [
+        "start: 100 steps",
+        "prepare: kernels",
+        "done: 1000 Gaussians",
+        "bake: motion models",
+        "sheet: contact sheet",
+    ]
+    assert 5 <= len(lines) - len(told) <= 1 + len(EVENTS) / progress.PLAIN_EVERY_S
+    assert lines[2] == "step 1: loss 0.5000, 10 Gaussians, 99 s left"
 
 
 def test_a_terminal_gets_bars(capsys, monkeypatch):
     monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: True, raising=False)
     show("auto")
     shown = capsys.readouterr().out
-    assert "train" in shown and "100/100" in shown and "identities" in shown
+    for words in ("prepare", "kernels", "train", "100/100", "identities", "5/5", "bake", "evaluate", "3/9", "sheet"):
+        assert words in shown
 
 
 @pytest.mark.parametrize(
     ("event", "words"),
     [
         ({"event": "x"}, ""),
+        ({"event": "x", "text": "now this"}, "now this"),
+        ({"event": "x", "done": 3, "total": 9}, "of 9 images"),
         ({"event": "x", "iterations": 7}, "7 steps"),
         ({"event": "x", "loss": 0.25, "iterations": 7}, "loss 0.2500"),
     ],
