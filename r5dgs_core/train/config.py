@@ -225,6 +225,8 @@ def load(path: Path | None, overrides: list[str] | tuple[str, ...] = ()) -> Conf
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise ConfigError(f"{path}: no such configuration file") from None
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read: {error}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
     return from_dict(_merge(values, dict(_parse_override(text) for text in overrides)))

@@ -1,13 +1,18 @@
 """The command line: the way from images to a table, and one line on stderr for what the user can mend."""
 
+import contextlib
 import json
+import shlex
+import signal
 import subprocess
 import sys
 
 import pytest
 
-from r5dgs_core import __version__, cli, demo
+from r5dgs_core import __version__, cli, demo, progress
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.report import evaluate
+from r5dgs_core.scene import files
 from tests import datasets as tiny_datasets
 
 OPTIONS = [
@@ -146,3 +151,102 @@ def test_the_bundled_data_is_found_and_small():
 def test_missing_bundled_data_is_said(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(demo, "NAME", "nothing")
     assert "install r5dgs again" in complaint(capsys, "demo", "--out", tmp_path / "demo")
+
+
+def test_a_second_run_is_not_begun_over_the_first(made, tiny, capsys):
+    before = (made[0] / "checkpoint.pt").read_bytes()
+    line = complaint(capsys, "train", tiny.root, "--out", made[0], *OPTIONS)
+    assert f"{made[0]}: holds a run at step 20; add --resume to go on, or --overwrite to begin again" in line
+    assert (made[0] / "checkpoint.pt").read_bytes() == before
+
+
+def test_resume_and_overwrite_exclude_each_other(made, tiny, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--overwrite"])
+    assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
+
+
+def test_paths_of_the_wrong_kind_are_one_line(made, tiny, tmp_path, capsys):
+    file = tmp_path / "letter.txt"
+    file.write_text("mine")
+    assert f"{file}: not a run folder" in complaint(capsys, "bake", file, "--out", tmp_path / "x.r5dgs")
+    assert f"{file / 'run'}: cannot be made" in complaint(capsys, "train", tiny.root, "--out", file / "run", *OPTIONS)
+    assert f"{file}: exists and is not a run" in complaint(capsys, "train", tiny.root, "--out", file, *OPTIONS)
+    assert f"{tmp_path}: cannot be read" in complaint(
+        capsys, "train", tiny.root, "--out", tmp_path / "r", "--config", tmp_path
+    )
+    assert file.read_text() == "mine" and [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize("place", ["missing/deep/x.json", "."])
+def test_an_evaluation_that_could_not_be_written_is_refused_before_the_work(made, tmp_path, capsys, monkeypatch, place):
+    monkeypatch.setattr(evaluate, "evaluate", None)  # calling it would be a TypeError
+    assert "--json" in complaint(capsys, "evaluate", made[0], "--json", tmp_path / place)
+
+
+def test_the_table_is_shown_even_where_the_file_cannot_be_written(made, tmp_path, capsys, monkeypatch):
+    def full_disk(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "write", full_disk)
+    assert cli.main(["evaluate", str(made[0])]) == 1
+    shown = capsys.readouterr()
+    assert "PSNR" in shown.out and "No space left" in shown.err and str(made[0] / "evaluation.json") in shown.err
+
+
+def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, tmp_path, capsys, caplog):
+    other = tiny_datasets.make_dataset(tmp_path / "other", views=3)
+    line = complaint(capsys, "bake", made[0], "--out", tmp_path / "x.r5dgs", "--data", other.root)
+    assert f"{other.root}: is not the data that {made[0]} was trained on" in line
+    assert not (tmp_path / "x.r5dgs").exists()
+    for target in made:
+        caplog.clear()
+        assert cli.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
+        assert [r.getMessage() for r in caplog.records if r.name == cli.__name__] == [
+            f"{other.root}: {target} was trained on other data; measured all the same"
+        ]
+
+
+def test_evaluate_counts_its_images(made, tmp_path, capsys):
+    assert cli.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json"), "--progress", "json"]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(e["event"], e["done"], e["total"]) for e in events] == [("evaluate", k, 6) for k in range(1, 7)]
+
+
+@pytest.fixture
+def small_demo(tiny, monkeypatch):
+    """Makes the demo run on the tiny data set; returns its arguments without --out."""
+    monkeypatch.setattr(demo, "NAME", tiny.root.name)
+    monkeypatch.setattr(demo, "bundled_data", lambda: tiny.root)
+    return ["demo", *OPTIONS, "--progress", "json"]
+
+
+def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "my demo"
+    for _ in range(2):
+        assert cli.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
+        events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        kinds = list(dict.fromkeys(event["event"] for event in events))
+        assert kinds == ["start", "prepare", "step", "identity", "done", "bake", "evaluate", "sheet", "written"]
+        assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
+    assert "leave out --config and --set" in complaint(capsys, *small_demo, "--out", out, "--resume")
+    monkeypatch.setattr(demo, "NAME", "another data set")
+    line = complaint(capsys, *small_demo, "--out", made[0])
+    assert "add --resume to go on, or --overwrite" in line
+
+
+@pytest.mark.parametrize("moment", [{"event": "step", "iteration": 10}, {"event": "evaluate", "done": 1}])
+def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, capsys, monkeypatch, moment):
+    out = tmp_path / "my demo"
+
+    @contextlib.contextmanager
+    def stopping(kind):
+        yield lambda event: signal.raise_signal(signal.SIGINT) if moment.items() <= event.items() else None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(progress, "make", stopping)
+        assert cli.main([*small_demo, "--out", str(out)]) == 130
+    command = shlex.split(capsys.readouterr().err.split("go on with: ")[1])
+    assert command == ["r5dgs", "demo", "--out", str(out), "--resume"]
+    assert cli.main([*command[1:], "--progress", "none"]) == 0
+    assert (out / "contact_sheet.png").exists()
