@@ -15,6 +15,7 @@ from ..motion.models import MotionModel
 from .cameras import Camera
 
 ROLES = ("pinned", "body", "shadow")
+IDENTITY_DIM = 16  # numbers of an identity encoding (Gaussian Grouping)
 NEAR_PLANE = 0.01  # of a scene that does not say
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from .. import errors
 from . import cameras
 from .playback import runs
-from .scene import ROLES, MotionGroup, Scene
+from .scene import IDENTITY_DIM, ROLES, MotionGroup, Scene
 
 SH_BASES = (1, 4, 9, 16)
 _UNIT_TOLERANCE = 1e-3
@@ -38,8 +38,8 @@ def check(scene: Scene, place: str) -> None:
         "track_times": ((knots,), np.float64),
         "track_poses": ((groups, knots, 7), np.float64),
         "background_sh": ((scene.background_sh.shape[0], 3), None),
-        "identities": ((count, 16), None),
-        "classifier_weight": ((classes, 16), np.float32),
+        "identities": ((count, IDENTITY_DIM), None),
+        "classifier_weight": ((classes, IDENTITY_DIM), np.float32),
         "classifier_bias": ((classes,), np.float32),
         "shading": ((count, 3), np.float32),
         "light_direction": ((3,), None),

@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -72,7 +73,25 @@ class InitSection:
 
 @dataclass(frozen=True)
 class RatesSection:
-    """Learning rates of Adam, in normalised units."""
+    """Learning rates of Adam, in normalised units per step.
+
+    Attributes:
+        means: Centres.
+        log_scales: Logarithms of the standard deviations.
+        sh: Constant colour, as harmonics.
+        sh_rest: Colour that depends on the view.
+        opacity_logits: Opacities before the sigmoid.
+        quats: Orientations.
+        shading: How colours change as objects turn.
+        light: Direction of the light that they turn in.
+        translations: Displacements of the tracks.
+        rotvecs: Rotations of the tracks, rad.
+        slope: How shadows follow their casters.
+        background: Harmonics of the sky.
+        decay: Factor by which rates have fallen at the end of the run.
+        decay_floor_appearance: Appearance falls no lower than this factor.
+        decay_from: Share of the run before the rates begin to fall.
+    """
 
     means: float = 1e-3
     log_scales: float = 1e-2
@@ -155,13 +174,11 @@ class IdentitySection:
 
     Attributes:
         iterations: Steps; 0 leaves encodings and classifier out.
-        dim: Length of an encoding.
         rate: Learning rate of the encodings.
         classifier_rate: Learning rate of the classifier.
     """
 
     iterations: int = 400
-    dim: int = 16
     rate: float = 1e-2
     classifier_rate: float = 5e-3
 
@@ -268,26 +285,41 @@ def _check(name: str, value: Any, kind: type) -> Any:
 
 
 def _validate(config: Config) -> None:
-    train = config.train
-    rules = [
-        (train.iterations >= 1, "train.iterations", "at least 1", train.iterations),
-        (
-            train.representation in REPRESENTATIONS,
-            "train.representation",
-            " or ".join(REPRESENTATIONS),
-            train.representation,
-        ),
-        (train.background in BACKGROUNDS, "train.background", " or ".join(BACKGROUNDS), train.background),
-        (0 <= train.sh_degree <= 3, "train.sh_degree", "0 to 3", train.sh_degree),
-        (train.threads >= 1, "train.threads", "at least 1", train.threads),
-        (train.checkpoint_every >= 1, "train.checkpoint_every", "at least 1", train.checkpoint_every),
-        (train.log_every >= 1, "train.log_every", "at least 1", train.log_every),
-        (0 <= config.losses.ssim <= 1, "losses.ssim", "0 to 1", config.losses.ssim),
-        (config.init.sweep_depths >= 2, "init.sweep_depths", "at least 2", config.init.sweep_depths),
-        (0 < config.init.opacity < 1, "init.opacity", "between 0 and 1", config.init.opacity),
-        (config.densify.every >= 1, "densify.every", "at least 1", config.densify.every),
-        (config.identity.dim >= 2, "identity.dim", "at least 2", config.identity.dim),
-    ]
-    for good, name, expected, found in rules:
-        if not good:
-            raise ConfigError(f"{name}: expected {expected}, got {found!r}")
+    """Raise ConfigError naming the first key whose value no run can use."""
+    for name, good, expected in _RULES:
+        section, key = name.split(".")
+        value = getattr(getattr(config, section), key)
+        if not good(value):
+            raise ConfigError(f"{name}: expected {expected}, got {value!r}")
+
+
+_AT_LEAST_1: tuple[Callable[[Any], bool], str] = (lambda value: value >= 1, "at least 1")
+_SHARE: tuple[Callable[[Any], bool], str] = (lambda value: 0 <= value <= 1, "0 to 1")
+_POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more than 0")
+_INSIDE: tuple[Callable[[Any], bool], str] = (lambda value: 0 < value < 1, "between 0 and 1")
+# What a value must be beyond its type; all numbers are finite and not negative (`_check`).
+_RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("train.iterations", *_AT_LEAST_1),
+    ("train.seed", lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
+    ("train.representation", lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
+    ("train.background", lambda value: value in BACKGROUNDS, " or ".join(BACKGROUNDS)),
+    ("train.sh_degree", lambda value: value <= 3, "0 to 3"),
+    ("train.threads", *_AT_LEAST_1),
+    ("train.checkpoint_every", *_AT_LEAST_1),
+    ("train.log_every", *_AT_LEAST_1),
+    ("init.object_points", *_AT_LEAST_1),
+    ("init.background_points", *_AT_LEAST_1),
+    ("init.sweep_depths", lambda value: value >= 2, "at least 2"),
+    ("init.opacity", *_INSIDE),
+    ("init.min_mask_pixels", lambda value: value < 1, "less than 1"),
+    ("rates.decay", lambda value: 0 < value <= 1, "more than 0, at most 1"),
+    ("rates.decay_floor_appearance", *_SHARE),
+    ("rates.decay_from", *_SHARE),
+    ("losses.ssim", *_SHARE),
+    ("curriculum.newest", *_SHARE),
+    ("densify.stop", *_SHARE),
+    ("densify.every", *_AT_LEAST_1),
+    ("densify.share", *_SHARE),
+    ("densify.prune_opacity", lambda value: value < 1, "less than 1"),
+    ("densify.prune_width", *_POSITIVE),
+)

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..raster import rasterize_splats
+from ..scene.scene import IDENTITY_DIM
 from .config import IdentitySection
 from .posing import Splats
 from .views import TrainView
@@ -78,15 +79,15 @@ def train_encodings(
         progress: Called with step and loss.
 
     Returns:
-        Encodings [N, D], classifier weight [C, D] and bias [C].
+        Encodings [N, 16], classifier weight [C, 16] and bias [C].
 
     Source: Gaussian Grouping (Ye et al. 2024), Eq. 2 to 4: pixel cross-entropy divided by ln C; without its 3D losses,
         which cost accuracy where masks are clean.
     """
     masked = [v for v in views if v.mask is not None]
     count = max(classes.values()) + 1
-    directions = torch.randn(max(count, section.dim), section.dim, generator=generator)
-    weight = torch.linalg.qr(directions).Q[:count].clone() if count <= section.dim else directions[:count]
+    directions = torch.randn(max(count, IDENTITY_DIM), IDENTITY_DIM, generator=generator)
+    weight = torch.linalg.qr(directions).Q[:count].clone() if count <= IDENTITY_DIM else directions[:count]
     weight = (2 * weight / weight.norm(dim=1, keepdim=True)).requires_grad_(True)
     # Half of what a solid pixel of an object answers: where nothing is drawn, or less than half, it is background.
     bias = torch.zeros(count)
@@ -108,7 +109,7 @@ def train_encodings(
         with torch.no_grad():
             splats = pose(view)
         image = _rasterize(splats, encodings, view)
-        logits = image.reshape(-1, section.dim) @ weight.T + bias
+        logits = image.reshape(-1, IDENTITY_DIM) @ weight.T + bias
         loss = F.cross_entropy(logits, target.reshape(-1), ignore_index=-1) / math.log(max(count, 2))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -165,3 +165,22 @@ def test_a_damaged_run_file_is_named(tmp_path, change, message):
 def test_a_folder_that_is_no_run_is_said(tmp_path):
     with pytest.raises(CheckpointError, match="not a run folder"):
         checkpoint.open_run(tmp_path)
+
+
+def test_a_configuration_of_another_version_is_named_with_the_remedy(tmp_path):
+    checkpoint.create_run(tmp_path, dataset(), config.Config())
+    path = tmp_path / checkpoint.RUN_FILE
+    text = json.loads(path.read_text())
+    text["config"]["identity"]["dim"] = 16
+    text["versions"]["r5dgs"] = "0.0.9"
+    path.write_text(json.dumps(text))
+    with pytest.raises(
+        CheckpointError, match=r"run.json: .*made by 0\.0\.9.*identity\.dim: unknown key.*train again with --overwrite"
+    ):
+        checkpoint.open_run(tmp_path)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="file/run: cannot be made or written: .*choose another --out"):
+        checkpoint.create_run(tmp_path / "file" / "run", dataset(), config.Config())

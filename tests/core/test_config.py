@@ -1,6 +1,8 @@
 """Configurations: files and overrides arrive as typed values, and what cannot be used is named."""
 
+import dataclasses
 import json
+import re
 
 import hypothesis
 import pytest
@@ -15,7 +17,7 @@ from r5dgs_core.train import config
         {
             "train": st.fixed_dictionaries({"iterations": st.integers(1, 10**6), "sh_degree": st.integers(0, 3)}),
             "losses": st.fixed_dictionaries({"ssim": st.floats(0, 1)}),
-            "rates": st.fixed_dictionaries({}, optional={"means": st.floats(0, 1), "decay": st.integers(0, 3)}),
+            "rates": st.fixed_dictionaries({}, optional={"means": st.floats(0, 1), "decay": st.integers(1, 1)}),
         }
     )
 )
@@ -60,6 +62,20 @@ def test_the_last_of_two_overrides_wins_and_whole_numbers_serve_as_decimals():
         ("train.sh_degree=4", "train.sh_degree: expected 0 to 3, got 4"),
         ("train.background=gray", "train.background: expected auto or learned or white or black, got 'gray'"),
         ("init.opacity=1", "init.opacity: expected between 0 and 1, got 1.0"),
+        ("init.object_points=0", "init.object_points: expected at least 1, got 0"),
+        ("init.background_points=0", "init.background_points: expected at least 1, got 0"),
+        ("init.sweep_depths=1", "init.sweep_depths: expected at least 2, got 1"),
+        ("init.min_mask_pixels=1", "init.min_mask_pixels: expected less than 1, got 1.0"),
+        ("rates.decay=0", "rates.decay: expected more than 0, at most 1, got 0.0"),
+        ("rates.decay_from=1.1", "rates.decay_from: expected 0 to 1, got 1.1"),
+        ("rates.decay_floor_appearance=2", "rates.decay_floor_appearance: expected 0 to 1, got 2.0"),
+        ("curriculum.newest=1.5", "curriculum.newest: expected 0 to 1, got 1.5"),
+        ("densify.stop=2", "densify.stop: expected 0 to 1, got 2.0"),
+        ("densify.share=1.01", "densify.share: expected 0 to 1, got 1.01"),
+        ("densify.every=0", "densify.every: expected at least 1, got 0"),
+        ("densify.prune_opacity=1", "densify.prune_opacity: expected less than 1, got 1.0"),
+        ("densify.prune_width=0", "densify.prune_width: expected more than 0, got 0.0"),
+        ("train.seed=9223372036854775807", "train.seed: expected less than"),
         ("losses.ssim", "expected SECTION.KEY=VALUE"),
         ("ssim=0.1", "expected SECTION.KEY=VALUE"),
         ("a.b.c=1", "expected SECTION.KEY=VALUE"),
@@ -97,6 +113,21 @@ def test_an_override_into_something_that_is_no_section_is_refused(tmp_path):
 def test_numbers_that_no_key_can_use_are_refused(value):
     with pytest.raises(ConfigError, match="rates.means"):
         config.load(None, [f"rates.means={value}"])
+
+
+@pytest.mark.parametrize("section", [f.name for f in dataclasses.fields(config.Config)])
+def test_every_key_says_what_it_is(section):
+    kind = type(getattr(config.Config(), section))
+    described = re.findall(r"^        (\w+): \S", kind.__doc__, re.MULTILINE)
+    assert described == [f.name for f in dataclasses.fields(kind)]
+
+
+def test_every_rule_is_about_a_key_and_lets_its_default_pass():
+    names = [name for name, _, _ in config._RULES]
+    assert len(names) == len(set(names))
+    for name, good, _ in config._RULES:
+        section, key = name.split(".")
+        assert good(getattr(getattr(config.Config(), section), key)), name
 
 
 def test_a_missing_file_is_said(tmp_path):

@@ -6,6 +6,7 @@ import torch
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate, metrics
+from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.train import identity
 from r5dgs_core.train.config import IdentitySection
@@ -53,7 +54,7 @@ def test_ids_without_a_class_do_not_vote():
 def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
     view, splats = row_of_blobs()
     wrong = torch.tensor([0, 2, 2])
-    section = IdentitySection(iterations=steps, dim=8, rate=0.1, classifier_rate=0.05)
+    section = IdentitySection(iterations=steps, rate=0.1, classifier_rate=0.05)
     losses = []
     encodings, weight, bias = identity.train_encodings(
         [view],
@@ -64,7 +65,7 @@ def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
         torch.Generator().manual_seed(0),
         lambda _, loss: losses.append(loss),
     )
-    assert encodings.shape == (3, 8) and weight.shape == (3, 8) and bias.shape == (3,)
+    assert encodings.shape == (3, 16) and weight.shape == (3, 16) and bias.shape == (3,)
     answers = (encodings @ weight.T + bias).argmax(1).tolist()
     assert answers == ([0, 2, 2] if steps == 0 else [0, 2, 1])
     assert steps == 0 or losses[-1] < 0.8 * losses[0]
@@ -72,11 +73,12 @@ def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
 
 def test_more_classes_than_dimensions_are_no_obstacle():
     view, splats = row_of_blobs()
-    section = IdentitySection(iterations=1, dim=2)
+    many = {0: 0, 3: 18, 5: 19} | {i: i - 99 for i in range(100, 117)}
+    section = IdentitySection(iterations=1)
     _, weight, _ = identity.train_encodings(
-        [view], lambda _: splats, CLASSES, torch.tensor([0, 2, 1]), section, torch.Generator().manual_seed(0)
+        [view], lambda _: splats, many, torch.tensor([0, 19, 18]), section, torch.Generator().manual_seed(0)
     )
-    assert weight.shape == (3, 2) and torch.isfinite(weight).all()
+    assert weight.shape == (20, scene.IDENTITY_DIM) and torch.isfinite(weight).all()
 
 
 def test_pixels_of_the_trained_scene_belong_to_the_objects_of_the_masks(baked, tiny):
