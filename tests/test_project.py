@@ -53,17 +53,31 @@ def test_what_was_tested_lies_in_the_ranges_and_everything_needed_is_pinned():
         assert requirement.specifier.contains(tested[normal(requirement.name)]), requirement
 
 
-def test_every_package_that_the_core_imports_is_a_dependency():
-    declared = {normal(Requirement(line).name) for line in PROJECT["project"]["dependencies"]}
-    imported = set()
+def dependencies() -> set[str]:
+    return {normal(Requirement(line).name) for line in PROJECT["project"]["dependencies"]}
+
+
+def imported_packages(*, late: bool) -> set[str]:
+    """Packages that modules of the core import at their top and, if ``late``, inside functions too."""
+    found = set()
     for path in (ROOT / "r5dgs_core").rglob("*.py"):
-        for node in ast.parse(path.read_text()).body:
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree) if late else tree.body:
             if isinstance(node, ast.Import):
-                imported |= {alias.name.split(".")[0] for alias in node.names}
+                found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
-                imported.add((node.module or "").split(".")[0])
-    packages = {normal(name) for name in imported - sys.stdlib_module_names}
-    assert packages <= declared, f"imported at the top of a module of the core: {sorted(packages - declared)}"
+                found.add((node.module or "").split(".")[0])
+    return {normal(name) for name in found - sys.stdlib_module_names}
+
+
+def test_every_package_that_the_core_imports_is_a_dependency():
+    missing = imported_packages(late=False) - dependencies()
+    assert not missing, f"imported at the top of a module of the core: {sorted(missing)}"
+
+
+def test_every_dependency_is_imported_by_the_core():
+    unused = dependencies() - imported_packages(late=True)
+    assert not unused, f"hard dependencies that nothing imports: {sorted(unused)}"
 
 
 def test_the_commands_of_the_readme_exist():
