@@ -20,7 +20,7 @@ def make(kind: str) -> Iterator[Progress]:
     """A function that shows events.
 
     Args:
-        kind: "auto" (rich in a terminal, else a plain line every ten seconds), "json" or "none".
+        kind: "auto" (rich in a terminal, else a plain line per phase and every ten seconds), "json" or "none".
     """
     if kind == "json":
         yield lambda event: print(json.dumps(event), flush=True)
@@ -68,14 +68,14 @@ def _rich() -> Iterator[Progress]:
 
 
 def _plain() -> Progress:
-    last = [0.0]
+    last: dict[str, float] = {}
 
     def show(event: Event) -> None:
         now, position = time.monotonic(), count_of(event)
         if position is None:
             print(f"{event['event']}: {describe(event)}", flush=True)
-        elif now - last[0] >= PLAIN_EVERY_S:
-            last[0] = now
+        elif now - last.get(event["event"], -PLAIN_EVERY_S) >= PLAIN_EVERY_S:
+            last[event["event"]] = now
             print(f"{event['event']} {position[0]}: {describe(event)}", flush=True)
 
     return show

@@ -93,7 +93,7 @@ def train(
     progress({"event": "start", "iterations": iterations, "dataset": str(dataset_root)})
     began = time.monotonic()
     if state is not None and state.finished:
-        progress({"event": "done", "gaussians": len(state.tensors["gaussians.means"])})
+        progress({"event": "trained", "gaussians": len(state.tensors["gaussians.means"])})
         return run
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
     with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
@@ -110,7 +110,7 @@ def train(
     _optimise(trainer, run, began, go_on, progress)
     with stopping.at_once(f"stopped after the last step, before the labels are made; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
-    progress({"event": "done", "gaussians": len(trainer.gaussians)})
+    progress({"event": "trained", "gaussians": len(trainer.gaussians)})
     return run
 
 

@@ -148,7 +148,7 @@ def test_a_run_killed_before_its_last_labels_only_makes_these(tiny, unbroken, tm
 def test_progress_counts_up_to_the_end(unbroken):
     folder, events = unbroken
     assert events[0]["event"] == "start" and events[0]["iterations"] == STEPS
-    assert events[-1]["event"] == "done"
+    assert events[-1]["event"] == "trained"
     steps = [event for event in events if event["event"] == "step"]
     assert [event["iteration"] for event in steps] == list(range(10, STEPS + 1, 10))
     assert (
@@ -168,7 +168,7 @@ def test_resuming_a_finished_run_changes_nothing(tiny, unbroken):
     events = []
     run.train(tiny.root, unbroken[0], tiny_datasets.settings(), resume=True, progress=events.append)
     assert path.read_bytes() == before
-    assert events[-1]["event"] == "done" and events[-1]["gaussians"] > 0
+    assert events[-1]["event"] == "trained" and events[-1]["gaussians"] > 0
 
 
 def test_resuming_on_other_data_is_refused(unbroken, tmp_path):
