@@ -136,11 +136,13 @@ class R5DGS_OT_capture_dataset(bpy.types.Operator):
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
+        failed = True
         try:
             finished = self._step(context)
-        except Exception:
-            self._end(context, {"CANCELLED"})
-            raise
+            failed = False
+        finally:  # the timer and the progress bar go, and the error is shown
+            if failed:
+                self._end(context, {"CANCELLED"})
         return {"RUNNING_MODAL"} if finished is None else self._end(context, finished)
 
     def _step(self, context):

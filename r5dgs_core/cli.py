@@ -196,27 +196,20 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _dispatch(args: argparse.Namespace) -> None:
-    if args.command == "demo":
-        from .demo import run_demo
+    if args.command in ("demo", "train"):
+        options = {
+            "config_path": args.config,
+            "overrides": args.set,
+            "resume": args.resume,
+            "overwrite": args.overwrite,
+            "progress_kind": args.progress,
+        }
+        if args.command == "train":
+            run_train(args.data, args.out, **options)
+        else:
+            from .demo import run_demo
 
-        run_demo(
-            args.out,
-            config_path=args.config,
-            overrides=args.set,
-            resume=args.resume,
-            overwrite=args.overwrite,
-            progress_kind=args.progress,
-        )
-    elif args.command == "train":
-        run_train(
-            args.data,
-            args.out,
-            config_path=args.config,
-            overrides=args.set,
-            resume=args.resume,
-            overwrite=args.overwrite,
-            progress_kind=args.progress,
-        )
+            run_demo(args.out, **options)
     elif args.command == "bake":
         run_bake(args.run, args.out, args.data)
     elif args.command == "evaluate":
