@@ -31,9 +31,13 @@ class _OneCore(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def load_extension():
-    """The repository root as package `r5dgs`, loaded once."""
-    if "r5dgs" not in sys.modules:
+    """The repository root as package `r5dgs`, loaded once.
+
+    In a folder that is called `r5dgs` pytest itself has loaded it under that name already.
+    """
+    if not any(isinstance(finder, _OneCore) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OneCore())
+    if "r5dgs" not in sys.modules:
         spec = importlib.util.spec_from_file_location(
             "r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)]
         )
