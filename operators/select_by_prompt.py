@@ -35,7 +35,7 @@ class R5DGS_OT_select_by_prompt(bpy.types.Operator):
 
     def execute(self, context):
         session = context.window_manager.r5dgs
-        text = (self.text or session.prompt).strip()
+        text = (self.text if self.properties.is_property_set("text") else session.prompt).strip()
         if not text:
             self.report({"WARNING"}, "Type the name of an object first")
             return {"CANCELLED"}

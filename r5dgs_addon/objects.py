@@ -201,7 +201,8 @@ def _part_name(scene: Scene, part: Range, parts: list[Range]) -> str:
     name = object_name(scene, part.object_id)
     group: MotionGroup = scene.groups[part.motion_id]
     if group.role == "shadow":
-        return f"{object_name(scene, group.object_id)} shadow"
+        owner = object_name(scene, group.object_id)
+        return f"{owner} shadow" if part.object_id <= 0 else f"{name} with {owner} shadow"
     if part == max((other for other in parts if other.object_id == part.object_id), key=lambda other: other.count):
         return name
     return f"{name} still" if part.motion_id == 0 else f"{name} with {object_name(scene, group.object_id)}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,14 @@ def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
     """Turn a run into a scene file (see `train.bake.run_bake`)."""
     from .train import bake
 
+    if out.is_dir():
+        raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
+    if out.suffix.lower() != ".r5dgs":
+        raise errors.SceneFileError(f"{out}: expected a name that ends in .r5dgs, which is what Blender looks for")
     scene = bake.run_bake(run_folder, out, data)
-    print(f"{out}: {len(scene.means)} Gaussians, {sum(o.id > 0 for o in scene.objects)} objects, t_max {scene.t_max:g}")
+    count = sum(o.id > 0 for o in scene.objects)
+    objects = "1 object" if count == 1 else f"{count} objects"
+    print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
 
 
 def run_evaluate(
@@ -76,7 +83,7 @@ def run_evaluate(
     trained_on = None
     if target.is_dir():
         run = checkpoint.open_run(target)
-        dataset = datasets.read(data if data is not None else run.dataset_root)
+        dataset = datasets.read(run.data(data))
         scene = bake.bake(run, dataset)
         trained_on = run.digest
         default = target / checkpoint.EVALUATION_FILE
@@ -192,6 +199,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("r5dgs: stopped", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever read our output has gone; what is left of it goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     return 0
 
 

@@ -74,7 +74,7 @@ def _plain() -> Progress:
         now, position = time.monotonic(), count_of(event)
         if position is None:
             print(f"{event['event']}: {describe(event)}", flush=True)
-        elif now - last.get(event["event"], -PLAIN_EVERY_S) >= PLAIN_EVERY_S:
+        elif position[0] == position[1] or now - last.get(event["event"], -PLAIN_EVERY_S) >= PLAIN_EVERY_S:
             last[event["event"]] = now
             print(f"{event['event']} {position[0]}: {describe(event)}", flush=True)
 
@@ -103,6 +103,8 @@ def describe(event: Event) -> str:
         parts.append(f"{event['seconds_left']:.0f} s left")
     if "iterations" in event and "loss" not in event:
         parts.append(f"{event['iterations']} steps")
+    if event.get("from"):
+        parts.append(f"going on at step {event['from']}")
     if "total" in event:
         parts.append(f"of {event['total']} images")
     return ", ".join(parts)

@@ -181,7 +181,7 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
     """Error of each object's predicted pose at the last time of the ground truth.
 
     The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times
-    decide (`metrics.aligned_pose_error`).
+    at which the object was seen decide (`metrics.aligned_pose_error`).
 
     Returns:
         Per object ``id name position_error rotation_error_deg``: world units and degrees, None where the object has no
@@ -204,8 +204,10 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
         group = _body(scene, object_id)
         if group is None or not observed.any():
             continue
+        first, last = group.seen or (-np.inf, np.inf)
+        seen = observed & (times >= first - 1e-9) & (times <= last + 1e-9)
         motion = np.stack([_matrix(group, quats[group.id], moves[group.id]) for quats, moves in poses])
-        position, angle = metrics.aligned_pose_error(motion, truth, observed, group.pivot)
+        position, angle = metrics.aligned_pose_error(motion, truth, seen if seen.any() else observed, group.pivot)
         row["position_error"], row["rotation_error_deg"] = position, angle
     return [rows[key] for key in sorted(rows)]
 

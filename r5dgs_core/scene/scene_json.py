@@ -51,6 +51,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
                 "follow_matrix": None if g.follow_matrix is None else np.asarray(g.follow_matrix, np.float64).tolist(),
                 "rigid_rms": float(g.rigid_rms),
                 "rigid_max": float(g.rigid_max),
+                "seen": None if g.seen is None else [float(t) for t in g.seen],
             }
             for g in scene.groups
         ],
@@ -163,7 +164,12 @@ def _read_group(row: dict[str, Any], place: str) -> MotionGroup:
         follow_matrix=None if row.get("follow_matrix") is None else numbers(row, "follow_matrix", (3, 3), place),
         rigid_rms=get(row, "rigid_rms", float, place),
         rigid_max=get(row, "rigid_max", float, place),
+        seen=None if row.get("seen") is None else _interval(numbers(row, "seen", (2,), place)),
     )
+
+
+def _interval(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
 
 
 def _read_camera(row: dict[str, Any], place: str) -> Camera:

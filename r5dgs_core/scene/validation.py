@@ -158,6 +158,8 @@ def _check_group(scene: Scene, place: str, row: int, group: MotionGroup) -> None
         _fail(place, where, "a pivot of three finite numbers", group.pivot)
     if not (np.isfinite(group.rigid_rms) and np.isfinite(group.rigid_max)):
         _fail(place, where, "finite rigid residuals", (group.rigid_rms, group.rigid_max))
+    if group.seen is not None and not group.seen[0] <= group.seen[1]:
+        _fail(place, where, "'seen' as first and last time, in order", group.seen)
     if row == 0:
         poses = scene.track_poses[0]
         if (

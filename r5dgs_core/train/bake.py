@@ -40,7 +40,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     Raises:
         CheckpointError, DatasetError: A file is missing or damaged.
     """
-    dataset = dataset if dataset is not None else datasets.read(run.dataset_root)
+    dataset = dataset if dataset is not None else datasets.read(run.data())
     state = checkpoint.load(run.folder)
     tensors = state.tensors
     norm = Normalization(np.array(state.origin), state.scale)
@@ -74,6 +74,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         sh[members], shading[members] = _bind_shading(sh[members], shading[members], q, light)
         pivot = _pivot(means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
+        if group.observed.any():  # nothing is known of an object before it is seen
+            first = int(np.argmax(group.observed))
+            poses[:first] = poses[first]
         radius = _radius(means[members], opacities[members], pivot)
         if group.role == "pinned" or (group.role == "body" and needs.is_still(poses, radius)):
             poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
@@ -182,7 +185,18 @@ def _motion_group(
         model = fit.model
     else:
         model = MotionModel(radius=radius)
-    return MotionGroup(index, group.object_id, group.role, anchor, pivot, model, group.follows, group.follow_matrix)
+    seen = times[group.observed]
+    return MotionGroup(
+        index,
+        group.object_id,
+        group.role,
+        anchor,
+        pivot,
+        model,
+        group.follows,
+        group.follow_matrix,
+        seen=(float(seen[0]), float(seen[-1])) if len(seen) else None,
+    )
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, float]:
@@ -248,7 +262,7 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None) -> Scene
     from ..scene import scene_file
 
     run = checkpoint.open_run(folder)
-    dataset = datasets.read(dataset_root if dataset_root is not None else run.dataset_root)
+    dataset = datasets.read(run.data(dataset_root))
     if dataset.digest != run.digest:
         raise CheckpointError(
             f"{dataset.root}: is not the data that {folder} was trained on, or has changed since; "

@@ -49,6 +49,19 @@ class Run:
     config: Config
     versions: dict[str, str]
 
+    def data(self, given: Path | None = None) -> Path:
+        """Where to look for the data set: the ``given`` place, else where it was.
+
+        Raises:
+            CheckpointError: It is no longer where it was, and no place is given.
+        """
+        if given is None and not self.dataset_root.is_dir():
+            raise CheckpointError(
+                f"{self.folder}: its data set was in {self.dataset_root}, where there is none now; "
+                "give its place with --data DIR"
+            )
+        return given if given is not None else self.dataset_root
+
 
 @dataclass(frozen=True)
 class Checkpoint:

@@ -70,7 +70,9 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
     times = observed_times(views)
     places = triangulation.locate(views, times, init.min_mask_pixels)
     if all(v.mask is None for v in views):
-        log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/VIEW.png files")
+        log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/train/IMAGE.png files")
+    elif len(times) == 1:
+        log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
     first = _first_time(places, len(times))
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))

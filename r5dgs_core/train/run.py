@@ -90,10 +90,12 @@ def train(
         replaces = (folder / checkpoint.CHECKPOINT_FILE).exists()
         run = (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config)
     iterations = run.config.train.iterations
-    progress({"event": "start", "iterations": iterations, "dataset": str(dataset_root)})
+    done = 0 if state is None else state.iteration
+    progress({"event": "start", "iterations": iterations, "from": done, "dataset": str(dataset_root)})
     began = time.monotonic()
     if state is not None and state.finished:
-        progress({"event": "trained", "gaussians": len(state.tensors["gaussians.means"])})
+        count = len(state.tensors["gaussians.means"])
+        progress({"event": "trained", "gaussians": count, "text": "was finished already"})
         return run
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
     with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):

@@ -57,6 +57,10 @@ class Trainer:
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
                 "camera alone or is all sky. Remedy: give masks, or more cameras"
             )
+        missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
+        if missing and len(start.object_ids) > 1:
+            named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
+            log.warning("no training mask shows object %s: it is left out. Remedy: check ids in objects.json", named)
         self.gaussians: Gaussians = start.gaussians
         self.motion = representation.make(start, config)
         self.times = start.tracks.times

@@ -227,3 +227,26 @@ def test_a_scene_of_any_size_is_measured_alike(trained, tiny, baked, tmp_path, s
     for one, other in zip(expected["objects"], found["objects"], strict=True):
         assert other["position_error"] == pytest.approx(scale * one["position_error"], rel=1e-3)
         assert other["rotation_error_deg"] == pytest.approx(one["rotation_error_deg"], rel=1e-3)
+
+
+def test_an_object_that_comes_late_holds_its_first_pose_and_is_measured_where_it_was_seen(tmp_path):
+    data = tiny_datasets.make_dataset(tmp_path / "data", ball_from=0.4)
+    scene = bake.bake(train_briefly(data, tmp_path / "run"))
+    group = next(g for g in scene.groups if g.role == "body" and g.object_id == tiny_datasets.BALL)
+    assert group.seen is not None and group.seen[0] >= 0.4 and group.seen[1] == scene.t_max
+    before = scene.track_poses[group.id][scene.track_times < group.seen[0]]
+    first = scene.track_poses[group.id][np.searchsorted(scene.track_times, group.seen[0])]
+    assert len(before) and (before == first).all()
+    copy = scene_file.read(scene_file.write(scene, tmp_path / "late.r5dgs"))
+    assert copy.groups[group.id].seen == group.seen
+    # The offset between the frames comes from the times at which the ball was seen, so that early ones do not count.
+    truth = datasets.read(data.root).ground_truth
+    moved = dataclasses.replace(
+        scene,
+        track_poses=np.where(
+            (np.arange(len(scene.groups)) == group.id)[:, None, None] & (scene.track_times < group.seen[0])[:, None],
+            [1.0, 0, 0, 0, 5, 5, 5],
+            scene.track_poses,
+        ),
+    )
+    assert evaluate.object_errors(moved, truth) == evaluate.object_errors(scene, truth)

@@ -3,9 +3,11 @@
 import contextlib
 import json
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -250,3 +252,22 @@ def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, cap
     assert command == ["r5dgs", "demo", "--out", str(out), "--resume"]
     assert cli.main([*command[1:], "--progress", "none"]) == 0
     assert (out / "contact_sheet.png").exists()
+
+
+def test_a_scene_goes_into_a_file_that_blender_finds(made, tmp_path, capsys):
+    for out, words in ((tmp_path, "is a folder"), (tmp_path / "scene.zip", ".r5dgs")):
+        assert words in complaint(capsys, "bake", made[0], "--out", out)
+
+
+def test_a_data_set_that_has_moved_is_asked_for(made, tmp_path, capsys):
+    shutil.copytree(made[0], tmp_path / "run")
+    path = tmp_path / "run" / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "dataset": str(tmp_path / "gone")}))
+    assert "--data" in complaint(capsys, "bake", path.parent, "--out", tmp_path / "x.r5dgs")
+    assert "--data" in complaint(capsys, "evaluate", path.parent)
+
+
+def test_a_reader_that_goes_away_is_no_traceback(made):
+    command = f"{shlex.quote(sys.executable)} -m r5dgs_core.cli info {shlex.quote(str(made[1]))} | true"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(cli.__file__).parents[1])
+    assert "Traceback" not in done.stderr
