@@ -13,6 +13,14 @@ class _Sidebar:
     bl_category = TAB
 
 
+class _WithScene(_Sidebar):
+    """Panels that are shown once a scene is loaded."""
+
+    @classmethod
+    def poll(cls, context):
+        return objects.active_collection(context) is not None
+
+
 class R5DGS_PT_scene(_Sidebar, bpy.types.Panel):
     """Load a scene and see what it holds."""
 
@@ -42,15 +50,11 @@ class R5DGS_PT_scene(_Sidebar, bpy.types.Panel):
         layout.prop(state, "filepath")
 
 
-class R5DGS_PT_prompt(_Sidebar, bpy.types.Panel):
+class R5DGS_PT_prompt(_WithScene, bpy.types.Panel):
     """Select objects by words."""
 
     bl_idname = "R5DGS_PT_prompt"
     bl_label = "Select by Prompt"
-
-    @classmethod
-    def poll(cls, context):
-        return objects.active_collection(context) is not None
 
     def draw(self, context):
         layout = self.layout
@@ -73,15 +77,11 @@ class R5DGS_PT_prompt(_Sidebar, bpy.types.Panel):
             line.label(text=f"{match.score:.2f}")
 
 
-class R5DGS_PT_preview(_Sidebar, bpy.types.Panel):
+class R5DGS_PT_preview(_WithScene, bpy.types.Panel):
     """Render what Blender shows in the worker."""
 
     bl_idname = "R5DGS_PT_preview"
     bl_label = "Preview"
-
-    @classmethod
-    def poll(cls, context):
-        return objects.active_collection(context) is not None
 
     def draw(self, context):
         layout = self.layout

@@ -144,13 +144,18 @@ def make_scene(
 def orbit_camera(angle_rad: float, width: int = 96, height: int = 72) -> cameras.Camera:
     """A camera 4 units from the origin that looks at it from above, at an angle about the z axis."""
     position = np.array([3.5 * np.cos(angle_rad), 3.5 * np.sin(angle_rad), 2.0])
-    back = position / np.linalg.norm(position)
-    right = np.cross([0, 0, 1.0], back)
+    return looking_camera(position, -position, 0.9, width, height, f"orbit_{angle_rad:.2f}")
+
+
+def looking_camera(position, forward, angle_x_rad, width, height, name="", up=(0, 0, 1.0)) -> cameras.Camera:
+    """A camera at a place that looks along a direction."""
+    back = -np.asarray(forward, np.float64) / np.linalg.norm(forward)
+    right = np.cross(up, back)
     right /= np.linalg.norm(right)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
-    return camera_from_field_of_view(matrix, 0.9, width, height, f"orbit_{angle_rad:.2f}")
+    return camera_from_field_of_view(matrix, angle_x_rad, width, height, name)
 
 
 def _name(object_id: int) -> str:

@@ -20,7 +20,7 @@ from ..raster import rasterize_splats
 from ..scene.scene import IDENTITY_DIM
 from .config import IdentitySection
 from .posing import Splats
-from .views import TrainView
+from .views import TrainView, spread
 
 VOTE_VIEWS = 80
 
@@ -39,9 +39,7 @@ def vote(
     Returns:
         The classes. [N] int64
     """
-    masked = [v for v in views if v.mask is not None]
-    if len(masked) > VOTE_VIEWS:
-        masked = [masked[i] for i in np.linspace(0, len(masked) - 1, VOTE_VIEWS).round().astype(int)]
+    masked = spread([v for v in views if v.mask is not None], VOTE_VIEWS)
     count = max(classes.values(), default=0) + 1
     weights = torch.zeros(len(fallback), count)
     for view in masked:

@@ -18,7 +18,7 @@ from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
 from . import hull, shadows, sweep, triangulation
 from .config import Config
-from .views import TrainView
+from .views import TrainView, nearest_knot
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
         reference = _reference_time(places.visibility[row], places.measured[row], first)
         centers[row + 1] = places.centers[row, reference]
         translations[row + 1] = places.centers[row] - centers[row + 1]
-        then = [v for v in views if v.mask is not None and np.argmin(np.abs(times - v.t)) == reference]
+        then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
         where, shade = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], init.object_points, rng)
         points.append(where)
         colors.append(shade)

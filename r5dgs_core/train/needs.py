@@ -19,8 +19,17 @@ SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not s
 
 def is_still(poses: np.ndarray, radius: float) -> bool:
     """Whether a group neither travels nor turns over the observed time. poses [S, 7] relative to the bind state."""
-    travel = np.linalg.norm(poses[:, 4:], axis=1).max() / (2 * radius)
-    return bool(travel <= STILL and rotations.angle_between(poses[:, :4], STILL_QUAT).max() <= TURN)
+    return _travel(poses, radius) <= STILL and _turn(poses) <= TURN
+
+
+def _travel(poses: np.ndarray, radius: float) -> float:
+    """Largest displacement of a track, in diameters."""
+    return float(np.linalg.norm(poses[:, 4:], axis=1).max()) / (2 * radius)
+
+
+def _turn(poses: np.ndarray) -> float:
+    """Largest rotation of a track, rad."""
+    return float(rotations.angle_between(poses[:, :4], STILL_QUAT).max())
 
 
 def is_on(table: Sequence[dict[str, Any]], name: str) -> bool:
@@ -54,9 +63,8 @@ def decide(
         Rows with name, value, threshold, decision ("on" or "off") and reason.
     """
     bodies = [g for g in groups if g.role == "body"]
-    travel = [float(np.linalg.norm(track_poses[g.id][:, 4:], axis=1).max()) / (2 * g.model.radius) for g in bodies]
-    turns = [float(rotations.angle_between(track_poses[g.id][:, :4], STILL_QUAT).max()) for g in bodies]
-    largest_travel, largest_turn = max(travel, default=0.0), max(turns, default=0.0)
+    largest_travel = max((_travel(track_poses[g.id], g.model.radius) for g in bodies), default=0.0)
+    largest_turn = max((_turn(track_poses[g.id]) for g in bodies), default=0.0)
     moving = sum(not is_still(track_poses[g.id], g.model.radius) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))

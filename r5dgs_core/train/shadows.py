@@ -16,9 +16,9 @@ import numpy as np
 from scipy import ndimage
 
 from .hull import pixel_indices
-from .sweep import Backdrop, camera_key
+from .sweep import Backdrop, camera_key, plane_axes
 from .triangulation import Places
-from .views import TrainView
+from .views import TrainView, nearest_knot
 
 CANDIDATES = 400
 LOWEST_SINE = 0.25  # light from under 15 degrees throws shadows too long to follow
@@ -66,7 +66,7 @@ def find_light(
         if backdrop is None:
             continue
         darkening, known = _darkening(view, backdrop)
-        s = int(np.argmin(np.abs(times - view.t)))
+        s = nearest_knot(times, view.t)
         for row in np.flatnonzero(places.measured[:, s]):
             center = places.centers[row, s]
             above = center @ normal - height
@@ -103,10 +103,7 @@ def _directions(normal: np.ndarray) -> np.ndarray:
     k = np.arange(CANDIDATES) + 0.5
     sine = 1 - (1 - LOWEST_SINE) * k / CANDIDATES
     angle = np.pi * (1 + 5**0.5) * k
-    axis = np.eye(3)[np.argmin(np.abs(normal))]
-    u = np.cross(normal, axis)
-    u /= np.linalg.norm(u)
-    v = np.cross(normal, u)
+    u, v = plane_axes(normal)
     cosine = np.sqrt(1 - sine**2)
     spread = cosine[:, None] * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v) - sine[:, None] * normal
     return np.concatenate([-normal[None], spread])

@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from ..scene import cameras
 from . import sky
-from .views import TrainView
+from .views import TrainView, spread
 
 MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
@@ -45,10 +45,9 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     """Median over time of the unmasked pixels, one per distinct camera."""
     result = []
     for group in by_camera(views, MAX_BACKDROPS):
-        if len(group) > MAX_FRAMES:
-            group = [group[i] for i in np.linspace(0, len(group) - 1, MAX_FRAMES).round().astype(int)]
-        images = np.stack([v.image for v in group]).astype(np.float32) / 255
-        free = np.stack([_free(v) for v in group])
+        frames = spread(group, MAX_FRAMES)
+        images = np.stack([v.image for v in frames]).astype(np.float32) / 255
+        free = np.stack([_free(v) for v in frames])
         known = np.asarray(free.any(0))
         images[~free] = np.nan
         images[:, ~known] = 0.0
@@ -62,10 +61,7 @@ def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
     groups: dict[bytes, list[TrainView]] = {}
     for view in views:
         groups.setdefault(camera_key(view.camera), []).append(view)
-    found = list(groups.values())
-    if len(found) > limit:
-        found = [found[i] for i in np.linspace(0, len(found) - 1, limit).round().astype(int)]
-    return found
+    return spread(list(groups.values()), limit)
 
 
 def camera_key(camera: cameras.Camera) -> bytes:
@@ -247,14 +243,19 @@ def _flatten(grids: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([grid.reshape(-1, *grid.shape[2:]) for grid in grids])
 
 
+def plane_axes(normal: np.ndarray) -> np.ndarray:
+    """Two unit vectors that span the plane of a unit normal, perpendicular to each other. [2, 3]"""
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(normal, u)])
+
+
 class _Support:
     """The part of a plane that distinct points outline: their convex hull in the plane, stray ones left out."""
 
     def __init__(self, points: np.ndarray, plane: tuple[np.ndarray, float]):
         normal, height = plane
-        axis = np.eye(3)[np.argmin(np.abs(normal))]
-        u = np.cross(normal, axis)
-        self._axes = np.stack([u, np.cross(normal, u)]) / np.linalg.norm(u)
+        self._axes = plane_axes(normal)
         flat = points[np.abs(points @ normal - height) < 0.1] @ self._axes.T
         if len(flat) > 4000:
             flat = flat[:: len(flat) // 4000]

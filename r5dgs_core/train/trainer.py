@@ -76,7 +76,7 @@ class Trainer:
         self.entered = (self.first_time, self.first_time)
         self.queue: list[int] = []
         self.running_loss = math.nan
-        self._view_times = np.array([int(np.argmin(np.abs(self.times - v.t))) for v in self.views])
+        self._view_times = np.array([views.nearest_knot(self.times, v.t) for v in self.views])
         sizes = [v.camera.width * v.camera.height for v in self.views]
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
         self._pixel_size = normalization.TARGET_DISTANCE / focal

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .views import TrainView
+from .views import TrainView, nearest_knot
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
     for view in views:
         if view.mask is None:
             continue
-        s = int(np.argmin(np.abs(times - view.t)))
+        s = nearest_knot(times, view.t)
         for object_id in np.unique(view.mask):
             if object_id <= 0:
                 continue

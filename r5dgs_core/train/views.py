@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +12,8 @@ from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..scene.cameras import Camera
 from .normalization import Normalization
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -58,3 +62,15 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
         small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint16)
         views.append(TrainView(view.name, camera, view.t, image, small, alpha))
     return views
+
+
+def spread(items: Sequence[Item], limit: int) -> list[Item]:
+    """The items, or ``limit`` of them evenly over their order where there are more."""
+    if len(items) <= limit:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]
+
+
+def nearest_knot(times: np.ndarray, t: float) -> int:
+    """Index of the observed time that is nearest to ``t``. [S]"""
+    return int(np.argmin(np.abs(times - t)))

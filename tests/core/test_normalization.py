@@ -22,13 +22,7 @@ def moved(camera, scale, shift):
 
 def looking(position, forward):
     """A camera at a place that looks along a direction."""
-    back = -np.asarray(forward, np.float64) / np.linalg.norm(forward)
-    right = np.cross([0.1, 0.2, 1.0], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
-    matrix[:3, 3] = position
-    return scenes.camera_from_field_of_view(matrix, 0.8, 32, 24)
+    return scenes.looking_camera(position, forward, 0.8, 32, 24, up=(0.1, 0.2, 1.0))
 
 
 def test_the_focus_becomes_the_origin_and_the_cameras_stand_at_four_units():

@@ -36,13 +36,7 @@ def floor_views(count=5, seed=0):
 def steep_camera(angle):
     """A camera four units from the origin that looks down at it."""
     position = np.array([2.4 * np.cos(angle), 2.4 * np.sin(angle), 3.2])
-    back = position / np.linalg.norm(position)
-    right = np.cross([0, 0, 1.0], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
-    matrix[:3, 3] = position
-    return scenes.camera_from_field_of_view(matrix, 0.8, 64, 48)
+    return scenes.looking_camera(position, -position, 0.8, 64, 48)
 
 
 @pytest.fixture(scope="module")
