@@ -1,18 +1,23 @@
-"""Rasterizer in plain torch: every pixel looks at every Gaussian near it. Slow, any dtype: the oracle of the tests.
+"""Rasterizer in plain torch: every pixel looks at every Gaussian near it. Slow and exact: the oracle of the tests.
 
-Notation: z depth, u = x / z and v = y / z slopes, C the projected covariance in px^2, T transmittance.
+Whatever the dtype of the inputs, everything is computed in float64: float32 inputs are drawn as the same numbers in
+float64 would be, and only results and gradients are rounded.
+
+Notation: z depth, u = x / z and v = y / z slopes, C the projected covariance in px^2, P with C = P P^T + dilation,
+T transmittance.
 """
 
 from __future__ import annotations
 
-import math
-
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from ..scene.cameras import Camera
 from .settings import RasterSettings, RasterStats, SplatImage
 
-TILE = 32  # pixels; only bounds memory, results do not depend on it
+# Results depend on neither of these. A tile is the unit of work: every pixel in it with every Gaussian that reaches it.
+TILE = 32  # px; small ones leave out more
+TILE_WORK = 1 << 18  # pixels times Gaussians; tiles are larger where a scene has so few Gaussians
 
 
 def rasterize_splats(
@@ -28,34 +33,31 @@ def rasterize_splats(
     stats: RasterStats | None,
 ) -> SplatImage:
     """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
-    height, width = camera.height, camera.width
-    means2d, cov, z = project(means, quats, scales, camera, settings)
+    dtype, height, width = means.dtype, camera.height, camera.width
+    means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
+    means2d, cov, determinant, z = project(means, quats, scales, camera, settings)
     with torch.no_grad():
         order, extent = _visible(means2d, cov, z, opacities, camera, settings)
     if stats is not None:
-        _fill_stats(stats, means2d, cov, order)
-    means2d_kept, cov, z = means2d[order], cov[order], z[order]
-    values = torch.cat([channels[order], z[:, None]], 1)
-    opacities, extent = opacities[order], extent[order]
+        _fill_stats(stats, means2d, cov, order, dtype)
+    inputs = (means2d, cov, determinant, opacities, torch.cat([channels, z[:, None]], 1))
+    inputs = [t[order] for t in inputs]
     kept_labels = None if labels is None else labels[order]
+    centers, extent = inputs[0].detach(), extent[order]
 
+    tile = TILE
+    while 4 * tile * tile * max(len(order), 1) <= TILE_WORK:
+        tile *= 2
     rows = []
-    for y0 in range(0, height, TILE):
+    for y0 in range(0, height, tile):
         row = []
-        for x0 in range(0, width, TILE):
-            box = (x0, y0, min(x0 + TILE, width), min(y0 + TILE, height))
-            near = _overlapping(means2d_kept.detach(), extent, box)
-            row.append(
-                _blend(
-                    means2d_kept[near],
-                    cov[near],
-                    opacities[near],
-                    values[near],
-                    None if kept_labels is None else kept_labels[near],
-                    box,
-                    settings,
-                )
-            )
+        for x0 in range(0, width, tile):
+            box = (x0, y0, min(x0 + tile, width), min(y0 + tile, height))
+            near = _overlapping(centers, extent, box)
+            near_labels = None if kept_labels is None else kept_labels[near]
+            arguments = (*(t[near] for t in inputs), near_labels, box, settings)
+            # Checkpoints are computed again by the backward pass: otherwise it would keep every pair of all tiles.
+            row.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
     blended, transmittance, ids = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
     alpha = 1 - transmittance
@@ -63,8 +65,8 @@ def rasterize_splats(
     depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
     image = blended[..., :-1]
     if background is not None:
-        image = image + transmittance[..., None] * background
-    return SplatImage(image, alpha, depth, None if labels is None else ids)
+        image = image + transmittance[..., None] * background.double()
+    return SplatImage(image.to(dtype), alpha.to(dtype), depth.to(dtype), None if labels is None else ids)
 
 
 def project(
@@ -73,8 +75,12 @@ def project(
     scales: torch.Tensor,  # [N, 3]
     camera: Camera,
     settings: RasterSettings,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Project Gaussians to the image.
+
+    The determinant of C comes from det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, where det(P P^T) is the square of
+    the cross product of the rows of P (Cauchy and Binet). Nothing cancels, while c_xx c_yy - c_xy^2 has no digit left
+    for a Gaussian 10^8 times as long as wide.
 
     Args:
         means: Centres, world. [N, 3]
@@ -84,18 +90,19 @@ def project(
         settings: For near plane, frustum clamp and dilation.
 
     Returns:
-        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], depths [N]. Rows before the near plane are
-        finite and meaningless.
+        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], their determinants [N], depths [N]. Rows
+        before the near plane are finite and meaningless.
 
     Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
     """
     T = torch.as_tensor(camera.T_cam_world, dtype=means.dtype, device=means.device)
     k = camera.intrinsics
     fx, skew, cx, fy, cy = float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])
-    p_cam = means @ T[:3, :3].T + T[:3, 3]
-    z = p_cam[:, 2]
+    # Term by term: a matrix product may round equal rows differently, and equal centres must have equal depths.
+    a, b, c = means.unbind(1)
+    x, y, z = (T[i, 3] + T[i, 0] * a + T[i, 1] * b + T[i, 2] * c for i in range(3))
     safe_z = torch.where(z > settings.near_plane, z, 1)
-    u, v = p_cam[:, 0] / safe_z, p_cam[:, 1] / safe_z
+    u, v = x / safe_z, y / safe_z
     means2d = torch.stack([fx * u + skew * v + cx, fy * v + cy], 1)
 
     u_low, u_high, v_low, v_high = frustum_slopes(camera, settings)
@@ -110,7 +117,9 @@ def project(
     )
     axes = jacobian @ T[:3, :3] @ rotmats(quats) * scales[:, None, :]
     dilation = settings.dilation * torch.eye(2, dtype=means.dtype, device=means.device)
-    return means2d, axes @ axes.transpose(1, 2) + dilation, z
+    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
+    determinant = area + settings.dilation * (axes.square().sum((1, 2)) + settings.dilation)
+    return means2d, axes @ axes.transpose(1, 2) + dilation, determinant, z
 
 
 def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
@@ -160,24 +169,25 @@ def _overlapping(means2d, extent, box):
     return ((means2d + extent > low) & (means2d - extent < high)).all(1)
 
 
-def _blend(means2d, cov, opacities, values, labels, box, settings):
+def _blend(means2d, cov, determinant, opacities, values, labels, box, settings):
     """Blend depth-sorted Gaussians over the pixels of a box: values [h, w, D], transmittance [h, w], ids [h, w]."""
     x0, y0, x1, y1 = box
     x = torch.arange(x0, x1, dtype=means2d.dtype, device=means2d.device) + 0.5
     y = torch.arange(y0, y1, dtype=means2d.dtype, device=means2d.device) + 0.5
     shape = (len(y), len(x))
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
-    d = pixels - means2d
-    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    power = -0.5 * (c * d[..., 0] ** 2 - 2 * b * d[..., 0] * d[..., 1] + a * d[..., 1] ** 2) / (a * c - b * b)
+    dx, dy = (pixels - means2d).unbind(-1)
+    # d^T C^-1 d as a sum of two squares, C^-1 = L^T L: the expanded form cancels for long thin Gaussians
+    c_xy, c_yy = cov[:, 0, 1], cov[:, 1, 1]
+    across = torch.sqrt(c_yy / determinant) * (dx - c_xy / c_yy * dy)
+    power = -0.5 * (across.square() + dy.square() / c_yy)
     alpha = (opacities * torch.exp(power)).clamp_max(settings.alpha_max)
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0)
 
-    # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
-    log_passed = torch.cumsum(torch.log1p(-alpha), 1)
     with torch.no_grad():  # a pixel stops at the first Gaussian that would bring T below the minimum
-        keep = log_passed >= math.log(settings.transmittance_min)
+        keep = torch.cumprod(1 - alpha, 1) >= settings.transmittance_min
     alpha = torch.where(keep, alpha, 0)
+    # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
     log_passed = torch.cumsum(torch.log1p(-alpha), 1)
     log_before = torch.cat([torch.zeros_like(log_passed[:, :1]), log_passed[:, :-1]], 1)
     weights = alpha * torch.exp(log_before)
@@ -197,18 +207,21 @@ def _heaviest(weights, labels, transmittance, settings):
     return torch.where(enough, (votes.argmax(1) - 1).to(torch.int32), ids)
 
 
-def _fill_stats(stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor) -> None:
+def _fill_stats(
+    stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype
+) -> None:
     """Write visibility and radii now, and the norm of the screen-space gradient when the backward pass comes by."""
     with torch.no_grad():
         a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
         longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
-        stats.visible = torch.zeros(len(means2d), dtype=torch.bool, device=means2d.device)
-        stats.visible[order] = True
-        stats.radii = torch.where(stats.visible, 3 * torch.sqrt(longest), 0)
+        visible = torch.zeros(len(means2d), dtype=torch.bool, device=means2d.device)
+        visible[order] = True
+        stats.visible = visible
+        stats.radii = torch.where(visible, 3 * torch.sqrt(longest), 0).to(dtype)
         stats.grad_norm = torch.zeros_like(stats.radii)
     if means2d.requires_grad:
 
         def keep_norm(grad):
-            stats.grad_norm = grad.norm(dim=1)
+            stats.grad_norm = grad.norm(dim=1).to(dtype)
 
         means2d.register_hook(keep_norm)

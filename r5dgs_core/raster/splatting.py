@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
 import time
 from typing import Any
 
@@ -52,7 +53,8 @@ def rasterize_splats(
         Image, alpha and depth, on the device and in the dtype of ``means``.
 
     Raises:
-        ValueError: A shape does not fit, or an input is not finite; the message names the input and the first row.
+        ValueError: A shape does not fit, or a value of an input or of the camera is not finite or out of its range; the
+            message names the input and the first index.
         BackendError: The backend is not there.
 
     Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
@@ -188,6 +190,7 @@ def _check(means, quats, scales, opacities, channels, camera, background, labels
             raise ValueError(f"{name}: expected shape {expected}, got {tuple(tensor.shape)}")
         if tensor.dtype != means.dtype or tensor.device != means.device or not tensor.is_floating_point():
             raise ValueError(f"{name}: expected {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}")
+    _check_camera(camera)
     if background is not None:
         depth = channels.shape[-1]
         if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
@@ -199,13 +202,52 @@ def _check(means, quats, scales, opacities, channels, camera, background, labels
     if labels is not None and (tuple(labels.shape) != (n,) or labels.is_floating_point()):
         raise ValueError(f"labels: expected {n} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
     for name, tensor in inputs.items():
-        # A sum is one fast pass, and not finite as soon as one term is not; only then is the culprit looked for.
-        # On the CPU numpy sums: torch would wake its thread pool for it.
-        content = tensor.detach()
-        with np.errstate(invalid="ignore", over="ignore"):
-            total = content.numpy().sum() if content.device.type == "cpu" else content.sum().item()
-        if not np.isfinite(total):
-            bad = torch.nonzero(~torch.isfinite(tensor))
-            if len(bad):
-                index = tuple(bad[0].tolist())
-                raise ValueError(f"{name}: expected finite values, found {tensor[index].item()} at index {index}")
+        _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
+
+
+# Smallest and largest value of the inputs that have them, and the remedy.
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "scales": (0.0, math.inf, "pass exp(log_scales)"),
+    "opacities": (0.0, 1.0, "pass sigmoid(opacity_logits)"),
+}
+
+
+def _check_camera(camera: Camera) -> None:
+    """Raise ValueError naming the entry of the camera that no image can be drawn with."""
+    place = f"camera {camera.name!r}" if camera.name else "camera"
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(f"{place}: expected a width and height of 1 or more, got {camera.width} x {camera.height}")
+    for name, shape in (("intrinsics", (3, 3)), ("T_cam_world", (4, 4))):
+        matrix = np.asarray(getattr(camera, name))
+        if matrix.shape != shape:
+            raise ValueError(f"{place}: {name}: expected shape {shape}, got {matrix.shape}")
+        bad = np.argwhere(~np.isfinite(matrix))
+        if len(bad):
+            at = tuple(bad[0].tolist())
+            raise ValueError(f"{place}: {name}: expected finite values, found {matrix[at]} at index {at}")
+    for at in ((0, 0), (1, 1)):
+        if not camera.intrinsics[at] > 0:
+            raise ValueError(
+                f"{place}: intrinsics: expected focal lengths above 0, found {camera.intrinsics[at]} at index {at}"
+            )
+
+
+def _check_values(name: str, values: torch.Tensor, low: float, high: float, remedy: str) -> None:
+    """Raise ValueError naming the first value that is not finite or lies outside low .. high."""
+    if not values.numel():
+        return
+    # Smallest and largest take one fast pass each and are NaN where a value is; only then is the culprit looked for.
+    # On the CPU numpy finds them: torch would wake its thread pool for it.
+    if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
+        smallest, largest = values.numpy().min(), values.numpy().max()
+    else:
+        smallest, largest = (bound.item() for bound in torch.aminmax(values))
+    if smallest >= low and largest <= high and smallest > -math.inf and largest < math.inf:
+        return
+    bad = ~(torch.isfinite(values) & (values >= low) & (values <= high))
+    index = tuple(torch.nonzero(bad)[0].tolist())
+    found = values[index].item()
+    if not math.isfinite(found):
+        raise ValueError(f"{name}: expected finite values, found {found} at index {index}")
+    wanted = "0 or more" if high == math.inf else f"values from {low:g} to {high:g}"
+    raise ValueError(f"{name}: expected {wanted}, found {found:g} at index {index}; remedy: {remedy}")
