@@ -3,8 +3,14 @@
 Whatever the dtype of the inputs, everything is computed in float64: float32 inputs are drawn as the same numbers in
 float64 would be, and only results and gradients are rounded.
 
-Notation: z depth, u = x / z and v = y / z slopes, C the projected covariance in px^2, P with C = P P^T + dilation,
-T transmittance.
+Notation: z depth, u = x / z and v = y / z slopes, P the axes of a Gaussian in px, one per column, C = P P^T + dilation
+its covariance in px^2, T transmittance.
+
+Nothing cancels, however long and thin a Gaussian is: det C and d^T C^-1 d are sums of squares (Cauchy and Binet), with
+x for the cross product in the plane and k, l for columns of P:
+
+    det C = sum over k < l of (P_k x P_l)^2 + dilation (|P|^2 + dilation)
+    det C d^T C^-1 d = sum over k of (d x P_k)^2 + dilation |d|^2
 """
 
 from __future__ import annotations
@@ -35,13 +41,15 @@ def rasterize_splats(
     """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
     dtype, height, width = means.dtype, camera.height, camera.width
     means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
-    means2d, cov, determinant, z = project(means, quats, scales, camera, settings)
+    means2d, axes, z = project(means, quats, scales, camera, settings)
     with torch.no_grad():
+        cov = axes @ axes.transpose(1, 2) + settings.dilation * torch.eye(2).to(axes)
         order, extent = _visible(means2d, cov, z, opacities, camera, settings)
-    if stats is not None:
-        _fill_stats(stats, means2d, cov, order, dtype)
-    inputs = (means2d, cov, determinant, opacities, torch.cat([channels, z[:, None]], 1))
-    inputs = [t[order] for t in inputs]
+        if stats is not None:
+            _fill_stats(stats, cov, order, dtype)
+    if stats is not None and means2d.requires_grad:
+        means2d.register_hook(lambda gradient: _keep_norm(stats, gradient, dtype))
+    inputs = [t[order] for t in (means2d, axes, opacities, torch.cat([channels, z[:, None]], 1))]
     kept_labels = None if labels is None else labels[order]
     centers, extent = inputs[0].detach(), extent[order]
 
@@ -75,23 +83,19 @@ def project(
     scales: torch.Tensor,  # [N, 3]
     camera: Camera,
     settings: RasterSettings,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Project Gaussians to the image.
-
-    The determinant of C comes from det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, where det(P P^T) is the square of
-    the cross product of the rows of P (Cauchy and Binet). Nothing cancels, while c_xx c_yy - c_xy^2 has no digit left
-    for a Gaussian 10^8 times as long as wide.
 
     Args:
         means: Centres, world. [N, 3]
         quats: Rotations wxyz, any length; length zero counts as no rotation. [N, 4]
         scales: Standard deviations, world units. [N, 3]
         camera: The view.
-        settings: For near plane, frustum clamp and dilation.
+        settings: For near plane and frustum clamp.
 
     Returns:
-        Centres in px [N, 2], covariances with dilation in px^2 [N, 2, 2], their determinants [N], depths [N]. Rows
-        before the near plane are finite and meaningless.
+        Centres in px [N, 2], axes in px, one per column [N, 2, 3], depths [N]. Rows before the near plane are finite
+        and meaningless.
 
     Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
     """
@@ -115,11 +119,7 @@ def project(
         ],
         1,
     )
-    axes = jacobian @ T[:3, :3] @ rotmats(quats) * scales[:, None, :]
-    dilation = settings.dilation * torch.eye(2, dtype=means.dtype, device=means.device)
-    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
-    determinant = area + settings.dilation * (axes.square().sum((1, 2)) + settings.dilation)
-    return means2d, axes @ axes.transpose(1, 2) + dilation, determinant, z
+    return means2d, jacobian @ T[:3, :3] @ rotmats(quats) * scales[:, None, :], z
 
 
 def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
@@ -169,7 +169,7 @@ def _overlapping(means2d, extent, box):
     return ((means2d + extent > low) & (means2d - extent < high)).all(1)
 
 
-def _blend(means2d, cov, determinant, opacities, values, labels, box, settings):
+def _blend(means2d, axes, opacities, values, labels, box, settings):
     """Blend depth-sorted Gaussians over the pixels of a box: values [h, w, D], transmittance [h, w], ids [h, w]."""
     x0, y0, x1, y1 = box
     x = torch.arange(x0, x1, dtype=means2d.dtype, device=means2d.device) + 0.5
@@ -177,10 +177,12 @@ def _blend(means2d, cov, determinant, opacities, values, labels, box, settings):
     shape = (len(y), len(x))
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
     dx, dy = (pixels - means2d).unbind(-1)
-    # d^T C^-1 d as a sum of two squares, C^-1 = L^T L: the expanded form cancels for long thin Gaussians
-    c_xy, c_yy = cov[:, 0, 1], cov[:, 1, 1]
-    across = torch.sqrt(c_yy / determinant) * (dx - c_xy / c_yy * dy)
-    power = -0.5 * (across.square() + dy.square() / c_yy)
+    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
+    determinant = area + settings.dilation * (axes.square().sum((1, 2)) + settings.dilation)
+    square = settings.dilation * (dx.square() + dy.square())
+    for k in range(3):
+        square = square + (dx * axes[:, 1, k] - dy * axes[:, 0, k]).square()
+    power = -0.5 * square / determinant
     alpha = (opacities * torch.exp(power)).clamp_max(settings.alpha_max)
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0)
 
@@ -207,21 +209,17 @@ def _heaviest(weights, labels, transmittance, settings):
     return torch.where(enough, (votes.argmax(1) - 1).to(torch.int32), ids)
 
 
-def _fill_stats(
-    stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype
-) -> None:
-    """Write visibility and radii now, and the norm of the screen-space gradient when the backward pass comes by."""
-    with torch.no_grad():
-        a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-        longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
-        visible = torch.zeros(len(means2d), dtype=torch.bool, device=means2d.device)
-        visible[order] = True
-        stats.visible = visible
-        stats.radii = torch.where(visible, 3 * torch.sqrt(longest), 0).to(dtype)
-        stats.grad_norm = torch.zeros_like(stats.radii)
-    if means2d.requires_grad:
+def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype) -> None:
+    """Write visibility and radii, and no gradient yet."""
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
+    visible = torch.zeros(len(cov), dtype=torch.bool, device=cov.device)
+    visible[order] = True
+    stats.visible = visible
+    stats.radii = torch.where(visible, 3 * torch.sqrt(longest), 0).to(dtype)
+    stats.grad_norm = torch.zeros_like(stats.radii)
 
-        def keep_norm(grad):
-            stats.grad_norm = grad.norm(dim=1).to(dtype)
 
-        means2d.register_hook(keep_norm)
+def _keep_norm(stats: RasterStats, gradient: torch.Tensor, dtype: torch.dtype) -> None:
+    """Write the norms of the gradient with respect to the projected centres, when the backward pass comes by."""
+    stats.grad_norm = gradient.norm(dim=1).to(dtype)
