@@ -1,0 +1,324 @@
+"""Rasterizer on NVIDIA GPUs: plain torch projects in float64, kernels of gsplat (Apache-2.0) blend in float32.
+
+Of gsplat three functions are called: `isect_tiles` and `isect_offset_encode` list the Gaussians of each tile,
+`rasterize_to_pixels` blends them. Its projection is not: it knows no skew and no other clamp than its own, and it culls
+and sorts in float32, while that of the reference makes both backends draw the same Gaussians in the same order.
+
+gsplat is imported when something is drawn, not when this module is. Its thresholds are compiled into it; `Kernels`
+carries them, and `check_settings` refuses settings that ask for others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from .. import errors
+from ..scene.cameras import Camera
+from . import reference
+from .settings import RasterSettings, RasterStats, SplatImage
+
+log = logging.getLogger(__name__)
+
+TILE = 16  # px; the size that gsplat tunes its kernels for
+# Compiled into gsplat 1.5 and 1.6 alike. More than 32 at a time need more shared memory than some GPUs have.
+CHANNEL_COUNTS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
+OLDEST_GSPLAT = (1, 5)  # the first that takes a radius per axis
+ALPHA_MAX_SLACK = 0.01  # difference of alpha_max that is drawn, with a warning
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """What is called of gsplat, and the thresholds that are compiled into it.
+
+    Attributes:
+        isect_tiles: Pairs of tile and Gaussian, sorted by tile and depth.
+        isect_offset_encode: Where the pairs of each tile begin.
+        rasterize_to_pixels: Blended channels and alpha, differentiable.
+        version: Of gsplat, for messages.
+        alpha_min: Contributions below this are dropped.
+        alpha_max: Contributions are capped here.
+        transmittance_min: A pixel is finished before its transmittance reaches this.
+    """
+
+    isect_tiles: Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
+    isect_offset_encode: Callable[..., torch.Tensor]
+    rasterize_to_pixels: Callable[..., tuple[torch.Tensor, torch.Tensor]]
+    version: str
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
+
+
+@dataclass(frozen=True)
+class _Projected:
+    """Gaussians that touch the image, near to far, as gsplat takes them, and the tiles that they touch."""
+
+    means2d: torch.Tensor  # [V, 2] px
+    conics: torch.Tensor  # [V, 3] inverse covariance: xx, xy, yy
+    opacities: torch.Tensor  # [V]
+    tile_starts: torch.Tensor  # [1, tiles high, tiles wide] first pair of each tile
+    pairs: torch.Tensor  # [P] Gaussian of each pair
+    width: int
+    height: int
+
+
+def rasterize_splats(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    channels: torch.Tensor,
+    camera: Camera,
+    background: torch.Tensor | None,
+    labels: torch.Tensor | None,
+    settings: RasterSettings,
+    stats: RasterStats | None,
+) -> SplatImage:
+    """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
+    kernels = find_kernels()
+    if isinstance(kernels, str):
+        raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
+    check_settings(settings, kernels, opacities)
+    with torch.no_grad():
+        projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
+        means2d, cov, _, z = projected
+        order, extent = reference._visible(means2d, cov, z, opacities.double(), camera, settings)
+        tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
+        # Once more with gradients, only what is seen: the graph of a float64 projection is the largest thing in memory.
+        seen = (means[order].double(), quats[order].double(), scales[order].double())
+        means2d, cov, determinant, z = reference.project(*seen, camera, settings)
+    else:
+        means2d, cov, determinant, z = (t[order] for t in projected)
+    if stats is not None:
+        _fill_stats(stats, means2d, cov, order, means)
+
+    inverse = torch.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], 1) / determinant[:, None]
+    splats = _Projected(
+        means2d.float(), inverse.float(), opacities[order], tile_starts, pairs, camera.width, camera.height
+    )
+    blended, alpha = _blend(splats, torch.cat([channels[order], z[:, None].float()], 1), kernels)
+    covered = alpha > 0
+    depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
+    image = blended[..., :-1]
+    if background is not None:
+        image = image + (1 - alpha)[..., None] * background
+    ids = None
+    if labels is not None:
+        ids = _heaviest(splats, labels.to(order.device)[order], alpha, kernels, settings)
+    return SplatImage(image, alpha, depth, ids)
+
+
+def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
+    """Why tensors of this device and dtype cannot be drawn here, and the remedy; None where they can.
+
+    The first call may take minutes: gsplat compiles its kernels when they are first loaded on a machine.
+    """
+    if torch.version.cuda is None:
+        return (
+            f"torch {torch.__version__} is built without CUDA; remedy: install a CUDA build of torch "
+            "(https://pytorch.org/get-started), or use backend='cpu'"
+        )
+    if not torch.cuda.is_available():
+        return (
+            "torch finds no CUDA device; remedy: check that nvidia-smi lists a GPU, that its driver is new enough for "
+            f"CUDA {torch.version.cuda} and that CUDA_VISIBLE_DEVICES does not hide it, or use backend='cpu'"
+        )
+    if device.type != "cuda":
+        return f"expected tensors on a CUDA device, got {device}; remedy: move them there, or use backend='cpu'"
+    if dtype != torch.float32:
+        return f"expected float32 tensors, got {dtype}; remedy: convert them, or use backend='reference'"
+    kernels = find_kernels()
+    return kernels if isinstance(kernels, str) else None
+
+
+@functools.cache
+def find_kernels() -> Kernels | str:
+    """Kernels of gsplat, or why they cannot be used, and the remedy; found once, as a build may fail after minutes."""
+    log.info("rasterizer 'cuda': loading gsplat; the first time on a machine it compiles for minutes")
+    version = "(unknown version)"
+    try:
+        # gsplat reports its build on stdout, which is that of the caller: `--progress json` writes there.
+        with contextlib.redirect_stdout(sys.stderr):
+            import gsplat
+
+            version = gsplat.__version__
+            if tuple(int(part) for part in version.split(".")[:2]) < OLDEST_GSPLAT:
+                oldest = ".".join(map(str, OLDEST_GSPLAT))
+                return f"gsplat {version} is too old; remedy: pip install -U 'gsplat>={oldest}'"
+            from gsplat.cuda import _backend
+    except Exception as error:  # a compiler, a linker and a loader may fail in their own ways
+        if isinstance(error, ModuleNotFoundError) and error.name == "gsplat":
+            return "gsplat is not installed; remedy: pip install 'r5dgs[cuda]'"
+        what = (str(error).splitlines() or [""])[0]
+        return (
+            f"gsplat {version} does not load ({type(error).__name__}: {what}); remedy: see that nvcc of CUDA "
+            f"{torch.version.cuda} and a C++ compiler that it accepts are there; `python -c 'from gsplat.cuda import "
+            "_backend'` shows the whole message"
+        )
+    if _backend._C is None:
+        return (
+            f"gsplat {version} finds no CUDA toolkit to compile its kernels with; remedy: install CUDA "
+            f"{torch.version.cuda} with nvcc and set CUDA_HOME, or a gsplat wheel that holds compiled kernels"
+        )
+    return Kernels(
+        gsplat.isect_tiles, gsplat.isect_offset_encode, gsplat.rasterize_to_pixels, version, **_read_thresholds()
+    )
+
+
+def _read_thresholds() -> dict[str, float]:
+    """Thresholds of the gsplat that is installed: 1.6 states them, those of 1.5 stand in its kernels."""
+    try:
+        from gsplat.cuda import _constants as constants
+    except ImportError:
+        return {"alpha_min": 1 / 255, "alpha_max": 0.999, "transmittance_min": 1e-4}
+    return {
+        "alpha_min": constants.ALPHA_THRESHOLD,
+        "alpha_max": constants.MAX_ALPHA,
+        "transmittance_min": constants.TRANSMITTANCE_THRESHOLD,
+    }
+
+
+def check_settings(settings: RasterSettings, kernels: Kernels, opacities: torch.Tensor) -> None:
+    """Raise BackendError naming the setting that these kernels cannot meet; warn where they meet it nearly.
+
+    Args:
+        settings: What is asked for.
+        kernels: With the thresholds compiled into them.
+        opacities: Where none exceeds either cap, ``alpha_max`` is never used, and any value of it is met. [N]
+    """
+    for name in ("alpha_min", "transmittance_min"):
+        wanted, there = getattr(settings, name), getattr(kernels, name)
+        if not math.isclose(wanted, there, rel_tol=1e-6):
+            raise errors.BackendError(_cannot_meet(name, wanted, there, kernels))
+    wanted, there = settings.alpha_max, kernels.alpha_max
+    if math.isclose(wanted, there, rel_tol=1e-6) or not len(opacities):
+        return
+    if opacities.detach().max().item() <= min(wanted, there):
+        return
+    if abs(wanted - there) > ALPHA_MAX_SLACK:
+        raise errors.BackendError(_cannot_meet("alpha_max", wanted, there, kernels))
+    _warn_once(
+        f"rasterizer 'cuda': gsplat {kernels.version} caps alpha at {there:g}, alpha_max is {wanted:g}: pixels in the "
+        f"middle of Gaussians with a higher opacity differ by up to {abs(wanted - there):.3f} of a colour"
+        + ("; gsplat 1.6 caps at 0.99" if there == 0.999 else "")
+    )
+
+
+def _cannot_meet(name: str, wanted: float, there: float, kernels: Kernels) -> str:
+    return (
+        f"rasterizer 'cuda': {name}: expected {there:g}, which is compiled into gsplat {kernels.version}, got "
+        f"{wanted:g}; remedy: leave it at that, or use backend='cpu' or 'reference'"
+    )
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning(message)
+
+
+def _tile_lists(
+    means2d: torch.Tensor,  # [V, 2]
+    extent: torch.Tensor,  # [V, 2]
+    camera: Camera,
+    kernels: Kernels,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which Gaussians touch which tile: first pair of each tile [1, tiles high, tiles wide], Gaussian of each pair [P].
+
+    gsplat is given the box of each alpha_min ellipse inside the image, whose numbers are small whatever those of the
+    Gaussian, and the rank in depth for the depth, which float32 holds where it would round neighbours together. Equal
+    ranks, from the 16.7 millionth on, stay in order all the same, as the sort is stable.
+    """
+    size = means2d.new_tensor([camera.width, camera.height])
+    low, high = (means2d - extent).clamp_min(0), torch.minimum(means2d + extent, size)
+    radii = torch.ceil(0.5 * (high - low)).clamp_min(1).int()
+    ranks = torch.arange(len(means2d), dtype=torch.float32, device=means2d.device)
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    if not len(means2d):
+        return ranks.new_zeros((1, tiles_y, tiles_x), dtype=torch.int32), ranks.int()
+    centers = (0.5 * (low + high)).float()
+    _, keys, pairs = kernels.isect_tiles(centers[None], radii[None], ranks[None], TILE, tiles_x, tiles_y)
+    return kernels.isect_offset_encode(keys, 1, tiles_x, tiles_y), pairs
+
+
+def _blend(splats: _Projected, values: torch.Tensor, kernels: Kernels) -> tuple[torch.Tensor, torch.Tensor]:
+    """Blend values [V, D] front to back: their weighted sums [H, W, D] and alpha [H, W]."""
+    if not len(values):
+        # Sums over nothing are zero, and keep the result on the graph of the inputs.
+        nothing = sum(t.sum() for t in (splats.means2d, splats.conics, splats.opacities, values))
+        zeros = values.new_zeros((splats.height, splats.width, values.shape[1] + 1)) + nothing
+        return zeros[..., 1:], zeros[..., 0]
+    sums, alpha = [], None
+    for part in values.split(CHANNEL_COUNTS[-1], 1):
+        n = part.shape[1]
+        count = next(c for c in CHANNEL_COUNTS if c >= n)
+        colors, alphas = kernels.rasterize_to_pixels(
+            splats.means2d[None],
+            splats.conics[None],
+            torch.nn.functional.pad(part, (0, count - n))[None],
+            splats.opacities[None],
+            splats.width,
+            splats.height,
+            TILE,
+            splats.tile_starts,
+            splats.pairs,
+        )
+        sums.append(colors[0, ..., :n])
+        alpha = alphas[0, ..., 0] if alpha is None else alpha
+    assert alpha is not None
+    return torch.cat(sums, -1), alpha
+
+
+@torch.no_grad()
+def _heaviest(
+    splats: _Projected,
+    labels: torch.Tensor,  # [V]
+    alpha: torch.Tensor,  # [H, W]
+    kernels: Kernels,
+    settings: RasterSettings,
+) -> torch.Tensor:
+    """Label with the largest sum of weights, the smallest of equals, -1 where alpha is small. [H, W] int32
+
+    Each label is a channel that its Gaussians fill with ones, so the labels of a scene take a pass per 32 of them.
+    """
+    known, members = torch.unique(labels.clamp_min(-1), return_inverse=True)
+    ids = torch.full(alpha.shape, -1, dtype=torch.int32, device=alpha.device)
+    most = torch.zeros_like(alpha)
+    for first in range(0, len(known), CHANNEL_COUNTS[-1]):
+        some = torch.arange(first, min(first + CHANNEL_COUNTS[-1], len(known)), device=alpha.device)
+        votes, _ = _blend(splats, (members[:, None] == some).to(alpha.dtype), kernels)
+        weight, which = votes.max(-1)  # the first of equals, and labels ascend
+        ids = torch.where(weight > most, known[some[which]].to(torch.int32), ids)
+        most = torch.maximum(weight, most)
+    return torch.where(alpha >= settings.id_alpha_min, ids, -1)
+
+
+def _fill_stats(
+    stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor, means: torch.Tensor
+) -> None:
+    """Write visibility and radii now, and the norm of the screen-space gradient when the backward pass comes by."""
+
+    def spread(rows: torch.Tensor) -> torch.Tensor:
+        """Rows of the visible Gaussians among those of all, zero elsewhere. [N]"""
+        return means.new_zeros(len(means)).index_copy_(0, order, rows.to(means.dtype))
+
+    with torch.no_grad():
+        a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+        longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
+        stats.visible = spread(torch.ones_like(a)) > 0
+        stats.radii = spread(3 * torch.sqrt(longest))
+        stats.grad_norm = torch.zeros_like(stats.radii)
+    if means2d.requires_grad:
+
+        def keep_norm(grad):
+            stats.grad_norm = spread(grad.norm(dim=1))
+
+        means2d.register_hook(keep_norm)
