@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import logging
 import math
@@ -45,8 +46,8 @@ def rasterize_splats(
         background: Shows through by 1 - alpha; zeros where None. [D] or [H, W, D]
         labels: Integers; ``ids`` of the result is the label with the largest weight, negative ones vote for -1. [N]
         settings: Thresholds; those of 3DGS where None.
-        backend: "cpu" (numba, float32), "reference" (plain torch, any float dtype), "cuda", or "auto": the fastest one
-            that can take these tensors.
+        backend: "cpu" (numba, float32), "cuda" (gsplat, float32 tensors on a GPU), "reference" (plain torch, any float
+            dtype and device), or "auto": the fastest one that can take these tensors.
         stats: Filled with visibility and radii by the call, and with screen-space gradients by the backward pass.
 
     Returns:
@@ -67,7 +68,7 @@ def rasterize_splats(
     elif chosen == "cpu":
         from . import cpu as implementation
     else:
-        raise errors.BackendError("rasterizer 'cuda': not built yet; use backend='cpu' or move the tensors to the CPU")
+        from . import cuda as implementation
     return implementation.rasterize_splats(
         means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     )
@@ -119,7 +120,7 @@ def rasterize(
         channels,
         camera,
         background,
-        labels=None if object_ids is None else torch.as_tensor(object_ids),
+        labels=None if object_ids is None else torch.as_tensor(object_ids, device=means.device),
         settings=settings,
         backend=backend,
         stats=stats,
@@ -167,7 +168,20 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
             return "cpu"
         if means.device.type == "cpu" and means.dtype == torch.float32:
             log.warning("rasterizer: numba is not installed, using the slow reference; remedy: pip install numba")
+        if means.device.type == "cuda" and means.dtype == torch.float32:
+            from . import cuda
+
+            reason = cuda.obstacle(means.device, means.dtype)
+            if reason is None:
+                return "cuda"
+            _warn_once(f"rasterizer: using the slow reference on the GPU, as backend 'cuda' cannot draw: {reason}")
         return "reference"
+    if backend == "cuda":
+        from . import cuda
+
+        reason = cuda.obstacle(means.device, means.dtype)
+        if reason is not None:
+            raise errors.BackendError(f"rasterizer 'cuda': {reason}")
     if backend == "cpu":
         if not numba_is_there:
             raise errors.BackendError("rasterizer 'cpu': numba is not installed; remedy: pip install numba")
@@ -177,6 +191,11 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
                 "remedy: convert them, or use backend='reference'"
             )
     return backend
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning(message)
 
 
 def _check(means, quats, scales, opacities, channels, camera, background, labels) -> None:
