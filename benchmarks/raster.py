@@ -1,170 +1,309 @@
-"""Times the rasterizer on fixed workloads: `python benchmarks/raster.py [--json FILE]`.
+"""Times the rasterizer: `python benchmarks/raster.py --workloads W1,W2,W3,W4 --threads 1 --json FILE`.
 
-A row is one pass over one workload with one backend and number of threads. Times are of the whole call, checks
-included: ``cpu_ms`` is the smallest processor time over all threads (comparable on a busy machine), wall times are
-smallest and median, and ``peak_mb`` is the largest resident memory during the pass beyond that before it (null where
-the system does not tell). ``forward`` runs without gradients, ``forward_backward`` with gradients of every input. The
-threads are the rasterizer's; torch's own few operations run on one, or its waiting threads would be counted too.
+A row is one pass over one workload with one backend and number of threads. ``cpu_ms`` is the smallest processor time
+over all threads (comparable on a busy machine), wall times are smallest and median, and ``peak_mb`` is the largest
+resident memory during the pass beyond that before it, measured in calls of their own (null where the system does not
+tell). Everything takes turns, so that what else the machine does meets all alike. Times are of whole calls, checks
+included. Passes:
+
+    forward           without gradients
+    forward_backward  with gradients of every input
+    motion            scenes only: from the scene file's arrays to Gaussians at a time (`playback.frame`)
+    frame             scenes only: motion, colours seen from the camera, forward, ids; what playback costs
+
+The threads are the rasterizer's. Beside the backend `cpu`, torch's own few operations run on one, or its waiting
+threads would be counted too; other backends and peers get them all.
+
+A peer is another renderer that takes turns with ours: a Python module (dotted name, or path to a .py file) with
+``NAME``, ``prepare(inputs, camera) -> state`` and ``forward(state) -> image [H, W, D]``, and if it has them
+``forward_backward(state, upstream)``, with the gradient of the image [H, W, D], and ``supports(workload) -> bool``.
+``inputs`` are means [N, 3], quats [N, 4] (wxyz), scales [N, 3], opacities [N], channels [N, D], float32 tensors;
+``camera`` has ``width``, ``height``, ``intrinsics`` [3, 3] and ``T_cam_world`` [4, 4] (OpenCV axes).
 """
 
 from __future__ import annotations
 
 import argparse
-import ctypes
+import functools
+import importlib
+import importlib.util
 import json
-import statistics
-import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
-import numpy as np
+import stages
+import timing
 import torch
+import workloads
+from workloads import Workload
 
-from r5dgs_core.raster import rasterize_splats
-from r5dgs_core.scene.cameras import Camera
+from r5dgs_core import errors
+from r5dgs_core.raster import rasterize_splats, scene_render
+from r5dgs_core.scene import playback, scene_file
 
 COLUMNS = ("workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb")
+DEFAULT_WORKLOADS = ["W1", "W2", "W3", "W4"]
 
-
-@dataclass(frozen=True)
-class Workload:
-    """A cube of random Gaussians before a camera.
-
-    Attributes:
-        count: Number of Gaussians.
-        size: Width and height of the image, px.
-        n_channels: Channels to blend.
-        radius_px: Median of three standard deviations along the longest axis, px.
-    """
-
-    count: int
-    size: int
-    n_channels: int
-    radius_px: float = 4.0
-
-
-WORKLOADS = {
-    "train": Workload(12_000, 128, 3),  # a training step of the demo
-    "train+16": Workload(12_000, 128, 19),  # the same with identity encodings
-    "W1": Workload(40_000, 400, 3),
-    "W1h": Workload(40_000, 400, 3, radius_px=12.0),
-    "W2": Workload(40_000, 400, 19),
-    "W3": Workload(200_000, 800, 3),
+# Smallest processor milliseconds on one thread, (forward, forward and backward). Measured on another day on a machine
+# of the kind that the committed results come from (2 cores with AVX-512, 2.6 GHz). W4 there had the real points.
+ANCHORS = {
+    "OpenSplat, CPU": {
+        "W1": (161, 290),
+        "W1h": (390, 556),
+        "W2": (1062, 1867),  # 7 passes: it draws 3 channels
+        "W3": (1338, 2161),
+        "W4": (270, 515),
+    },
+    "plain numba sketch": {
+        "W1": (20, 47),
+        "W1h": (30, 79),
+        "W2": (31, 81),
+        "W3": (135, 317),
+        "W4": (47, 117),
+    },
+    # An estimate, not a measurement: blending at 60 % of what counting its vector instructions allows, the rest tuned.
+    "estimated bound": {"W1": (None, 15)},
 }
-
-
-def make(workload: Workload, seed: int = 0) -> tuple[list[torch.Tensor], Camera]:
-    """Inputs of `rasterize_splats` and the camera: centres uniform in a cube, log-normal sizes and anisotropy."""
-    random = np.random.default_rng(seed)
-    n, size = workload.count, workload.size
-    focal = 0.5 * size / np.tan(np.radians(25.0))
-    eye = np.array([0.5, -0.4, -3.0])
-    forward = -eye / np.linalg.norm(eye)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    T_cam_world = np.eye(4)
-    T_cam_world[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    T_cam_world[:3, 3] = -T_cam_world[:3, :3] @ eye
-    camera = Camera(
-        size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]]), T_cam_world, "benchmark"
-    )
-    means = random.uniform(-1, 1, (n, 3))
-    quats = random.normal(size=(n, 4))
-    scales = np.exp(0.5 * random.normal(size=(n, 1)) + 0.5 * random.normal(size=(n, 3)))
-    depths = means @ T_cam_world[2, :3] + T_cam_world[2, 3]
-    scales *= workload.radius_px / 3 / np.median(scales.max(1) * focal / depths)
-    arrays = (
-        means,
-        quats,
-        scales,
-        random.uniform(0.1, 0.99, n),
-        random.uniform(0, 1, (n, workload.n_channels)),
-    )
-    return [torch.tensor(array, dtype=torch.float32) for array in arrays], camera
-
-
-def measure(run, repeats: int) -> dict:
-    """Times and memory of ``run()``, after one call that compiles and warms up."""
-    run()
-    cpu, wall, peaks = [], [], []
-    for _ in range(repeats):
-        before = _reset_peak_mb()
-        cpu_start, wall_start = time.process_time(), time.perf_counter()
-        run()
-        cpu.append(1e3 * (time.process_time() - cpu_start))
-        wall.append(1e3 * (time.perf_counter() - wall_start))
-        if before is not None:
-            peaks.append(_status_mb("VmHWM") - before)
-    return {
-        "cpu_ms": round(min(cpu), 3),
-        "wall_ms_min": round(min(wall), 3),
-        "wall_ms_median": round(statistics.median(wall), 3),
-        "peak_mb": round(max(peaks), 1) if peaks else None,
-    }
-
-
-def _reset_peak_mb() -> float | None:
-    """Give freed memory back and let Linux forget its largest size; returns the present one, None on other systems."""
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
-        return _status_mb("VmRSS")
-    except (OSError, AttributeError, TypeError):
-        return None
-
-
-def _status_mb(key: str) -> float:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(key + ":"):
-            return int(line.split()[1]) / 1024
-    raise OSError(f"/proc/self/status: no {key}")
-
-
-def run_workload(name: str, backend: str, threads: int, repeats: int) -> list[dict]:
-    """Rows for both passes."""
-    inputs, camera = make(WORKLOADS[name])
-    upstream = torch.randn(
-        (camera.height, camera.width, inputs[-1].shape[1]), generator=torch.Generator().manual_seed(1)
-    )
-    torch.set_num_threads(1 if backend == "cpu" else threads)
-    if backend == "cpu":
-        from r5dgs_core.raster import compile as compilation
-
-        compilation.set_threads(threads)
-
-    @torch.no_grad()
-    def forward():
-        rasterize_splats(*inputs, camera, backend=backend)
-
-    def forward_backward():
-        leaves = [tensor.detach().requires_grad_() for tensor in inputs]
-        rasterize_splats(*leaves, camera, backend=backend).image.backward(upstream)
-
-    row = {"workload": name, "backend": backend, "threads": threads}
-    return [
-        {**row, "pass": "forward", **measure(forward, repeats)},
-        {**row, "pass": "forward_backward", **measure(forward_backward, repeats)},
-    ]
+PASSES = ("forward", "forward_backward")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--workloads", nargs="+", choices=WORKLOADS, default=["train", "train+16", "W1", "W1h", "W2"])
-    parser.add_argument("--backends", nargs="+", default=["cpu"], help="cpu, reference")
-    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    """Measure, print rows and ratios, write the rows."""
+    parser = _parser()
     options = parser.parse_args(arguments)
-    rows = []
-    print(" ".join(f"{column:>16}" for column in COLUMNS))
-    for name in options.workloads:
-        for backend in options.backends:
-            for threads in options.threads:
-                for row in run_workload(name, backend, threads, options.repeats):
-                    rows.append(row)
+    options.threads = [count for part in options.threads for count in part]
+    options.backends = [name for part in options.backends for name in part]
+    if min(options.threads) < 1 or options.repeats < 1:
+        parser.error("--threads and --repeats: expected at least 1")
+    try:
+        chosen = _choose(options)
+        peers = [load_peer(name) for name in options.peer]
+    except (ValueError, OSError, errors.R5dgsError) as error:
+        parser.error(str(error))
+    rows: list[dict[str, Any]] = []
+    print(" ".join(f"{column:>16}" for column in COLUMNS), flush=True)
+    for make in chosen:
+        workload = make()
+        for threads in options.threads:
+            with _rasterizer_threads(threads):
+                contenders = list(_contenders(workload, threads, options.backends, peers))
+                timing.take_turns(contenders, options.repeats)
+                new = [contender.row() for contender in contenders]
+                rows += new
+                for row in new:
                     print(" ".join(f"{row[column]!s:>16}" for column in COLUMNS), flush=True)
+                if options.stages and "cpu" in options.backends:
+                    print(_split(workload, threads, options.repeats), flush=True)
+        for peer in peers:
+            print(_compare_images(peer, workload), end="", flush=True)
+    print(ratios(rows, [peer.NAME for peer in peers]), end="")
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def load_peer(name: str) -> ModuleType:
+    """A peer's module by dotted name or path. Raises ValueError where it is missing or lacks something."""
+    if name.endswith(".py"):
+        path = Path(name)
+        if not path.is_file():
+            raise ValueError(f"--peer {name}: no such file")
+        spec = importlib.util.spec_from_file_location(f"peer_{path.stem}", path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    else:
+        try:
+            module = importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            raise ValueError(
+                f"--peer {name}: {error}; expected a module on PYTHONPATH or a path to a .py file"
+            ) from None
+    lacking = [needed for needed in ("NAME", "prepare", "forward") if not hasattr(module, needed)]
+    if lacking:
+        raise ValueError(f"--peer {name}: expected NAME, prepare and forward, found no {', '.join(lacking)}")
+    return module
+
+
+def ratios(rows: list[dict[str, Any]], peers: list[str]) -> str:
+    """Text: our `cpu` rows beside peers of this run, figures of another day and one thread, and frames per second."""
+    found = {(row["workload"], row["backend"], row["threads"], row["pass"]): row for row in rows}
+    ours = [row for row in rows if row["backend"] == "cpu"]
+    lines = []
+    for peer in peers:
+        pairs = [(row, found.get((row["workload"], peer, row["threads"], row["pass"]))) for row in ours]
+        pairs = [(row, other) for row, other in pairs if other is not None]
+        if pairs:
+            lines.append(f"\n{peer} / ours, in turns in this run: processor time, median wall time")
+        for row, other in pairs:
+            of_cpu, of_wall = (other[key] / row[key] for key in ("cpu_ms", "wall_ms_median"))
+            lines.append(f"{_title(row):>44} {of_cpu:8.1f}x {of_wall:8.1f}x")
+    alone = [row for row in ours if row["threads"] == 1 and row["pass"] in PASSES]
+    for anchor, figures in ANCHORS.items():
+        known = []
+        for row in alone:
+            figure = figures.get("W4" if row["workload"] == workloads.GARDEN else row["workload"], (None, None))
+            if (value := figure[PASSES.index(row["pass"])]) is not None:
+                known.append((row, value))
+        if known:
+            lines.append(f"\n{anchor} / ours, processor time; theirs is a constant from another day, such a machine")
+        for row, value in known:
+            lines.append(f"{_title(row):>44} {value / row['cpu_ms']:8.1f}x  ({value} ms)")
+    shared = [row for row in ours if row["threads"] > 1 and (row["workload"], "cpu", 1, row["pass"]) in found]
+    if shared:
+        lines.append("\none thread / several, smallest wall time")
+    for row in shared:
+        single = found[row["workload"], "cpu", 1, row["pass"]]
+        lines.append(f"{_title(row):>44} {single['wall_ms_min'] / row['wall_ms_min']:8.2f}x")
+    frames = [row for row in ours if row["pass"] == "frame"]
+    if frames:
+        lines.append("\nframes per second of playback, median and best")
+    for row in frames:
+        lines.append(f"{_title(row):>44} {1e3 / row['wall_ms_median']:8.1f} {1e3 / row['wall_ms_min']:8.1f}")
+    return "".join(line + "\n" for line in lines)
+
+
+def _title(row: dict[str, Any]) -> str:
+    return f"{row['workload']} {row['pass']}, {row['threads']} thread{'s' * (row['threads'] > 1)}"
+
+
+def _contenders(
+    workload: Workload, threads: int, backends: list[str], peers: list[ModuleType]
+) -> Iterator[timing.Contender]:
+    """Everything that takes turns on a workload with a number of threads."""
+    upstream = make_upstream(workload)
+
+    def contender(backend: str, name: str, run: Callable[[], object]) -> timing.Contender:
+        row = {"workload": workload.name, "backend": backend, "threads": threads, "pass": name}
+        return timing.Contender(row, run, 1 if backend == "cpu" else threads)
+
+    for backend in backends:
+        yield contender(backend, "forward", functools.partial(draw, workload, backend))
+        yield contender(backend, "forward_backward", functools.partial(step, workload, backend, upstream))
+        if workload.scene is not None:
+            yield contender(backend, "motion", functools.partial(playback.frame, workload.scene, workload.t))
+            yield contender(backend, "frame", functools.partial(play, workload, backend))
+    for peer in peers:
+        if hasattr(peer, "supports") and not peer.supports(workload.name):
+            print(f"{peer.NAME} does not support {workload.name}")
+            continue
+        state = peer.prepare(workload.inputs, workload.camera)
+        yield contender(peer.NAME, "forward", functools.partial(peer.forward, state))
+        if hasattr(peer, "forward_backward"):
+            yield contender(peer.NAME, "forward_backward", functools.partial(peer.forward_backward, state, upstream))
+
+
+def make_upstream(workload: Workload) -> torch.Tensor:
+    """A random gradient of the image. [H, W, D]"""
+    shape = (workload.camera.height, workload.camera.width, workload.n_channels)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(1))
+
+
+@torch.no_grad()
+def draw(workload: Workload, backend: str) -> torch.Tensor:
+    """Image of a workload. [H, W, D]"""
+    return rasterize_splats(*workload.inputs, workload.camera, settings=workload.settings, backend=backend).image
+
+
+def step(workload: Workload, backend: str, upstream: torch.Tensor) -> None:
+    """Image of a workload, and gradients of all its inputs."""
+    leaves = [tensor.detach().requires_grad_() for tensor in workload.inputs]
+    drawn = rasterize_splats(*leaves, workload.camera, settings=workload.settings, backend=backend)
+    drawn.image.backward(upstream)
+
+
+def play(workload: Workload, backend: str) -> None:
+    """One frame of a scene, from its file's arrays to pixels."""
+    assert workload.scene is not None
+    frame = playback.frame(workload.scene, workload.t)
+    scene_render.render_frame(workload.scene, frame, workload.camera, backend=backend)
+
+
+def _split(workload: Workload, threads: int, repeats: int) -> str:
+    """Text: median wall time of each kernel in both passes."""
+    upstream = make_upstream(workload)
+    runs = {"forward": lambda: draw(workload, "cpu"), "forward_backward": lambda: step(workload, "cpu", upstream)}
+    lines = []
+    torch.set_num_threads(1)
+    for name, run in runs.items():
+        parts = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages.measure(run, repeats).items())
+        lines.append(f"    {workload.name} {name}, {threads} threads, median wall ms: {parts}")
+    return "\n".join(lines)
+
+
+def _compare_images(peer: ModuleType, workload: Workload) -> str:
+    """How much a peer's image differs from ours: whether both did the same work."""
+    if hasattr(peer, "supports") and not peer.supports(workload.name):
+        return ""
+    theirs = peer.forward(peer.prepare(workload.inputs, workload.camera))
+    if not isinstance(theirs, torch.Tensor):
+        return ""
+    ours = draw(workload, "cpu")
+    if theirs.shape != ours.shape:
+        return f"{peer.NAME} on {workload.name}: image of shape {tuple(theirs.shape)}, ours {tuple(ours.shape)}\n"
+    difference = (theirs.detach() - ours).abs()
+    return (
+        f"{peer.NAME} on {workload.name}: its image differs from ours by {difference.mean().item():.1e} on average, "
+        f"{difference.max().item():.1e} at most\n"
+    )
+
+
+@contextmanager
+def _rasterizer_threads(count: int) -> Iterator[None]:
+    from r5dgs_core.raster import compile as compilation
+
+    before = compilation.threads()
+    compilation.set_threads(count)
+    try:
+        yield
+    finally:
+        compilation.set_threads(before)
+
+
+def _choose(options: argparse.Namespace) -> list[Callable[[], Workload]]:
+    """Makers of the workloads asked for. Raises what is wrong with the names before anything is measured."""
+    names = [name for part in options.workloads or [] for name in part]
+    if not names and options.scene is None:
+        names = list(DEFAULT_WORKLOADS)
+    if options.garden is not None:
+        names.append(workloads.GARDEN)
+    names = list(dict.fromkeys(names))
+    for name in names:
+        workloads.check(name, options.garden)
+    chosen: list[Callable[[], Workload]] = [lambda name=name: workloads.make(name, options.garden) for name in names]
+    if options.scene is not None:
+        scene = scene_file.read(options.scene)
+        camera = workloads.find_camera(scene, options.camera)
+        t = scene.t_max if options.time is None else options.time
+        posed = workloads.pose_scene(options.scene.stem, scene, camera, t)
+        chosen.append(lambda: posed)
+    return chosen
+
+
+def _parser() -> argparse.ArgumentParser:
+    listed, numbers = workloads.name_list, workloads.number_list
+    parser = argparse.ArgumentParser(
+        description=__doc__.splitlines()[0], epilog="Lists are written with commas or spaces."
+    )
+    parser.add_argument(
+        "--workloads",
+        type=listed,
+        nargs="+",
+        help=f"of {', '.join(workloads.GENERATED)}; default {','.join(DEFAULT_WORKLOADS)}, none with --scene",
+    )
+    parser.add_argument("--garden", type=Path, help=f"gsplat's test_garden.npz: adds {workloads.GARDEN}")
+    parser.add_argument("--scene", type=Path, help="a .r5dgs file: adds it as a workload, named as the file")
+    parser.add_argument("--camera", default="0", help="of the scene: name, or number from 0; default 0")
+    parser.add_argument("--time", type=float, help="scene time at which it is posed; default t_max")
+    parser.add_argument("--backends", type=listed, nargs="+", default=[["cpu"]], help="of cpu, reference, cuda")
+    parser.add_argument("--threads", type=numbers, nargs="+", default=[[1, 2]], help="default 1,2")
+    parser.add_argument("--repeats", type=int, default=15, help="turns of each; default 15")
+    parser.add_argument("--peer", action="append", default=[], metavar="MODULE", help="another renderer; repeatable")
+    parser.add_argument("--stages", action="store_true", help="also split the time of the backend cpu into its kernels")
+    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    return parser
 
 
 if __name__ == "__main__":
