@@ -89,15 +89,17 @@ def rasterize_splats(
     check_settings(settings, kernels, opacities)
     with torch.no_grad():
         projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
-        means2d, cov, _, z = projected
+        means2d, axes, z = projected
+        cov, _ = _covariances(axes, settings.dilation)
         order, extent = reference._visible(means2d, cov, z, opacities.double(), camera, settings)
         tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
         # Once more with gradients, only what is seen: the graph of a float64 projection is the largest thing in memory.
         seen = (means[order].double(), quats[order].double(), scales[order].double())
-        means2d, cov, determinant, z = reference.project(*seen, camera, settings)
+        means2d, axes, z = reference.project(*seen, camera, settings)
     else:
-        means2d, cov, determinant, z = (t[order] for t in projected)
+        means2d, axes, z = (t[order] for t in projected)
+    cov, determinant = _covariances(axes, settings.dilation)
     if stats is not None:
         _fill_stats(stats, means2d, cov, order, means)
 
@@ -223,6 +225,13 @@ def _cannot_meet(name: str, wanted: float, there: float, kernels: Kernels) -> st
 @functools.cache
 def _warn_once(message: str) -> None:
     log.warning(message)
+
+
+def _covariances(axes: torch.Tensor, dilation: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Covariances [V, 2, 2] of axes in px [V, 2, 3], and their determinants [V] as sums of squares."""
+    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
+    determinant = area + dilation * (axes.square().sum((1, 2)) + dilation)
+    return axes @ axes.transpose(1, 2) + dilation * torch.eye(2).to(axes), determinant
 
 
 def _tile_lists(
