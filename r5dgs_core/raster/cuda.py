@@ -210,7 +210,7 @@ def check_settings(settings: RasterSettings, kernels: Kernels, opacities: torch.
         raise errors.BackendError(_cannot_meet("alpha_max", wanted, there, kernels))
     _warn_once(
         f"rasterizer 'cuda': gsplat {kernels.version} caps alpha at {there:g}, alpha_max is {wanted:g}: pixels in the "
-        f"middle of Gaussians with a higher opacity differ by up to {abs(wanted - there):.3f} of a colour"
+        f"middle of Gaussians with a higher opacity differ by up to {ALPHA_MAX_SLACK:g} of a colour"
         + ("; gsplat 1.6 caps at 0.99" if there == 0.999 else "")
     )
 

@@ -232,7 +232,7 @@ def test_gradients_do_not_depend_on_which_others_are_wanted(rasterize_cuda):
 
     for position in range(5):
         alone, beside = gradient(position, False), gradient(position, True)
-        assert relative(alone, beside) < 1e-6  # gsplat adds in any order
+        assert relative(alone, beside) < 1e-5  # gsplat adds in any order
 
 
 def test_frames_without_gradients_are_the_same(rasterize_cuda):
