@@ -17,10 +17,10 @@ import torch
 
 from ..model import spherical_harmonics
 from ..motion import rotations
-from ..scene import cameras, playback
+from ..scene import playback
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import RasterSettings, RenderOutput, rasterize
+from . import RasterSettings, RenderOutput, harmonics, rasterize
 
 SIMILARITY_TOLERANCE = 1e-5
 
@@ -163,13 +163,13 @@ def render_frame(
     if isinstance(background, str):
         if background != "scene":
             raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")
-        background = sky(scene, camera)
+        background = _behind(scene, camera)
     with torch.no_grad():
         return rasterize(
             _Gaussians(posed),
             camera,
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
-            None if background is None else torch.from_numpy(np.ascontiguousarray(background, np.float32)),
+            None if background is None else _tensor(background),
             colors=_tensor(colors(posed, camera)),
             settings=settings or RasterSettings(near_plane=scene.near_plane),
             backend=backend,
@@ -178,29 +178,34 @@ def render_frame(
 
 def sky(scene: Scene, camera: Camera) -> np.ndarray:
     """The scene's background as this camera sees it, display-referred sRGB. [H, W, 3] float32"""
-    sh = np.asarray(scene.background_sh, np.float64)
-    if len(sh) == 1:
-        color = np.clip(spherical_harmonics.to_rgb(sh, np.zeros(3)), 0, 1)
-        return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
-    rays = cameras.pixel_rays(camera)
-    return np.clip(spherical_harmonics.to_rgb(sh, rays), 0, 1).astype(np.float32)
+    return harmonics.sky(scene.background_sh, camera)
 
 
 def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
     """Display-referred colour of every Gaussian as this camera sees it, >= 0. [N, 3] float32"""
-    directions = np.zeros_like(posed.means)
-    if posed.sh.shape[1] > 1:
-        directions = posed.means - camera.center.astype(np.float32)
-        maps = posed.view_maps.astype(np.float32)
-        for pose in np.unique(posed.pose_ids):
-            rows = posed.pose_ids == pose
-            if not np.array_equal(maps[pose], np.eye(3)):
-                directions[rows] = directions[rows] @ maps[pose].T
-        directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-12)
-    rgb = np.maximum(spherical_harmonics.to_rgb(posed.sh, directions), 0)
-    if posed.shading_factor is not None:
-        rgb = rgb * posed.shading_factor[:, None]
-    return rgb.astype(np.float32)
+    factor = posed.shading_factor
+    if posed.sh.shape[1] == 1:
+        rgb = np.maximum(spherical_harmonics.dc_to_rgb(np.asarray(posed.sh[:, 0], np.float32)), 0)
+        if factor is not None:
+            for channel in range(3):  # a column at a time: numpy is slow at rows of three
+                rgb[:, channel] *= factor
+        return rgb
+    with torch.no_grad():
+        seen = harmonics.seen_colors(
+            _tensor(posed.means),
+            _tensor(posed.sh),
+            camera.center,
+            view_maps=posed.view_maps,
+            pose_ids=posed.pose_ids,
+            factor=None if factor is None else _tensor(factor),
+        )
+    return seen.numpy()
+
+
+def _behind(scene: Scene, camera: Camera) -> np.ndarray:
+    """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
+    image = sky(scene, camera)
+    return image[0, 0] if len(scene.background_sh) == 1 else image
 
 
 def to_numpy(value: Any, dtype: type) -> np.ndarray:
@@ -209,13 +214,18 @@ def to_numpy(value: Any, dtype: type) -> np.ndarray:
 
 
 class _Gaussians:
-    """What `rasterize` reads of the posed Gaussians, beside their colours."""
+    """What `rasterize` reads of the posed Gaussians, beside their colours.
+
+    numpy computes it, like everything else of a frame before the kernels: torch would wake its threads for that, and
+    they get in the way of ours.
+    """
 
     def __init__(self, posed: PosedScene):
         self.means = _tensor(posed.means)
         self.quats = _tensor(posed.quats)
-        self.log_scales = _tensor(posed.log_scales)
-        self.opacity_logits = _tensor(posed.opacity_logits)
+        self.scales = _tensor(np.exp(posed.log_scales))
+        with np.errstate(over="ignore"):
+            self.opacities = _tensor(1 / (1 + np.exp(-posed.opacity_logits)))
         self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
 
 

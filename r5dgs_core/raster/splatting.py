@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from .. import errors
-from ..model import spherical_harmonics
 from ..scene.cameras import Camera
+from . import harmonics
 from .settings import BACKENDS, RasterSettings, RasterStats, RenderOutput, SplatImage
 
 log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ def rasterize(
 
     Args:
         gaussians: Anything with ``means``, ``quats``, ``log_scales``, ``opacity_logits``, ``sh`` [N, K, 3] and, if it
-            has them, ``object_ids`` [N].
+            has them, ``object_ids`` [N]. What has ``scales`` and ``opacities`` needs no logarithms and logits.
         camera: The view.
         features: Further values to blend, e.g. identity encodings. [N, F]
         background: Colour behind the Gaussians; black where None. [3] or [H, W, 3]
@@ -103,7 +103,7 @@ def rasterize(
     """
     means = gaussians.means
     object_ids = getattr(gaussians, "object_ids", None) if ids else None
-    channels = seen_colors(gaussians, camera) if colors is None else colors
+    channels = seen_colors(gaussians, camera, fused=backend in ("auto", "cpu")) if colors is None else colors
     n_features = 0 if features is None else features.shape[-1]
     if features is not None and n_features:
         if features.ndim != 2 or len(features) != len(means):
@@ -115,8 +115,8 @@ def rasterize(
     splats = rasterize_splats(
         means,
         gaussians.quats,
-        torch.exp(gaussians.log_scales),
-        torch.sigmoid(gaussians.opacity_logits),
+        gaussians.scales if hasattr(gaussians, "scales") else torch.exp(gaussians.log_scales),
+        gaussians.opacities if hasattr(gaussians, "opacities") else torch.sigmoid(gaussians.opacity_logits),
         channels,
         camera,
         background,
@@ -147,15 +147,15 @@ def warm_up() -> float:
     return time.perf_counter() - start
 
 
-def seen_colors(gaussians: Any, camera: Camera) -> torch.Tensor:
-    """Display-referred colour of each Gaussian from this camera: max(0, 0.5 + harmonics). [N, 3]"""
-    means, sh = gaussians.means, gaussians.sh
-    if sh.shape[-2] == 1:
-        colors = spherical_harmonics.dc_to_rgb(sh[:, 0])
-    else:
-        offsets = means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
-        colors = spherical_harmonics.to_rgb(sh, torch.nn.functional.normalize(offsets, dim=-1))
-    return colors.clamp_min(0.0)
+def seen_colors(gaussians: Any, camera: Camera, *, fused: bool = True) -> torch.Tensor:
+    """Display-referred colour of each Gaussian from this camera: max(0, 0.5 + harmonics). [N, 3]
+
+    Args:
+        gaussians: Anything with ``means`` [N, 3] and ``sh`` [N, K, 3].
+        camera: The view.
+        fused: Whether the kernels of the `cpu` backend may be used where they can.
+    """
+    return harmonics.seen_colors(gaussians.means, gaussians.sh, camera.center, fused=fused)
 
 
 def choose_backend(backend: str, means: torch.Tensor) -> str:

@@ -20,6 +20,7 @@ from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
 from ..motion import rotations
+from ..raster import harmonics
 from ..scene.cameras import Camera
 from . import initialization, posing, triangulation
 from .config import Config
@@ -139,17 +140,20 @@ class TracksRepresentation:
         poses = self.tracks.poses(t)
         centers = self.tracks.group_centers()
         params = gaussians.params
-        colors = spherical_harmonics.dc_to_rgb(params["sh"][:, 0])
-        if params["sh_rest"].shape[1] > 0:
-            # Directions are taken back into each group's own frame, where the harmonics live.
+        if params["sh_rest"].shape[1] == 0:
+            colors = spherical_harmonics.dc_to_rgb(params["sh"][:, 0])
+        else:
+            # The harmonics live in each group's own frame, so the eye is taken back into it.
             with torch.no_grad():
                 arm = centers + poses.displacements - torch.from_numpy(camera.center).float()
                 eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
-                towards = params["means"] - eyes[gaussians.motion_ids]
-                directions = towards / towards.norm(dim=-1, keepdim=True).clamp(min=1e-9)
-                degree = spherical_harmonics.degree_of(params["sh_rest"].shape[1] + 1)
-                basis = spherical_harmonics.basis(directions, degree)[:, 1:]
-            colors = colors + (basis[..., None] * params["sh_rest"]).sum(-2)
+            colors = harmonics.seen_colors(
+                params["means"].detach(),
+                params["sh"],
+                eyes.numpy(),
+                rest=params["sh_rest"],
+                pose_ids=gaussians.motion_ids,
+            )
         return posing.pose(
             params["means"],
             params["quats"],
