@@ -143,7 +143,7 @@ def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
     """Stretches of equal ids as (start, stop, id). [N]"""
     if len(ids) == 0:
         return []
-    cuts = np.flatnonzero(np.diff(ids)) + 1
+    cuts = np.flatnonzero(ids[1:] != ids[:-1]) + 1
     starts = np.concatenate([[0], cuts])
     stops = np.concatenate([cuts, [len(ids)]])
     return [(int(a), int(b), int(ids[a])) for a, b in zip(starts, stops, strict=True)]
@@ -185,10 +185,13 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
     for start, stop, g in runs(scene.motion_ids):
         if g not in moved:
             continue
+        # Both maps are linear but for a shift: one small matrix product each, a column at a time where shifted.
         rows, pivot = slice(start, stop), np.asarray(scene.groups[g].pivot, np.float64)
-        offsets = scene.means[rows].astype(np.float64) - pivot
-        means[rows] = offsets @ rotmats[g].T + (pivot + group_displacements[g])
-        quats[rows] = rotations.multiply(group_quats[g], scene.quats[rows].astype(np.float64))
+        shift = pivot + group_displacements[g] - rotmats[g] @ pivot
+        turned = scene.means[rows].astype(np.float64) @ rotmats[g].T
+        for axis in range(3):
+            means[rows, axis] = turned[:, axis] + shift[axis]
+        quats[rows] = scene.quats[rows].astype(np.float64) @ rotations.multiply(group_quats[g], np.eye(4))
         if shading is not None and gradients is not None and light is not None:
             change = (rotmats[g].T @ light - light).astype(np.float32)
             shading[rows] = np.maximum(1 + gradients[rows] @ change, 0)

@@ -1,0 +1,141 @@
+"""Frames per second of a moving scene, motion included: `python benchmarks/frame_rate.py [--json FILE]`.
+
+A generated scene, a cube of Gaussians of which a third is still and the rest are bodies that turn and fly, is played
+over its observed time and as long past it. ``fps`` counts whole frames, from the time t to the picture, by the median.
+The parts are medians, too: ``ms_motion`` brings the Gaussians to time t, ``ms_colors`` evaluates their harmonics and
+the sky, ``ms_raster`` is the rest of the frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import playback
+from r5dgs_core.scene.cameras import Camera
+from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+
+COLUMNS = ("threads", "sh_degree", "sky_degree", "fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
+T_MAX = 0.75
+RADIUS_PX = 4.0  # median of three standard deviations along the longest axis
+SHARE_STILL = 1 / 3
+
+
+def make_camera(size: int) -> Camera:
+    """A camera 3 units before the origin, looking along z, with a field of view of 50 degrees."""
+    focal = 0.5 * size / np.tan(np.radians(25.0))
+    T_cam_world = np.eye(4)
+    T_cam_world[2, 3] = 3.0
+    return Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]]), T_cam_world)
+
+
+def make_scene(count: int, bodies: int, sh_degree: int, sky_degree: int, camera: Camera, seed: int = 0) -> Scene:
+    """The scene: rows of the cube sorted by x, the first third still, the others one slab a body."""
+    random = np.random.default_rng(seed)
+    means = random.uniform(-1, 1, (count, 3))
+    means = means[np.argsort(means[:, 0])]
+    scales = np.exp(0.5 * random.normal(size=(count, 1)) + 0.5 * random.normal(size=(count, 3)))
+    scales *= RADIUS_PX / 3 / np.median(scales.max(1) * camera.intrinsics[0, 0] / (means[:, 2] + 3))
+    still = round(count * SHARE_STILL)
+    cuts = [0, *np.linspace(still, count, bodies + 1).round().astype(int).tolist()]
+    ids = np.repeat(np.arange(bodies + 1), np.diff(cuts)).astype(np.int32)
+    times = np.linspace(0, T_MAX, 46)
+    groups, objects, poses = [], [], []
+    for k in range(bodies + 1):
+        model = models.STATIC
+        if k:
+            model = models.MotionModel(
+                "ballistic_spin", velocity=0.3 * random.normal(size=3), angular_velocity=random.normal(size=3)
+            )
+        pivot = means[cuts[k] : cuts[k + 1]].mean(0) if cuts[k] < cuts[k + 1] else np.zeros(3)
+        quats, displacements, _, _ = models.curve(model, times - T_MAX)
+        poses.append(np.concatenate([rotations.normalize(quats), displacements], -1))
+        groups.append(MotionGroup(k, k, "body" if k else "pinned", cuts[k], pivot, model))
+        objects.append(SceneObject(k, f"body {k}", (), "", (0.5, 0.5, 0.5), cuts[k], cuts[k + 1] - cuts[k]))
+    fade = 0.6 / (1 + np.arange(16))[:, None]
+    return Scene(
+        name="benchmark",
+        means=means.astype(np.float32),
+        quats=rotations.normalize(random.normal(size=(count, 4))).astype(np.float32),
+        log_scales=np.log(scales).astype(np.float32),
+        opacity_logits=np.log(1 / random.uniform(0.01, 0.9, count) - 1).astype(np.float32),
+        sh=(fade * random.normal(size=(count, 16, 3)))[:, : (sh_degree + 1) ** 2].astype(np.float32),
+        object_ids=ids,
+        motion_ids=ids,
+        track_times=times,
+        track_poses=np.stack(poses),
+        objects=tuple(objects),
+        groups=tuple(groups),
+        t_max=T_MAX,
+        frames_per_unit=60.0,
+        world_convention="blender",
+        cameras=(camera,),
+        background_sh=(fade * random.normal(size=(16, 3)))[: (sky_degree + 1) ** 2].astype(np.float32),
+        shading=(0.2 * random.normal(size=(count, 3))).astype(np.float32),
+        light_direction=np.array([0.0, 0.0, 1.0]),
+    )
+
+
+def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
+    """Medians over frames spread over twice the observed time, in milliseconds, and frames per second."""
+    parts: dict[str, list[float]] = {"ms_frame": [], "ms_motion": [], "ms_colors": []}
+    for t in [0.1 * T_MAX, *np.linspace(0, 2 * T_MAX, frames)]:  # the first one warms up and is not counted
+        start = time.perf_counter()
+        frame = playback.frame(scene, float(t))
+        moved = time.perf_counter()
+        scene_render.render_frame(scene, frame, camera)
+        drawn = time.perf_counter()
+        posed = scene_render.pose_frame(scene, frame)
+        scene_render.colors(posed, camera)
+        scene_render.sky(scene, camera)
+        colored = time.perf_counter()
+        for name, seconds in zip(parts, (drawn - start, moved - start, colored - drawn), strict=True):
+            parts[name].append(1e3 * seconds)
+    found = {name: statistics.median(values[1:]) for name, values in parts.items()}
+    found["ms_raster"] = found["ms_frame"] - found["ms_motion"] - found["ms_colors"]
+    return {"fps": round(1e3 / found["ms_frame"], 1), **{name: round(value, 3) for name, value in found.items()}}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=40_000, help="Gaussians")
+    parser.add_argument("--size", type=int, default=400, help="width and height in px")
+    parser.add_argument("--bodies", type=int, default=6)
+    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--degrees", nargs="+", default=["0,0", "0,2", "3,2"], help="of colours and sky: SH,SKY")
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--json", type=Path, help="write the rows here, too")
+    options = parser.parse_args(arguments)
+    camera, rows = make_camera(options.size), []
+    print(" ".join(f"{column:>10}" for column in COLUMNS))
+    for degrees in options.degrees:
+        sh_degree, sky_degree = map(int, degrees.split(","))
+        scene = make_scene(options.count, options.bodies, sh_degree, sky_degree, camera)
+        for threads in options.threads:
+            compilation.set_threads(threads)
+            torch.set_num_threads(threads)
+            rows.append(
+                {
+                    "threads": threads,
+                    "sh_degree": sh_degree,
+                    "sky_degree": sky_degree,
+                    **measure(scene, camera, options.frames),
+                }
+            )
+            print(" ".join(f"{rows[-1][column]!s:>10}" for column in COLUMNS), flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
