@@ -134,12 +134,13 @@ def test_ids_are_those_of_the_reference(rasterize_cuda):
     assert (found != expected).float().mean() < 0.002
 
 
-@pytest.mark.parametrize("labels", [[5, 7], [7, 5], [40, 39], [-1, 2]])
+@pytest.mark.parametrize("labels", [[5, 7], [7, 5], [-1, 2], [7, 999], [999, 7]])
 def test_equal_votes_go_to_the_smallest_label(rasterize_cuda, labels):
-    scene = [t[:2].float().clone() for t in splats.splats(2, 3)]
-    scene[0][:], scene[2][:] = 0.0, 1e6
-    scene[3][:] = torch.tensor([1 / 4, 1 / 3])  # so the second one has 3/4 * 1/3, which is 1/4 in float32
-    ids = rasterize_cuda(*scene, camera(), labels=torch.tensor(labels), settings=RasterSettings(id_alpha_min=0.1)).ids
+    scene = [t.float().clone() for t in splats.splats(42, 3)]
+    scene[0][:], scene[2][:], scene[3][:] = 0.0, 1e6, 0.005
+    scene[3][:2] = torch.tensor([1 / 4, 1 / 3])  # so the second one has 3/4 * 1/3, which is 1/4 in float32
+    others = torch.arange(100, 140)  # more labels than gsplat blends at a time
+    ids = rasterize_cuda(*scene, camera(), labels=torch.cat([torch.tensor(labels), others])).ids
     assert (ids == min(labels)).all()
 
 
