@@ -99,39 +99,35 @@ def pose_instances(scene: Scene, instances: Sequence[Instance]) -> PosedScene:
     Raises:
         ValueError: A range leaves the scene, or a matrix flattens space or is not finite.
     """
-    n = len(scene.means)
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("means", "quats", "log_scales", "shading", "pose_ids")}
-    view_maps, rows = [np.eye(3)], [np.empty(0, np.int64)]
-    for index, instance in enumerate(instances, start=1):
-        start, stop = instance.start, instance.start + instance.count
+    n, view_maps = len(scene.means), [np.eye(3)]
+    ranges = [(instance.start, instance.start + instance.count) for instance in instances]
+    for index, (start, stop) in enumerate(ranges):
         if not 0 <= start <= stop <= n:
-            raise ValueError(f"instance {index - 1}: rows {start}:{stop} leave the scene's {n} Gaussians")
-        linear, offset = _affine(instance.matrix, index - 1)
-        part = slice(start, stop)
-        parts["means"].append((scene.means[part] @ linear.T + offset).astype(np.float32))
-        quats, log_scales, rotation = _map_shapes(linear, scene.quats[part], scene.log_scales[part])
-        parts["quats"].append(quats)
-        parts["log_scales"].append(log_scales)
-        parts["shading"].append(_shading(scene, part, rotation))
-        parts["pose_ids"].append(np.full(stop - start, index))
+            raise ValueError(f"instance {index}: rows {start}:{stop} leave the scene's {n} Gaussians")
+    total = sum(instance.count for instance in instances)
+    means, quats, log_scales = (np.empty((total, width), np.float32) for width in (3, 4, 3))
+    shading, pose_ids = np.ones(total, np.float32), np.empty(total, np.int64)
+    filled = 0
+    for index, instance in enumerate(instances):
+        linear, offset = _affine(instance.matrix, index)
+        part, to = slice(*ranges[index]), slice(filled, filled + instance.count)
+        playback.move_points(scene.means[part], linear, offset, means[to])
+        rotation = _map_shapes(linear, scene.quats[part], scene.log_scales[part], quats[to], log_scales[to])
+        shading[to] = _shading(scene, part, rotation)
+        pose_ids[to] = len(view_maps)
         view_maps.append(np.linalg.inv(linear))
-        rows.append(np.arange(start, stop))
-    taken = np.concatenate(rows)
-
-    def joined(name: str, width: tuple[int, ...], dtype: type) -> np.ndarray:
-        return np.concatenate([np.empty((0, *width), dtype), *parts[name]], dtype=dtype)
-
+        filled = to.stop
     shaded = scene.shading is not None and scene.light_direction is not None
     return PosedScene(
-        means=joined("means", (3,), np.float32),
-        quats=joined("quats", (4,), np.float32),
-        log_scales=joined("log_scales", (3,), np.float32),
-        opacity_logits=scene.opacity_logits[taken],
-        sh=scene.sh[taken],
-        object_ids=scene.object_ids[taken],
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        opacity_logits=_take(scene.opacity_logits, ranges),
+        sh=_take(scene.sh, ranges),
+        object_ids=_take(scene.object_ids, ranges),
         view_maps=np.stack(view_maps),
-        pose_ids=joined("pose_ids", (), np.int64),
-        shading_factor=joined("shading", (), np.float32) if shaded else None,
+        pose_ids=pose_ids,
+        shading_factor=shading if shaded else None,
     )
 
 
@@ -245,21 +241,30 @@ def _affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
     return matrix[:3, :3], matrix[:3, 3]
 
 
+def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Rows of ranges, one after the other; the array itself where they are all of it in order."""
+    edges = [0, *(edge for start, stop in ranges for edge in (start, stop)), len(array)]
+    if all(before == after for before, after in zip(edges[::2], edges[1::2], strict=True)):
+        return array
+    return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
+
+
 def _map_shapes(
-    linear: np.ndarray, quats: np.ndarray, log_scales: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shapes of ellipsoids under a linear map, and the rotation nearest to it: quats, log_scales, rotation [3, 3]."""
+    linear: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, new_quats: np.ndarray, new_log_scales: np.ndarray
+) -> np.ndarray:
+    """Write the shapes of ellipsoids under a linear map; returns the rotation nearest to the map. [3, 3]"""
     u, singular, vt = np.linalg.svd(linear)
     nearest = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     uniform = singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0]
     if uniform and np.linalg.det(linear) > 0:
-        turned = rotations.multiply(rotations.rotmats_to_quats(nearest), np.asarray(quats, np.float64))
-        return turned.astype(np.float32), (log_scales + np.log(singular.mean())).astype(np.float32), nearest
+        playback.turn_quats(quats, rotations.rotmats_to_quats(nearest), new_quats)
+        np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
+        return nearest
     axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
     u, singular, _ = np.linalg.svd(axes)
     u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
-    turned = rotations.rotmats_to_quats(u)
-    return turned.astype(np.float32), np.log(np.maximum(singular, 1e-30)).astype(np.float32), nearest
+    new_quats[:], new_log_scales[:] = rotations.rotmats_to_quats(u), np.log(np.maximum(singular, 1e-30))
+    return nearest
 
 
 def _shading(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray:

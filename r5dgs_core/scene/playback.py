@@ -185,13 +185,10 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
     for start, stop, g in runs(scene.motion_ids):
         if g not in moved:
             continue
-        # Both maps are linear but for a shift: one small matrix product each, a column at a time where shifted.
         rows, pivot = slice(start, stop), np.asarray(scene.groups[g].pivot, np.float64)
         shift = pivot + group_displacements[g] - rotmats[g] @ pivot
-        turned = scene.means[rows].astype(np.float64) @ rotmats[g].T
-        for axis in range(3):
-            means[rows, axis] = turned[:, axis] + shift[axis]
-        quats[rows] = scene.quats[rows].astype(np.float64) @ rotations.multiply(group_quats[g], np.eye(4))
+        move_points(scene.means[rows], rotmats[g], shift, means[rows])
+        turn_quats(scene.quats[rows], group_quats[g], quats[rows])
         if shading is not None and gradients is not None and light is not None:
             change = (rotmats[g].T @ light - light).astype(np.float32)
             shading[rows] = np.maximum(1 + gradients[rows] @ change, 0)
@@ -208,3 +205,29 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         group_quats=group_quats,
         group_displacements=group_displacements,
     )
+
+
+def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:
+    """Write ``linear p + shift`` for each point p to ``result``, computed in float64.
+
+    Args:
+        points: [N, 3] float32
+        linear: [3, 3] float64
+        shift: [3] float64
+        result: Not ``points``. [N, 3] float32
+    """
+    turned = points.astype(np.float64) @ linear.T
+    for axis in range(3):  # a column at a time: numpy is slow at rows of three
+        np.add(turned[:, axis], shift[axis], out=result[:, axis], casting="same_kind")
+
+
+def turn_quats(quats: np.ndarray, turn: np.ndarray, result: np.ndarray) -> None:
+    """Write the products ``turn q`` to ``result``, computed in float64.
+
+    Args:
+        quats: Unit wxyz. [N, 4] float32
+        turn: Unit wxyz. [4] float64
+        result: Not ``quats``. [N, 4] float32
+    """
+    # Linear in q: row k of the matrix is the product with the k-th unit quaternion.
+    result[:] = quats.astype(np.float64) @ rotations.multiply(turn, np.eye(4))

@@ -128,6 +128,18 @@ def test_a_range_left_out_is_not_seen_and_a_range_given_twice_is_seen_twice(scen
     np.testing.assert_allclose(moved, [[0, 0, 0.5]] * body.count, atol=1e-6)
 
 
+@pytest.mark.parametrize("cuts", [(0, 300), (0, 120, 300), (300, 0), (0, 100, 50, 300), (0, 0, 299)])
+def test_every_array_takes_the_same_rows(scene, cuts):
+    """Ranges from each cut to the next larger one: all of the scene, with gaps, overlaps and empty ones."""
+    ranges = [(a, b) for a, b in zip(cuts, cuts[1:], strict=False) if a <= b]
+    posed = scene_render.pose_instances(scene, [Instance(a, b - a, np.eye(4)) for a, b in ranges])
+    rows = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in ranges)])
+    for name in ("means", "log_scales", "opacity_logits", "sh", "object_ids"):
+        np.testing.assert_array_equal(getattr(posed, name), getattr(scene, name)[rows])
+    np.testing.assert_allclose(posed.quats, scene.quats[rows], atol=1e-6)
+    assert len(posed.pose_ids) == len(posed.shading_factor) == len(rows)
+
+
 def test_black_and_given_backgrounds(scene):
     nothing = scene_render.pose_instances(scene, [])
     assert np.all(image(scene, nothing, background=None) == 0)
@@ -141,6 +153,8 @@ def test_black_and_given_backgrounds(scene):
     [
         (Instance(0, 10**6, np.eye(4)), "leave the scene"),
         (Instance(-1, 2, np.eye(4)), "leave the scene"),
+        (Instance(9, -5, np.eye(4)), "leave the scene"),
+        (Instance(0, 10**15, np.eye(4)), "leave the scene"),
         (Instance(0, 2, np.diag([1.0, 1, 0, 1])), "flattens"),
         (Instance(0, 2, np.full((4, 4), np.nan)), "finite"),
     ],
