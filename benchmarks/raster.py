@@ -2,9 +2,9 @@
 
 A row is one pass over one workload with one backend and number of threads. ``cpu_ms`` is the smallest processor time
 over all threads (comparable on a busy machine), wall times are smallest and median, and ``peak_mb`` is the largest
-resident memory during the pass beyond that before it, measured in calls of their own (null where the system does not
-tell). Everything takes turns, so that what else the machine does meets all alike. Times are of whole calls, checks
-included. Passes:
+resident memory of the process during the pass beyond that before it, measured in calls of their own (null where the
+system does not tell; memory of a GPU does not count). Everything takes turns, so that what else the machine does meets
+all alike. Times are of whole calls, checks included. Passes:
 
     forward           without gradients
     forward_backward  with gradients of every input
@@ -24,6 +24,7 @@ A peer is another renderer that takes turns with ours: a Python module (dotted n
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -41,7 +42,7 @@ import workloads
 from workloads import Workload
 
 from r5dgs_core import errors
-from r5dgs_core.raster import rasterize_splats, scene_render
+from r5dgs_core.raster import rasterize_splats, scene_render, splatting
 from r5dgs_core.scene import playback, scene_file
 
 COLUMNS = ("workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb")
@@ -79,6 +80,9 @@ def main(arguments: list[str] | None = None) -> None:
     if min(options.threads) < 1 or options.repeats < 1:
         parser.error("--threads and --repeats: expected at least 1")
     try:
+        for backend in options.backends:
+            on_gpu = backend == "cuda" and torch.cuda.is_available()
+            splatting.choose_backend(backend, torch.zeros(1, device="cuda" if on_gpu else "cpu"))
         chosen = _choose(options)
         peers = [load_peer(name) for name in options.peer]
     except (ValueError, OSError, errors.R5dgsError) as error:
@@ -180,8 +184,12 @@ def _contenders(
         return timing.Contender(row, run, 1 if backend == "cpu" else threads)
 
     for backend in backends:
-        yield contender(backend, "forward", functools.partial(draw, workload, backend))
-        yield contender(backend, "forward_backward", functools.partial(step, workload, backend, upstream))
+        placed, gradient = workload, upstream
+        if backend == "cuda":
+            placed = dataclasses.replace(workload, inputs=[tensor.cuda() for tensor in workload.inputs])
+            gradient = upstream.cuda()
+        yield contender(backend, "forward", functools.partial(draw, placed, backend))
+        yield contender(backend, "forward_backward", functools.partial(step, placed, backend, gradient))
         if workload.scene is not None:
             yield contender(backend, "motion", functools.partial(playback.frame, workload.scene, workload.t))
             yield contender(backend, "frame", functools.partial(play, workload, backend))
@@ -203,8 +211,11 @@ def make_upstream(workload: Workload) -> torch.Tensor:
 
 @torch.no_grad()
 def draw(workload: Workload, backend: str) -> torch.Tensor:
-    """Image of a workload. [H, W, D]"""
-    return rasterize_splats(*workload.inputs, workload.camera, settings=workload.settings, backend=backend).image
+    """Image of a workload, finished. [H, W, D]"""
+    image = rasterize_splats(*workload.inputs, workload.camera, settings=workload.settings, backend=backend).image
+    if image.is_cuda:
+        torch.cuda.synchronize()
+    return image
 
 
 def step(workload: Workload, backend: str, upstream: torch.Tensor) -> None:
@@ -212,6 +223,8 @@ def step(workload: Workload, backend: str, upstream: torch.Tensor) -> None:
     leaves = [tensor.detach().requires_grad_() for tensor in workload.inputs]
     drawn = rasterize_splats(*leaves, workload.camera, settings=workload.settings, backend=backend)
     drawn.image.backward(upstream)
+    if upstream.is_cuda:
+        torch.cuda.synchronize()
 
 
 def play(workload: Workload, backend: str) -> None:

@@ -55,7 +55,7 @@ def _watch() -> Iterator[dict[str, float]]:
         timed.timed_kernel = function  # type: ignore[attr-defined]
         return timed
 
-    runners = {getattr(compilation, n) for n in ("run", "run_parts") if hasattr(compilation, n)}
+    runners = {compilation.run, compilation.run_parts}
     replaced = []
     for module in [m for name, m in sys.modules.items() if name.startswith(PACKAGE)]:
         for name, value in list(vars(module).items()):

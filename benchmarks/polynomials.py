@@ -1,0 +1,121 @@
+"""Other polynomials for the exponential of the `cpu` backend, each compiled in a process of its own.
+
+Kernels are compiled once per process and kept on disk, so a process that shall have another polynomial must be told
+before its first picture and must keep its machine code elsewhere.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import timing
+import torch
+
+POINTS = 2001  # of [-1/2, 1/2] at which errors are looked at
+SWEEPS = 400  # of the iteration; more change nothing in float32
+
+
+def fit(degree: int) -> tuple[float, ...]:
+    """The polynomial that is nearest to 2^x on [-1/2, 1/2] and exact at 0: the least largest relative error.
+
+    Returns:
+        Coefficients, the constant 1 first.
+
+    Source: Lawson 1961: least squares whose weights grow where the error is large tend to the minimax solution.
+    """
+    x = 0.5 * np.cos(np.linspace(0, np.pi, POINTS))
+    columns = x[:, None] ** np.arange(1, degree + 1) * np.exp2(-x)[:, None]
+    target = 1 - np.exp2(-x)  # relative error of 1 + c1 x + ... : columns @ c - target
+    weights = np.full(POINTS, 1 / POINTS)
+    best, least = np.zeros(degree), np.inf
+    for _ in range(SWEEPS):
+        root = np.sqrt(weights)
+        coefficients = np.linalg.lstsq(columns * root[:, None], target * root, rcond=None)[0]
+        error = np.abs(columns @ coefficients - target)
+        if error.max() < least:
+            best, least = coefficients, error.max()
+        weights = weights * error
+        weights /= weights.sum()
+    return (1.0, *best.tolist())
+
+
+def worst_error(coefficients: tuple[float, ...]) -> float:
+    """Largest relative error on [-1/2, 1/2], in exact arithmetic."""
+    x = np.linspace(-0.5, 0.5, POINTS)
+    return float(np.abs(np.polynomial.polynomial.polyval(x, coefficients) / np.exp2(x) - 1).max())
+
+
+class Remote(timing.Contender):
+    """A contender that draws in a process of its own, with another polynomial. Close it when done."""
+
+    def __init__(self, label: dict[str, Any], coefficients: tuple[float, ...], make_run: Callable[[], Callable]):
+        """Start the process; ``make_run``, called there, gives the function that returns the image as a tensor."""
+        super().__init__(label, self.draw)
+        self._folder = tempfile.TemporaryDirectory(prefix="r5dgs-polynomial-")
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, coefficients, make_run), daemon=True)
+        before = os.environ.get("NUMBA_CACHE_DIR")
+        os.environ["NUMBA_CACHE_DIR"] = self._folder.name
+        try:
+            self._process.start()
+        finally:
+            os.environ.pop("NUMBA_CACHE_DIR")
+            if before is not None:
+                os.environ["NUMBA_CACHE_DIR"] = before
+
+    def draw(self) -> torch.Tensor:
+        """The image."""
+        return torch.from_numpy(self._ask("draw"))
+
+    def warm_up(self) -> None:
+        """Compile."""
+        self.draw()
+
+    def take_turn(self) -> None:
+        """Let the process take a turn and note its times."""
+        self.turns += 1
+        cpu_ms, wall_ms = self._ask("turn")
+        self.cpu_ms += cpu_ms
+        self.wall_ms += wall_ms
+
+    def close(self) -> None:
+        """End the process and forget its machine code."""
+        self._connection.close()
+        self._process.join()
+        self._folder.cleanup()
+
+    def _ask(self, request: str) -> Any:
+        self._connection.send(request)
+        try:
+            return self._connection.recv()
+        except EOFError:
+            raise RuntimeError(f"{self.label}: the process ended; its message is above") from None
+
+
+def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Callable[[], Callable]) -> None:
+    """Answer requests until the other end closes."""
+    from r5dgs_core.raster import compile as compilation
+    from r5dgs_core.raster import lanes
+
+    lanes._EXP2 = coefficients
+    torch.set_num_threads(1)
+    compilation.set_threads(1)
+    run = make_run()
+    while True:
+        try:
+            request = connection.recv()
+        except EOFError:
+            return
+        if request == "draw":
+            connection.send(run().numpy())
+        else:
+            contender = timing.Contender({}, run)
+            contender.take_turn()
+            connection.send((contender.cpu_ms, contender.wall_ms))
