@@ -63,14 +63,21 @@ def run(function, work: int, *arguments) -> None:
         work: Independent pieces of work that are worth a thread; fewer than two run on this thread alone.
         arguments: Passed on.
     """
-    workers = min(_threads, work)
-    if workers < 2:
+    run_parts(function, min(_threads, work), *arguments)
+
+
+def run_parts(function, parts: int, *arguments) -> None:
+    """Call ``function(part, parts, *arguments)`` for every part, on as many threads as there are, and wait for them.
+
+    For kernels whose parts belong together over several calls; others let `run` choose the number.
+    """
+    if parts < 2:
         function(0, 1, *arguments)
         return
     pool = _get_pool()
-    others = [pool.submit(function, worker, workers, *arguments) for worker in range(1, workers)]
+    others = [pool.submit(function, part, parts, *arguments) for part in range(1, parts)]
     try:
-        function(0, workers, *arguments)
+        function(0, parts, *arguments)
     finally:  # the arrays must outlive every share, whatever happened to ours
         for other in others:
             other.result()

@@ -24,13 +24,14 @@ class _Pass:
 
     view: np.ndarray
     limits: np.ndarray
+    geometry: np.ndarray
+    depths: np.ndarray
     tile_starts: np.ndarray
     tile_ends: np.ndarray
-    pair_ranks: np.ndarray
+    pair_rows: np.ndarray
     pair_slots: np.ndarray
+    pair_blocks: np.ndarray
     slot_starts: np.ndarray
-    geometry: np.ndarray
-    values: np.ndarray
     transmittance: np.ndarray
 
 
@@ -79,7 +80,8 @@ class _Rasterize(torch.autograd.Function):
             behind = background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
         view = pack_view(camera, settings)
         radii = np.zeros(n, np.float32)
-        state, *results = _forward(arrays, behind, camera, labels, settings, view, radii)
+        with_state = any(ctx.needs_input_grad)
+        state, *results = _forward(arrays, behind, camera, labels, settings, view, radii, with_state)
         if stats is not None:
             stats.radii = torch.from_numpy(radii)
             stats.visible = stats.radii > 0
@@ -87,8 +89,8 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
         # Results are saved as tensors: whoever changes one in place gets torch's error instead of a wrong gradient.
-        ctx.save_for_backward(means, quats, scales, opacities, image, alpha, depth)
-        ctx.state, ctx.stats, ctx.n_channels = state, stats, n_channels
+        ctx.save_for_backward(means, quats, scales, opacities, channels, image, alpha, depth)
+        ctx.state, ctx.stats = state, stats
         ctx.background_shape = None if background is None else background.shape
         ctx.mark_non_differentiable(ids)
         return image, alpha, depth, ids
@@ -99,12 +101,12 @@ class _Rasterize(torch.autograd.Function):
         state: _Pass = ctx.state
         arrays = [t.detach().contiguous().numpy() for t in ctx.saved_tensors]
         if d_image is None:
-            d_image = torch.zeros(ctx.saved_tensors[4].shape)
+            d_image = torch.zeros(ctx.saved_tensors[5].shape)
         d_image = d_image.contiguous().numpy()
         d_alpha = _EMPTY if d_alpha is None else d_alpha.contiguous().numpy()
         d_depth = _EMPTY if d_depth is None else d_depth.contiguous().numpy()
         with_geometry = any(ctx.needs_input_grad[:4])
-        gradients, grad_norm = _backward(state, arrays, ctx.n_channels, d_image, d_alpha, d_depth, with_geometry)
+        gradients, grad_norm = _backward(state, arrays, d_image, d_alpha, d_depth, with_geometry)
         if ctx.stats is not None:
             ctx.stats.grad_norm = torch.from_numpy(grad_norm)
         d_background = None
@@ -120,58 +122,68 @@ class _Rasterize(torch.autograd.Function):
         return (*wanted, d_background, None, None, None, None)
 
 
-def _forward(arrays, background, camera, labels, settings, view, radii):
-    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state, image, alpha, depth and ids."""
+def _forward(arrays, background, camera, labels, settings, view, radii, with_state):
+    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state or None, image, alpha, depth and ids."""
     means, quats, scales, opacities, channels = arrays
     n, n_channels = channels.shape
     height, width = camera.height, camera.width
-    geometry = np.empty((n, cpu_projection.GEOMETRY), np.float32)
-    depths = np.empty(n, np.float32)
+    geometry, depths = _aligned((n, cpu_projection.GEOMETRY), np.float64), np.empty(n)
     run(
         cpu_projection.project, n // _WORTH_A_THREAD,
         view, means, quats, scales, opacities, geometry, depths, radii,
     )  # fmt: skip
     order = cpu_tiles.sort_by_depth(depths, radii)
-    ranked = np.empty((len(order), cpu_projection.GEOMETRY), np.float32)
-    values = np.empty((len(order), (n_channels + 4) // 4 * 4), np.float32)
-    run(
-        cpu_projection.gather, len(order) // _WORTH_A_THREAD,
-        order, geometry, depths, channels, ranked, values,
-    )  # fmt: skip
-    tile_starts, pair_ranks, pair_slots, slot_starts = cpu_tiles.assign_tiles(order, n, ranked, width, height)
+    tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(order, geometry, width, height, with_state)
     votes, planes = np.zeros(0, np.int32), 0
     if labels is not None and len(order):
-        votes = labels.detach().cpu().numpy()[order].clip(-1).astype(np.int32) + np.int32(1)
-        planes = int(votes.max()) + 1
+        votes = labels.detach().cpu().numpy().clip(-1).astype(np.int32) + np.int32(1)
+        planes = int(votes[order].max()) + 1
+        votes[radii == 0] = 0
     limits = np.array(
-        [math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min, settings.id_alpha_min],
-        np.float32,
+        [
+            math.log2(settings.alpha_min),
+            math.log2(settings.alpha_max),
+            settings.alpha_max,
+            settings.transmittance_min,
+            settings.id_alpha_min,
+        ]
     )
     image = np.empty((height, width, n_channels), np.float32)
-    alpha, depth, transmittance = (np.empty((height, width), np.float32) for _ in range(3))
-    ids = np.full((height, width), -1, np.int32)
+    alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    ids = np.full((height, width) if labels is not None else (0, 0), -1, np.int32)
+    transmittance = np.empty((height, width) if with_state else (0, 0), np.float32)
     tile_ends = np.empty(len(tile_starts) - 1, np.int64)
+    pair_blocks = np.empty(len(pair_rows), np.uint64)
     run(
         cpu_blending.blend, len(tile_ends) // 2,
-        tile_starts, pair_ranks, ranked, values, votes, planes, background, limits, image, alpha, depth, transmittance,
-        ids, tile_ends,
+        tile_starts, pair_rows, geometry, channels, depths, votes, planes, background, limits, image, alpha, depth,
+        transmittance, ids, tile_ends, pair_blocks,
     )  # fmt: skip
     state = _Pass(
-        view, limits, tile_starts, tile_ends, pair_ranks, pair_slots, slot_starts, ranked, values, transmittance,
+        view, limits, geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts,
+        transmittance,
     )  # fmt: skip
-    return state, image, alpha, depth, ids
+    return state if with_state else None, image, alpha, depth, ids
 
 
-def _backward(state: _Pass, arrays, n_channels, d_image, d_alpha, d_depth, with_geometry):
+def _aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
+    """An array whose rows of 64 bytes each lie in one cache line."""
+    size = shape[0] * shape[1] * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    skip = -memory.ctypes.data % 64
+    return memory[skip : skip + size].view(dtype).reshape(shape)
+
+
+def _backward(state: _Pass, arrays, d_image, d_alpha, d_depth, with_geometry):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
-    means, quats, scales, opacities, image, alpha, depth = arrays
-    n = len(means)
-    slots = np.empty((len(state.pair_ranks), cpu_projection.MOMENTS + state.values.shape[1]), np.float32)
+    means, quats, scales, opacities, channels, image, alpha, depth = arrays
+    n, n_channels = channels.shape
+    slots = _aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
-        state.tile_starts, state.tile_ends, state.pair_ranks, state.pair_slots, state.geometry, state.values,
-        state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth, with_geometry,
-        slots,
+        state.tile_starts, state.tile_ends, state.pair_rows, state.pair_slots, state.pair_blocks, state.geometry,
+        channels, state.depths, state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth,
+        with_geometry, slots,
     )  # fmt: skip
     gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
     gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]

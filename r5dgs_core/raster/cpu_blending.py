@@ -1,287 +1,620 @@
 """Kernels that blend the pairs of each tile, and take the gradient of that.
 
-A tile is worked on in strips of eight pixels of one row (`lanes`), numbered column of strips by column of strips. Tile
-buffers keep what belongs to a strip together. Channels come in fours: the D channels, then depth, then zeros. A
-finished pixel keeps its transmittance T with the sign turned. Pairs are copied to a small tile-local table a batch at a
-time: the copies do not wait for each other, so that their cache misses overlap, and what follows has it all close by.
+A tile is worked on in blocks of 4 x 4 pixels, one vector each (`lanes`), numbered row by row: the blocks that a
+Gaussian may touch are the set bits of one integer. Tile buffers keep what belongs to a block together. The first four
+values (channels, then depth, then zeros) are worked on as soon as a weight is known; further values come in eights, in
+a second sweep over the blocks of the same Gaussian. A finished pixel keeps its transmittance T with the sign turned,
+and so does one outside the image. Pairs are copied to a small tile-local table a batch at a time: the copies do not
+wait for each other, so that their cache misses overlap, and what follows has it all close by.
+
+With (x, y) the place of a lane in its block, the whitened offset from the centre of the Gaussian is
+u = (l11 x - l12 y) + a term per column of blocks + a term per row, and v = l22 y + a term per row; all of them count
+from the middle of the tile, where they are taken in float64, and are small wherever the Gaussian is seen.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import float32
 
 from .compile import kernel
-from .cpu_projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L22, LOG2_OPACITY, MEAN_X, MEAN_Y, MOMENTS, SHIFT
+from .cpu_exact import (
+    ALPHA_MAX,
+    BLOCK,
+    BLOCKS,
+    CLOSE_LOG2,
+    CLOSE_TRANSMITTANCE,
+    ID_ALPHA_MIN,
+    LOG2_ALPHA_MAX,
+    LOG2_ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    lanes_at_least,
+    lanes_that_finish,
+)
+from .cpu_projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
 from .cpu_tiles import TILE
-from .lanes import LANES, any_of, broadcast, exp2, fma, iota, larger, load, select, smaller, splat, store, total
+from .lanes import (
+    LANES,
+    any_of,
+    bits_of,
+    broadcast,
+    exp2,
+    fma,
+    larger,
+    load,
+    load_rows,
+    load_rows_of_three,
+    lowest_bit,
+    mask_of,
+    prefetch,
+    select,
+    smaller,
+    splat,
+    store,
+    store_rows,
+    store_rows_of_three,
+    totals,
+    unlikely,
+)
 
 PIXELS = TILE * TILE
 BATCH = 64  # pairs
+AHEAD = 12  # pairs
+FIRST = 4  # values that are worked on at once
+MORE = 8  # further values come in multiples of this
 
-# Entries of the limits vector (float32).
-LOG2_ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN = range(4)
+# Columns of the tile-local table: terms of u per column and row of blocks, of v per row, then the numbers of the
+# Gaussian and its values.
+U_COLUMN, U_ROW, V_ROW = 0, BLOCKS, 2 * BLOCKS
+T_L11, T_L12, T_L22, T_LOG2_OPACITY = (3 * BLOCKS + i for i in range(4))
+VALUES = 3 * BLOCKS + 4
+
+_OFFSETS = np.array([BLOCK * (b % BLOCKS - 0.5 * BLOCKS) + 0.5 for b in range(LANES)], np.float32)
+_OF_ROWS = np.array([b // BLOCKS for b in range(LANES)], np.float32)  # 0 for columns, 1 for rows
+_X = np.array([lane % BLOCK for lane in range(LANES)], np.float32)
+_Y = np.array([lane // BLOCK for lane in range(LANES)], np.float32)
+
+
+def padded_values(n_channels: int) -> int:
+    """Number of values that are blended for a number of channels: those, depth, and zeros."""
+    return FIRST + max(0, -(-(n_channels + 1 - FIRST) // MORE)) * MORE
 
 
 @kernel
-def _load_batch(begin, end, x0, y0, rows, pair_ranks, geometry, values, table, strips):
-    """Copy pairs begin : end of a tile to rows of ``table``: centre relative to the tile, rest of the geometry, values.
+def aligned(count):
+    """An array of float32 that begins where a vector of the machine would: loads and stores then never straddle."""
+    array = np.empty(count + LANES, np.float32)
+    skip = (-array.ctypes.data // 4) % LANES
+    return array[skip : skip + count]
 
-    ``strips`` takes their first and last column of strips and their first and last row of pixels. [BATCH, 4]
+
+@kernel
+def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths, table, blocks):
+    """Copy pairs begin : end of a tile to rows of ``table``; ``blocks`` takes the blocks that their box touches.
+
+    What the pairs up to ``stop`` need is asked for a few pairs ahead, as it lies anywhere in memory.
     """
-    n_values = values.shape[1]
+    n_channels, width = channels.shape[1], table.shape[1]
+    flat, flat_geometry, flat_channels = table.reshape(-1), geometry.reshape(-1), channels.reshape(-1)
+    middle_x, middle_y = x0 + 0.5 * TILE, y0 + 0.5 * TILE
+    offsets, of_rows = load(_OFFSETS, 0), load(_OF_ROWS, 0) > splat(float32(0))
     for k in range(end - begin):
-        rank = np.uint64(pair_ranks[begin + k])
-        x = geometry[rank, MEAN_X] - float32(x0)
-        y = geometry[rank, MEAN_Y] - float32(y0)
-        extent_x, extent_y = geometry[rank, EXTENT_X], geometry[rank, EXTENT_Y]
+        ahead = begin + k + AHEAD
+        if ahead < stop:
+            coming = np.int64(pair_rows[ahead])
+            prefetch(flat_geometry, coming * GEOMETRY)
+            prefetch(flat_channels, coming * n_channels)
+            prefetch(depths, coming)
+        i = np.uint64(pair_rows[begin + k])
+        l11, l12, l22 = geometry[i, L11], geometry[i, L12], geometry[i, L22]
+        dx, dy = middle_x - geometry[i, MEAN_X], middle_y - geometry[i, MEAN_Y]
+        extent_x, extent_y = geometry[i, EXTENT_X], geometry[i, EXTENT_Y]
         # pixel centres lie at +0.5; 0.01 px more than that, because rounding must not lose a pixel
-        strips[k, 0] = int(np.ceil(max(x - extent_x - float32(0.51), float32(0)))) // LANES
-        strips[k, 1] = int(np.floor(min(x + extent_x - float32(0.49), float32(TILE - 1)))) // LANES
-        strips[k, 2] = int(np.ceil(max(y - extent_y - float32(0.51), float32(0))))
-        strips[k, 3] = int(np.floor(min(y + extent_y - float32(0.49), float32(rows - 1))))
-        table[k, MEAN_X], table[k, MEAN_Y] = x, y
-        table[k, L11], table[k, SHIFT], table[k, L22] = geometry[rank, L11], geometry[rank, SHIFT], geometry[rank, L22]
-        table[k, LOG2_OPACITY] = geometry[rank, LOG2_OPACITY]
-        for c in range(n_values):
-            table[k, GEOMETRY + c] = values[rank, c]
+        left = max(0.5 * TILE - 0.51 - dx - extent_x, 0.0)
+        right = min(0.5 * TILE - 0.49 - dx + extent_x, TILE - 1.0)
+        top = max(0.5 * TILE - 0.51 - dy - extent_y, 0.0)
+        bottom = min(0.5 * TILE - 0.49 - dy + extent_y, TILE - 1.0)
+        touched = np.uint64(0)
+        if left <= right and top <= bottom:
+            first, last = np.uint64(math.ceil(left)) // np.uint64(BLOCK), np.uint64(right) // np.uint64(BLOCK)
+            row = (np.uint64(2) << last) - (np.uint64(1) << first)
+            first, last = np.uint64(math.ceil(top)) // np.uint64(BLOCK), np.uint64(bottom) // np.uint64(BLOCK)
+            rows = (~np.uint64(0) >> np.uint64(8) * (np.uint64(7) - last)) & (~np.uint64(0) << np.uint64(8) * first)
+            touched = (row * np.uint64(0x0101010101010101)) & rows
+        blocks[k] = touched
+        g = k * width
+        u, v = splat(float32(l11 * dx - l12 * dy)), splat(float32(l22 * dy))
+        slopes = select(of_rows, splat(float32(-l12)), splat(float32(l11)))
+        store(flat, g + V_ROW, fma(splat(float32(l22)), offsets, v))  # eight lanes too many: overwritten below
+        store(flat, g + U_COLUMN, fma(slopes, offsets, select(of_rows, u, splat(float32(0)))))
+        row_of = table[k]
+        row_of[T_L11], row_of[T_L12], row_of[T_L22] = l11, l12, l22
+        row_of[T_LOG2_OPACITY] = geometry[i, LOG2_OPACITY]
+        for c in range(np.uint64(n_channels)):
+            row_of[np.uint64(VALUES) + c] = channels[i, c]
+        row_of[VALUES + n_channels] = depths[i]
+        for c in range(VALUES + n_channels + 1, V_ROW + LANES):
+            row_of[c] = 0
+
+
+@kernel
+def _start_tile(passed, x0, y0, width, height):
+    """Set the transmittance of the pixels of a tile; returns the blocks that have pixels inside the image."""
+    alive = np.uint64(0)
+    columns, rows = min(width - x0, TILE), min(height - y0, TILE)
+    for block in range(BLOCKS * BLOCKS):
+        left, top = block % BLOCKS * BLOCK, block // BLOCKS * BLOCK
+        for lane in range(LANES):
+            inside = left + lane % BLOCK < columns and top + lane // BLOCK < rows
+            passed[block * LANES + lane] = float32(1) if inside else float32(-1)
+        if left < columns and top < rows:
+            alive |= np.uint64(1) << np.uint64(block)
+    return alive
 
 
 @kernel
 def blend(
-    worker, workers, tile_starts, pair_ranks, geometry, values, labels, planes, background, limits, image, alpha, depth,
-    transmittance, ids, tile_ends,
+    worker, workers, tile_starts, pair_rows, geometry, channels, depths, labels, planes, background, limits, image,
+    alpha, depth, transmittance, ids, tile_ends, pair_blocks,
 ):  # fmt: skip
     """Blend every workers-th tile.
 
     Args:
-        tile_starts, pair_ranks: Pairs, see `cpu_tiles.assign_tiles`.
-        geometry: Projected Gaussians, near to far. [V, 8]
-        values: Their channels, depth and zeros. [V, B]
-        labels: Plane of each Gaussian's votes, 0 for label -1. [V] int32, or empty
+        tile_starts, pair_rows: Pairs, see `cpu_tiles`.
+        geometry: Projected Gaussians. [N, 8] float64
+        channels, depths: What is blended. [N, D], [N]
+        labels: Plane of each Gaussian's votes, 0 for label -1. [N] int32, or empty
         planes: Number of planes, 0 for no labels.
         background: One row per pixel, or one for all. [H * W or 1, D]
-        limits: Thresholds. [4] float32
-        image, alpha, depth, transmittance, ids: Results. [H, W, D], [H, W] each
+        limits: Thresholds. [5] float64
+        image, alpha, depth: Results. [H, W, D], [H, W], [H, W]
+        transmittance: Its end, for the backward pass. [H, W], or empty
+        ids: Label of each pixel. [H, W], or empty
         tile_ends: One past the last pair that had a pixel left to draw on. [tiles]
+        pair_blocks: The blocks that each pair drew on. [P] uint64
     """
     height, width, n_channels = image.shape
-    n_values = values.shape[1]
-    n_planes = n_values + planes
+    n_values = padded(n_channels)
     columns = (width + TILE - 1) // TILE
-    buffer = np.empty(n_planes * PIXELS, np.float32)
-    passed = np.empty(PIXELS, np.float32)
-    table, strips = np.empty((BATCH, GEOMETRY + n_values), np.float32), np.empty((BATCH, 4), np.int64)
+    more = n_values > FIRST
+    buffer = aligned(n_values * PIXELS)
+    votes = aligned(planes * PIXELS)
+    passed, weights = aligned(PIXELS), aligned(PIXELS)
+    table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat = table.reshape(-1)
-    log2_alpha_min, zero = splat(limits[LOG2_ALPHA_MIN]), splat(float32(0))
-    alpha_max, transmittance_min = splat(limits[ALPHA_MAX]), splat(limits[TRANSMITTANCE_MIN])
+    cut, zero = limits[LOG2_ALPHA_MIN], splat(float32(0))
+    cut_low, cut_high = splat(float32(cut - CLOSE_LOG2)), splat(float32(cut + CLOSE_LOG2))
+    cut_lanes, alpha_max = splat(float32(cut)), splat(float32(limits[ALPHA_MAX]))
+    end_low = splat(float32(limits[TRANSMITTANCE_MIN] * (1 - CLOSE_TRANSMITTANCE)))
+    end_high = splat(float32(limits[TRANSMITTANCE_MIN] * (1 + CLOSE_TRANSMITTANCE)))
+    lane_x, lane_y = load(_X, 0), load(_Y, 0)
     for tile in range(worker, len(tile_starts) - 1, workers):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
-        rows = min(TILE, height - y0)
+        tile_start, tile_stop = tile_starts[tile], tile_starts[tile + 1]
         buffer[:] = 0
-        passed[:] = 1
-        begin, end = tile_starts[tile], tile_starts[tile]
-        while begin < tile_starts[tile + 1] and _unfinished(passed, rows):
-            end = min(begin + BATCH, tile_starts[tile + 1])
-            _load_batch(begin, end, x0, y0, rows, pair_ranks, geometry, values, table, strips)
+        votes[:] = 0
+        alive = _start_tile(passed, x0, y0, width, height)
+        begin, end = tile_start, tile_start
+        while begin < tile_stop and alive:
+            end = min(begin + BATCH, tile_stop)
+            _load_batch(begin, end, tile_stop, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
             for k in range(end - begin):
-                g = k * (GEOMETRY + n_values)
-                l11, log2_opacity = broadcast(flat, g + L11), flat[g + LOG2_OPACITY]
-                mean_x, mean_y, shift, l22 = flat[g + MEAN_X], flat[g + MEAN_Y], flat[g + SHIFT], flat[g + L22]
-                vote = n_values + np.int64(labels[pair_ranks[begin + k]]) if planes else np.int64(0)
-                for column in range(strips[k, 0], strips[k, 1] + 1):
-                    dx = iota() + splat(float32(column * LANES) + float32(0.5) - mean_x)
-                    for row in range(strips[k, 2], strips[k, 3] + 1):
-                        dy = float32(row) + float32(0.5) - mean_y
-                        across = l22 * dy
-                        u = l11 * (dx - splat(shift * dy))
-                        exponent = fma(-u, u, splat(log2_opacity - across * across))
-                        at = (column * TILE + row) * LANES
+                touched = blocks[k] & alive
+                drawn = np.uint64(0)
+                if touched:
+                    g = k * (VALUES + n_values)
+                    u_lanes = broadcast(flat, g + T_L11) * lane_x - broadcast(flat, g + T_L12) * lane_y
+                    v_lanes = broadcast(flat, g + T_L22) * lane_y
+                    log2_opacity = broadcast(flat, g + T_LOG2_OPACITY)
+                    value_0, value_1 = broadcast(flat, g + VALUES), broadcast(flat, g + VALUES + 1)
+                    value_2, value_3 = broadcast(flat, g + VALUES + 2), broadcast(flat, g + VALUES + 3)
+                    vote = np.int64(labels[pair_rows[begin + k]]) * PIXELS if planes else np.int64(0)
+                    while touched:
+                        block = lowest_bit(touched)
+                        bit = touched & (~touched + np.uint64(1))
+                        touched ^= bit
+                        column, row, at = block & 7, block >> 3, block * LANES
+                        u = u_lanes + broadcast(flat, g + U_COLUMN + column) + broadcast(flat, g + U_ROW + row)
+                        v = v_lanes + broadcast(flat, g + V_ROW + row)
+                        exponent = fma(-u, u, fma(-v, v, log2_opacity))
                         before = load(passed, at)
-                        valid = (exponent >= log2_alpha_min) & (before > zero)
+                        valid = (exponent >= cut_low) & (before > zero)
                         if not any_of(valid):
                             continue
-                        opaque = smaller(exp2(larger(exponent, log2_alpha_min)), alpha_max)
+                        if unlikely(any_of(valid & (cut_high > exponent))):
+                            sure = bits_of(valid & (exponent >= cut_high))
+                            rest = bits_of(valid) ^ sure
+                            i = pair_rows[begin + k]
+                            valid = mask_of(sure | lanes_at_least(rest, geometry, i, x0, y0, block, cut))
+                        opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
                         weight = before * opaque
                         after = before - weight
-                        goes_on = after >= transmittance_min
-                        weight = select(valid & goes_on, weight, zero)
-                        store(passed, at, select(valid, select(goes_on, after, -before), before))
-                        value, to = g + GEOMETRY, at * n_planes
-                        for _ in range(0, n_values, 4):
-                            store(buffer, to, fma(weight, broadcast(flat, value), load(buffer, to)))
-                            to += LANES
-                            store(buffer, to, fma(weight, broadcast(flat, value + 1), load(buffer, to)))
-                            to += LANES
-                            store(buffer, to, fma(weight, broadcast(flat, value + 2), load(buffer, to)))
-                            to += LANES
-                            store(buffer, to, fma(weight, broadcast(flat, value + 3), load(buffer, to)))
-                            to += LANES
-                            value += 4
+                        weight = select(valid, weight, zero)
+                        after = select(valid, after, before)
+                        ends = valid & (end_high > after)
+                        if unlikely(any_of(ends)):
+                            close = bits_of(ends & (after >= end_low))
+                            if close:
+                                pair_blocks[begin + k] = drawn | bit
+                                ending = bits_of(ends) ^ close
+                                ends = mask_of(ending | lanes_that_finish(
+                                    close, geometry, pair_rows, pair_blocks, tile_start, begin + k + 1, x0, y0, block,
+                                    limits,
+                                ))  # fmt: skip
+                            weight = select(ends, zero, weight)
+                            after = select(ends, -before, after)
+                            if not any_of(after > zero):
+                                alive ^= bit
+                        drawn |= bit
+                        store(passed, at, after)
+                        to = at * FIRST
+                        store(buffer, to, fma(weight, value_0, load(buffer, to)))
+                        store(buffer, to + LANES, fma(weight, value_1, load(buffer, to + LANES)))
+                        store(buffer, to + 2 * LANES, fma(weight, value_2, load(buffer, to + 2 * LANES)))
+                        store(buffer, to + 3 * LANES, fma(weight, value_3, load(buffer, to + 3 * LANES)))
+                        if more:
+                            store(weights, at, weight)
                         if planes:
-                            to = at * n_planes + vote * LANES
-                            store(buffer, to, weight + load(buffer, to))
+                            store(votes, vote + at, weight + load(votes, vote + at))
+                    if more and drawn:
+                        _blend_more(drawn, n_values, weights, flat, g + VALUES, buffer)
+                pair_blocks[begin + k] = drawn
             begin = end
         tile_ends[tile] = end
-
-        for row in range(rows):
-            for column in range(min(TILE, width - x0)):
-                strip = column // LANES * TILE + row
-                at = strip * LANES * n_planes + column % LANES
-                y, x = y0 + row, x0 + column
-                left = abs(passed[strip * LANES + column % LANES])
-                covered = float32(1) - left
-                transmittance[y, x] = left
-                alpha[y, x] = covered
-                depth[y, x] = buffer[at + n_channels * LANES] / covered if covered > 0 else float32(0)
-                behind = y * width + x if len(background) > 1 else 0
-                for c in range(n_channels):
-                    image[y, x, c] = buffer[at + c * LANES] + left * background[behind, c]
-                if planes:
-                    ids[y, x] = -1
-                    if covered >= limits[ID_ALPHA_MIN]:
-                        best = float32(-1)
-                        for plane in range(planes):
-                            votes = buffer[at + (n_values + plane) * LANES]
-                            if votes > best:
-                                best = votes
-                                ids[y, x] = plane - 1
+        _finish_tile(
+            x0, y0, n_values, planes, buffer, votes, passed, background, limits, image, alpha, depth, transmittance, ids
+        )
 
 
 @kernel
-def _unfinished(passed, rows):
-    """Whether any pixel of the first ``rows`` rows can still change."""
-    for column in range(TILE // LANES):
-        for row in range(rows):
-            if any_of(load(passed, (column * TILE + row) * LANES) > splat(float32(0))):
-                return True
-    return False
+def padded(n_channels):
+    """`padded_values` for kernels."""
+    return FIRST + max(0, (n_channels + 1 - FIRST + MORE - 1) // MORE) * MORE
+
+
+@kernel
+def _blend_more(drawn, n_values, weights, flat, value, buffer):
+    """Add the values beyond the first four of one Gaussian to the blocks ``drawn``."""
+    for chunk in range(FIRST, n_values, MORE):
+        v = value + chunk
+        v0, v1, v2, v3 = broadcast(flat, v), broadcast(flat, v + 1), broadcast(flat, v + 2), broadcast(flat, v + 3)
+        v4, v5, v6, v7 = broadcast(flat, v + 4), broadcast(flat, v + 5), broadcast(flat, v + 6), broadcast(flat, v + 7)
+        rest = drawn
+        while rest:
+            block = lowest_bit(rest)
+            rest &= rest - np.uint64(1)
+            weight = load(weights, block * LANES)
+            to = chunk * PIXELS + block * LANES * MORE
+            store(buffer, to, fma(weight, v0, load(buffer, to)))
+            store(buffer, to + LANES, fma(weight, v1, load(buffer, to + LANES)))
+            store(buffer, to + 2 * LANES, fma(weight, v2, load(buffer, to + 2 * LANES)))
+            store(buffer, to + 3 * LANES, fma(weight, v3, load(buffer, to + 3 * LANES)))
+            store(buffer, to + 4 * LANES, fma(weight, v4, load(buffer, to + 4 * LANES)))
+            store(buffer, to + 5 * LANES, fma(weight, v5, load(buffer, to + 5 * LANES)))
+            store(buffer, to + 6 * LANES, fma(weight, v6, load(buffer, to + 6 * LANES)))
+            store(buffer, to + 7 * LANES, fma(weight, v7, load(buffer, to + 7 * LANES)))
+
+
+@kernel
+def _place(channel, block):
+    """Where the value of a block's first pixel lies in a tile buffer; that of its next pixel follows."""
+    if channel < FIRST:
+        return (block * FIRST + channel) * LANES
+    chunk = (channel - FIRST) // MORE
+    return (FIRST + chunk * MORE) * PIXELS + (block * MORE + channel - FIRST - chunk * MORE) * LANES
+
+
+@kernel
+def _finish_tile(
+    x0, y0, n_values, planes, buffer, votes, passed, background, limits, image, alpha, depth, transmittance, ids
+):
+    """Write the pixels of a tile."""
+    height, width, n_channels = image.shape
+    zero, one, nobody = splat(float32(0)), splat(float32(1)), splat(float32(-1))
+    id_alpha_min = splat(float32(limits[ID_ALPHA_MIN]))
+    one_background = len(background) == 1
+    three = n_channels == 3
+    pixels = aligned((n_channels + 4) * LANES)
+    at_alpha, at_depth, at_id = n_channels * LANES, (n_channels + 1) * LANES, (n_channels + 2) * LANES
+    flat_image, flat_alpha, flat_depth = image.reshape(-1), alpha.reshape(-1), depth.reshape(-1)
+    flat_end, flat_background = transmittance.reshape(-1), background.reshape(-1)
+    flat_ids = ids.reshape(-1)
+    for block in range(BLOCKS * BLOCKS):
+        left, top, at = x0 + block % BLOCKS * BLOCK, y0 + block // BLOCKS * BLOCK, block * LANES
+        if left >= width or top >= height:
+            continue
+        passes = load(passed, at)
+        passes = larger(passes, -passes)
+        store(passed, at, passes)
+        covers = one - passes
+        store(pixels, at_alpha, covers)
+        distance = load(buffer, _place(n_channels, block)) / select(covers > zero, covers, one)
+        store(pixels, at_depth, select(covers > zero, distance, zero))
+        for c in range(n_channels):
+            blended = load(buffer, _place(c, block))
+            if one_background:
+                blended = fma(passes, broadcast(flat_background, c), blended)
+            store(pixels, c * LANES, blended)
+        if planes:
+            most, winner = zero, nobody
+            for plane in range(planes):
+                weight = load(votes, plane * PIXELS + at)
+                wins = weight > most
+                most, winner = select(wins, weight, most), select(wins, splat(float32(plane - 1)), winner)
+            store(pixels, at_id, select(covers >= id_alpha_min, winner, nobody))
+        if left + BLOCK <= width and top + BLOCK <= height and three:
+            pixel = top * width + left
+            store_rows(flat_alpha, pixel, width, covers)
+            store_rows(flat_depth, pixel, width, load(pixels, at_depth))
+            if len(transmittance):
+                store_rows(flat_end, pixel, width, passes)
+            for lane in range(LANES if planes else 0):
+                flat_ids[pixel + lane // BLOCK * width + lane % BLOCK] = np.int32(pixels[at_id + lane])
+            red, green, blue = load(pixels, 0), load(pixels, LANES), load(pixels, 2 * LANES)
+            if not one_background:
+                behind = load_rows_of_three(flat_background, 3 * pixel, 3 * width)
+                red, green = fma(passes, behind[0], red), fma(passes, behind[1], green)
+                blue = fma(passes, behind[2], blue)
+            store_rows_of_three(flat_image, 3 * pixel, 3 * width, red, green, blue)
+            continue
+        for y in range(top, min(top + BLOCK, height)):
+            for x in range(left, min(left + BLOCK, width)):
+                pixel, lane = np.uint64(y * width + x), np.uint64((y - top) * BLOCK + x - left)
+                flat_alpha[pixel] = pixels[np.uint64(at_alpha) + lane]
+                flat_depth[pixel] = pixels[np.uint64(at_depth) + lane]
+                if len(transmittance):
+                    flat_end[pixel] = passed[np.uint64(at) + lane]
+                if planes:
+                    flat_ids[pixel] = np.int32(pixels[np.uint64(at_id) + lane])
+                to = pixel * np.uint64(n_channels)
+                for c in range(np.uint64(n_channels)):
+                    flat_image[to + c] = pixels[c * np.uint64(LANES) + lane]
+                if not one_background:
+                    for c in range(np.uint64(n_channels)):
+                        flat_image[to + c] += passed[np.uint64(at) + lane] * flat_background[to + c]
 
 
 @kernel
 def blend_backward(
-    worker, workers, tile_starts, tile_ends, pair_ranks, pair_slots, geometry, values, limits, image, alpha, depth,
-    transmittance, d_image, d_alpha, d_depth, with_geometry, slots,
+    worker, workers, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, geometry, channels, depths, limits,
+    image, alpha, depth, transmittance, d_image, d_alpha, d_depth, with_geometry, slots,
 ):  # fmt: skip
-    """Write the gradient slot of every pair of every workers-th tile: moments, then channels, depth and zeros.
+    """Write the gradient slot of every pair of every workers-th tile: moments, the gradients of values, zeros.
 
-    Goes near to far like `blend`. With s_i the inner product of channels and gradient, w_i the weight and h the
-    gradient of what lies behind, dL/d(alpha_i) = T_i s_i - rest_i / (1 - alpha_i), where the rest, the sum of w_j s_j
-    over j > i plus T_end h, is the known total minus the terms passed so far: one number per pixel serves all channels.
+    Goes near to far like `blend`. With s_i the inner product of values and gradient, w_i the weight and h the gradient
+    of what lies behind, dL/d(alpha_i) = T_i s_i - rest_i / (1 - alpha_i), where the rest, the sum of w_j s_j over j > i
+    plus T_end h, is the known total minus the terms passed so far: one number per pixel serves all channels.
 
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
             latter two empty where there is none; with_geometry is whether more than channels want a gradient, or else
-            the moments are zero; slots [S, 6 + B] the result.
+            the moments are zero; slots [S, 16 + 8 k] the result, see `cpu_projection.SLOT_VALUES`.
     """
     height, width, n_channels = image.shape
-    n_values, n_slots = values.shape[1], slots.shape[1]
+    n_values, n_slots = padded(n_channels), slots.shape[1]
     columns = (width + TILE - 1) // TILE
-    gradient = np.empty(n_values * PIXELS, np.float32)
-    passed, rest = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-    d_values = np.empty(n_values * LANES, np.float32)
-    table, strips = np.empty((BATCH, GEOMETRY + n_values), np.float32), np.empty((BATCH, 4), np.int64)
+    more = n_values > FIRST
+    gradient = aligned(n_values * PIXELS)
+    passed, rest = aligned(PIXELS), aligned(PIXELS)
+    weights, inners = aligned(PIXELS), aligned(PIXELS)
+    table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat, flat_slots = table.reshape(-1), slots.reshape(-1)
-    log2_alpha_min, zero, one = splat(limits[LOG2_ALPHA_MIN]), splat(float32(0)), splat(float32(1))
-    alpha_max, transmittance_min = splat(limits[ALPHA_MAX]), splat(limits[TRANSMITTANCE_MIN])
+    cut, zero, one = limits[LOG2_ALPHA_MIN], splat(float32(0)), splat(float32(1))
+    cut_low, cut_high = splat(float32(cut - CLOSE_LOG2)), splat(float32(cut + CLOSE_LOG2))
+    cut_lanes, alpha_max = splat(float32(cut)), splat(float32(limits[ALPHA_MAX]))
+    cap_low = splat(float32(limits[LOG2_ALPHA_MAX] - CLOSE_LOG2))
+    cap_high = splat(float32(limits[LOG2_ALPHA_MAX] + CLOSE_LOG2))
+    end_low = splat(float32(limits[TRANSMITTANCE_MIN] * (1 - CLOSE_TRANSMITTANCE)))
+    end_high = splat(float32(limits[TRANSMITTANCE_MIN] * (1 + CLOSE_TRANSMITTANCE)))
+    lane_x, lane_y = load(_X, 0), load(_Y, 0)
     for tile in range(worker, len(tile_starts) - 1, workers):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
-        rows = min(TILE, height - y0)
-        gradient[:] = 0
-        rest[:] = 0
-        passed[:] = 1
-        for row in range(rows):
-            for column in range(min(TILE, width - x0)):
-                strip = column // LANES * TILE + row
-                at = strip * LANES * n_values + column % LANES
-                y, x = y0 + row, x0 + column
+        tile_start, tile_end = tile_starts[tile], tile_ends[tile]
+        if tile_end > tile_start:
+            _start_tile(passed, x0, y0, width, height)
+            _start_backward(
+                x0, y0, n_values, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest
+            )
+        for begin in range(tile_start, tile_end, BATCH):
+            end = min(begin + BATCH, tile_end)
+            _load_batch(begin, end, tile_end, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
+            for k in range(end - begin):
+                drawn = pair_blocks[begin + k]
+                slot = np.int64(pair_slots[begin + k]) * n_slots
+                if not drawn:
+                    for c in range(0, n_slots, LANES):
+                        store(flat_slots, slot + c, zero)
+                    continue
+                g = k * (VALUES + n_values)
+                if more and with_geometry:
+                    _inner_more(drawn, n_values, flat, g + VALUES, gradient, inners)
+                u_lanes = broadcast(flat, g + T_L11) * lane_x - broadcast(flat, g + T_L12) * lane_y
+                v_lanes = broadcast(flat, g + T_L22) * lane_y
+                log2_opacity = broadcast(flat, g + T_LOG2_OPACITY)
+                value_0, value_1 = broadcast(flat, g + VALUES), broadcast(flat, g + VALUES + 1)
+                value_2, value_3 = broadcast(flat, g + VALUES + 2), broadcast(flat, g + VALUES + 3)
+                a, au, av, auu, auv, avv = zero, zero, zero, zero, zero, zero
+                d_0, d_1, d_2, d_3 = zero, zero, zero, zero
+                touched = drawn
+                while touched:
+                    block = lowest_bit(touched)
+                    touched &= touched - np.uint64(1)
+                    column, row, at = block & 7, block >> 3, block * LANES
+                    u = u_lanes + broadcast(flat, g + U_COLUMN + column) + broadcast(flat, g + U_ROW + row)
+                    v = v_lanes + broadcast(flat, g + V_ROW + row)
+                    exponent = fma(-u, u, fma(-v, v, log2_opacity))
+                    before = load(passed, at)
+                    valid = (exponent >= cut_low) & (before > zero)
+                    if unlikely(any_of(valid & (cut_high > exponent))):
+                        sure = bits_of(valid & (exponent >= cut_high))
+                        open_bits = bits_of(valid) ^ sure
+                        i = pair_rows[begin + k]
+                        valid = mask_of(sure | lanes_at_least(open_bits, geometry, i, x0, y0, block, cut))
+                    opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
+                    weight = before * opaque
+                    after = before - weight
+                    weight = select(valid, weight, zero)
+                    after = select(valid, after, before)
+                    ends = valid & (end_high > after)
+                    if unlikely(any_of(ends)):
+                        close = bits_of(ends & (after >= end_low))
+                        if close:
+                            ending = bits_of(ends) ^ close
+                            ends = mask_of(ending | lanes_that_finish(
+                                close, geometry, pair_rows, pair_blocks, tile_start, begin + k + 1, x0, y0, block,
+                                limits,
+                            ))  # fmt: skip
+                        weight = select(ends, zero, weight)
+                        after = select(ends, -before, after)
+                        valid = valid & ~ends
+                    store(passed, at, after)
+                    of = at * FIRST
+                    g_0, g_1 = load(gradient, of), load(gradient, of + LANES)
+                    g_2, g_3 = load(gradient, of + 2 * LANES), load(gradient, of + 3 * LANES)
+                    d_0, d_1 = fma(weight, g_0, d_0), fma(weight, g_1, d_1)
+                    d_2, d_3 = fma(weight, g_2, d_2), fma(weight, g_3, d_3)
+                    if more:
+                        store(weights, at, weight)
+                    if not with_geometry:
+                        continue
+                    inner = fma(value_3, g_3, fma(value_2, g_2, fma(value_1, g_1, value_0 * g_0)))
+                    if more:
+                        inner = inner + load(inners, at)
+                    own = weight * inner
+                    remaining = load(rest, at) - own
+                    store(rest, at, remaining)
+                    # dL/d(ln alpha); zero where the cap holds, as the capped alpha does not move
+                    capped = exponent >= cap_low
+                    if unlikely(any_of(valid & capped)):
+                        sure = bits_of(valid & (exponent >= cap_high))
+                        open_bits = bits_of(valid & capped) ^ sure
+                        if open_bits:
+                            i = pair_rows[begin + k]
+                            sure |= lanes_at_least(open_bits, geometry, i, x0, y0, block, limits[LOG2_ALPHA_MAX])
+                        valid = valid & ~mask_of(sure)
+                    to_log = select(valid, own - remaining * opaque / (one - opaque), zero)
+                    to_u, to_v = to_log * u, to_log * v
+                    a, au, av = a + to_log, au + to_u, av + to_v
+                    auu, auv, avv = fma(to_u, u, auu), fma(to_u, v, auv), fma(to_v, v, avv)
+                sums = totals((a, au, av, auu, auv, avv, d_0, d_1, d_2, d_3, zero, zero, zero, zero, zero, zero))
+                store(flat_slots, slot, sums)
+                if more:
+                    _sum_more(drawn, n_values, weights, gradient, flat_slots, slot + LANES)
+        for pair in range(tile_end, tile_starts[tile + 1]):
+            slots[pair_slots[pair]] = 0
+
+
+@kernel
+def _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest):
+    """Fill the tile buffers: gradient with respect to each value, and the sum over all pairs and the background."""
+    height, width, n_channels = image.shape
+    gradient[:] = 0
+    rest[:] = 0
+    flat_image, flat_gradient = image.reshape(-1), d_image.reshape(-1)
+    places = np.empty(n_channels, np.uint64)
+    zero, one, three = splat(float32(0)), splat(float32(1)), n_channels == 3
+    for block in range(BLOCKS * BLOCKS):
+        left, top = x0 + block % BLOCKS * BLOCK, y0 + block // BLOCKS * BLOCK
+        if left >= width or top >= height:
+            continue
+        depth_at = _place(n_channels, block)
+        if three and left + BLOCK <= width and top + BLOCK <= height:
+            pixel = top * width + left
+            red, green, blue = load_rows_of_three(flat_gradient, 3 * pixel, 3 * width)
+            seen_red, seen_green, seen_blue = load_rows_of_three(flat_image, 3 * pixel, 3 * width)
+            of = block * FIRST * LANES
+            store(gradient, of, red)
+            store(gradient, of + LANES, green)
+            store(gradient, of + 2 * LANES, blue)
+            remaining = fma(red, seen_red, fma(green, seen_green, blue * seen_blue))
+            to_alpha = zero
+            if d_alpha.size:
+                to_alpha = load_rows(d_alpha.reshape(-1), pixel, width)
+            if d_depth.size:
+                covers = load_rows(alpha.reshape(-1), pixel, width)
+                to_depth = select(covers > zero, load_rows(d_depth.reshape(-1), pixel, width), zero)
+                distance = load_rows(depth.reshape(-1), pixel, width)
+                per_weight = to_depth / select(covers > zero, covers, one)
+                store(gradient, of + 3 * LANES, per_weight)
+                remaining = fma(to_depth, distance, remaining)
+                to_alpha = to_alpha - per_weight * distance
+            passes = load_rows(transmittance.reshape(-1), pixel, width)
+            store(rest, block * LANES, remaining - passes * to_alpha)
+            continue
+        for c in range(n_channels):
+            places[c] = _place(c, block)
+        for y in range(top, min(top + BLOCK, height)):
+            for x in range(left, min(left + BLOCK, width)):
+                lane = np.uint64((y - top) * BLOCK + x - left)
+                of = np.uint64((y * width + x) * n_channels)
                 remaining = float32(0)
-                for c in range(n_channels):
-                    gradient[at + c * LANES] = d_image[y, x, c]
-                    remaining += d_image[y, x, c] * image[y, x, c]
+                for c in range(np.uint64(n_channels)):
+                    gradient[places[c] + lane] = flat_gradient[of + c]
+                    remaining += flat_gradient[of + c] * flat_image[of + c]
                 to_alpha = d_alpha[y, x] if d_alpha.size else float32(0)
                 if d_depth.size and alpha[y, x] > 0:
                     per_weight = d_depth[y, x] / alpha[y, x]
-                    gradient[at + n_channels * LANES] = per_weight
+                    gradient[np.uint64(depth_at) + lane] = per_weight
                     remaining += d_depth[y, x] * depth[y, x]
                     to_alpha -= per_weight * depth[y, x]
-                rest[strip * LANES + column % LANES] = remaining - transmittance[y, x] * to_alpha
+                rest[np.uint64(block * LANES) + lane] = remaining - transmittance[y, x] * to_alpha
 
-        for begin in range(tile_starts[tile], tile_ends[tile], BATCH):
-            end = min(begin + BATCH, tile_ends[tile])
-            _load_batch(begin, end, x0, y0, rows, pair_ranks, geometry, values, table, strips)
-            for k in range(end - begin):
-                g = k * (GEOMETRY + n_values)
-                l11, log2_opacity = broadcast(flat, g + L11), flat[g + LOG2_OPACITY]
-                mean_x, mean_y, shift, l22 = flat[g + MEAN_X], flat[g + MEAN_Y], flat[g + SHIFT], flat[g + L22]
-                a, au, av, auu, auv, avv = zero, zero, zero, zero, zero, zero
-                for c in range(n_values):
-                    store(d_values, c * LANES, zero)
-                for column in range(strips[k, 0], strips[k, 1] + 1):
-                    dx = iota() + splat(float32(column * LANES) + float32(0.5) - mean_x)
-                    for row in range(strips[k, 2], strips[k, 3] + 1):
-                        dy = float32(row) + float32(0.5) - mean_y
-                        across = l22 * dy
-                        u = l11 * (dx - splat(shift * dy))
-                        exponent = fma(-u, u, splat(log2_opacity - across * across))
-                        at = (column * TILE + row) * LANES
-                        before = load(passed, at)
-                        valid = (exponent >= log2_alpha_min) & (before > zero)
-                        if not any_of(valid):
-                            continue
-                        uncapped = exp2(larger(exponent, log2_alpha_min))
-                        opaque = smaller(uncapped, alpha_max)
-                        weight = before * opaque
-                        after = before - weight
-                        goes_on = after >= transmittance_min
-                        used = valid & goes_on
-                        weight = select(used, weight, zero)
-                        store(passed, at, select(valid, select(goes_on, after, -before), before))
 
-                        inner = zero
-                        value, of, to = g + GEOMETRY, at * n_values, np.int64(0)
-                        for _ in range(0, n_values, 4):
-                            g0, g1 = load(gradient, of), load(gradient, of + LANES)
-                            g2, g3 = load(gradient, of + 2 * LANES), load(gradient, of + 3 * LANES)
-                            if with_geometry:
-                                inner = fma(broadcast(flat, value), g0, inner)
-                                inner = fma(broadcast(flat, value + 1), g1, inner)
-                                inner = fma(broadcast(flat, value + 2), g2, inner)
-                                inner = fma(broadcast(flat, value + 3), g3, inner)
-                            store(d_values, to, fma(weight, g0, load(d_values, to)))
-                            to += LANES
-                            store(d_values, to, fma(weight, g1, load(d_values, to)))
-                            to += LANES
-                            store(d_values, to, fma(weight, g2, load(d_values, to)))
-                            to += LANES
-                            store(d_values, to, fma(weight, g3, load(d_values, to)))
-                            to += LANES
-                            of += 4 * LANES
-                            value += 4
+@kernel
+def _inner_more(drawn, n_values, flat, value, gradient, inners):
+    """Inner product of one Gaussian's values beyond the first four with the gradient, for the blocks ``drawn``."""
+    for chunk in range(FIRST, n_values, MORE):
+        v = value + chunk
+        v0, v1, v2, v3 = broadcast(flat, v), broadcast(flat, v + 1), broadcast(flat, v + 2), broadcast(flat, v + 3)
+        v4, v5, v6, v7 = broadcast(flat, v + 4), broadcast(flat, v + 5), broadcast(flat, v + 6), broadcast(flat, v + 7)
+        rest = drawn
+        while rest:
+            block = lowest_bit(rest)
+            rest &= rest - np.uint64(1)
+            of = chunk * PIXELS + block * LANES * MORE
+            a = v0 * load(gradient, of)
+            b = v1 * load(gradient, of + LANES)
+            a = fma(v2, load(gradient, of + 2 * LANES), a)
+            b = fma(v3, load(gradient, of + 3 * LANES), b)
+            a = fma(v4, load(gradient, of + 4 * LANES), a)
+            b = fma(v5, load(gradient, of + 5 * LANES), b)
+            a = fma(v6, load(gradient, of + 6 * LANES), a)
+            b = fma(v7, load(gradient, of + 7 * LANES), b)
+            inner = a + b
+            if chunk > FIRST:
+                inner = inner + load(inners, block * LANES)
+            store(inners, block * LANES, inner)
 
-                        if not with_geometry:
-                            continue
-                        own = weight * inner
-                        remaining = load(rest, at) - own
-                        store(rest, at, remaining)
-                        # dL/d(ln alpha); zero where the cap holds, as the capped alpha does not move
-                        to_log = own - remaining * opaque / (one - opaque)
-                        to_log = select(used & (alpha_max >= uncapped), to_log, zero)
-                        to_u, v = to_log * u, splat(across)
-                        a = a + to_log
-                        au = au + to_u
-                        av = fma(to_log, v, av)
-                        auu = fma(to_u, u, auu)
-                        auv = fma(to_u, v, auv)
-                        avv = fma(to_log, v * v, avv)
-                slot = np.int64(pair_slots[begin + k]) * n_slots
-                flat_slots[slot] = total(a)
-                flat_slots[slot + 1] = total(au)
-                flat_slots[slot + 2] = total(av)
-                flat_slots[slot + 3] = total(auu)
-                flat_slots[slot + 4] = total(auv)
-                flat_slots[slot + 5] = total(avv)
-                for c in range(n_slots - MOMENTS):
-                    flat_slots[slot + MOMENTS + c] = total(load(d_values, c * LANES))
-        for pair in range(tile_ends[tile], tile_starts[tile + 1]):
-            slots[pair_slots[pair]] = 0
+
+@kernel
+def _sum_more(drawn, n_values, weights, gradient, flat_slots, slot):
+    """Gradients of one Gaussian's values beyond the first four, summed over the blocks ``drawn``."""
+    zero = splat(float32(0))
+    for chunk in range(FIRST, n_values, 2 * MORE):
+        low = _sum_chunk(drawn, chunk, weights, gradient)
+        high = (zero, zero, zero, zero, zero, zero, zero, zero)
+        if chunk + MORE < n_values:
+            high = _sum_chunk(drawn, chunk + MORE, weights, gradient)
+        store(flat_slots, slot, totals(low + high))
+        slot += LANES
+
+
+@kernel
+def _sum_chunk(drawn, chunk, weights, gradient):
+    zero = splat(float32(0))
+    d0, d1, d2, d3, d4, d5, d6, d7 = zero, zero, zero, zero, zero, zero, zero, zero
+    while drawn:
+        block = lowest_bit(drawn)
+        drawn &= drawn - np.uint64(1)
+        weight, of = load(weights, block * LANES), chunk * PIXELS + block * LANES * MORE
+        d0 = fma(weight, load(gradient, of), d0)
+        d1 = fma(weight, load(gradient, of + LANES), d1)
+        d2 = fma(weight, load(gradient, of + 2 * LANES), d2)
+        d3 = fma(weight, load(gradient, of + 3 * LANES), d3)
+        d4 = fma(weight, load(gradient, of + 4 * LANES), d4)
+        d5 = fma(weight, load(gradient, of + 5 * LANES), d5)
+        d6 = fma(weight, load(gradient, of + 6 * LANES), d6)
+        d7 = fma(weight, load(gradient, of + 7 * LANES), d7)
+    return d0, d1, d2, d3, d4, d5, d6, d7

@@ -3,8 +3,8 @@
 Notation: p = (x, y, z) centre in the camera frame, u = x / z and v = y / z slopes, W world to camera rotation, R of the
 Gaussian, M = W R diag(s), J Jacobian of the projection, P = J M, C = P P^T + dilation.
 
-The conic C^-1 is kept as L^T L with L = [[l11, -l11 shift], [0, l22]]: the exponent is then a sum of two squares, which
-does not cancel for long thin Gaussians as the expanded quadratic form does in float32.
+The conic C^-1 is kept as L^T L with L = [[l11, -l12], [0, l22]]: the exponent is then a sum of two squares, which does
+not cancel for long thin Gaussians as the expanded quadratic form does in float32.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float32
 
 from .compile import kernel
+from .lanes import LANES
 
 # Columns of the geometry table. Row of each Gaussian: centre in px; the whitening L scaled so that
-# log2(alpha) = LOG2_OPACITY - (l11 (dx - shift dy))^2 - (l22 dy)^2; half extents of the alpha_min ellipse in px.
-MEAN_X, MEAN_Y, L11, SHIFT, L22, LOG2_OPACITY, EXTENT_X, EXTENT_Y = range(8)
+# log2(alpha) = LOG2_OPACITY - (l11 dx - l12 dy)^2 - (l22 dy)^2; half extents of the alpha_min ellipse in px.
+MEAN_X, MEAN_Y, L11, L12, L22, LOG2_OPACITY, EXTENT_X, EXTENT_Y = range(8)
 GEOMETRY = 8
 
 # Entries of the view vector, see `cpu.pack_view`.
@@ -26,7 +26,8 @@ FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATIO
 ROTATION, TRANSLATION = 14, 23
 VIEW = 26
 
-# Sums over pixels of A, A u, A v, A u u, A u v, A v v with A = dL/d(ln alpha) and (u, v) = L d scaled as above.
+# A slot begins with sums over pixels of A, A u, A v, A u u, A u v, A v v with A = dL/d(ln alpha) and (u, v) = L d
+# scaled as above; then come the gradients of four values, zeros to a whole vector, and the gradients of further values.
 MOMENTS = 6
 
 _WHITEN = 0.5 / math.log(2.0)  # squares of the scaled (u, v) are this times those of L d
@@ -131,7 +132,7 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         geometry[i, MEAN_X] = mean_x
         geometry[i, MEAN_Y] = mean_y
         geometry[i, L11] = math.sqrt(_WHITEN * yy / determinant)
-        geometry[i, SHIFT] = xy / yy
+        geometry[i, L12] = geometry[i, L11] * xy / yy
         geometry[i, L22] = math.sqrt(_WHITEN / yy)
         geometry[i, LOG2_OPACITY] = math.log2(opacity)
         geometry[i, EXTENT_X] = extent_x
@@ -139,6 +140,17 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         depths[i] = z
         middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
         radii[i] = 3 * math.sqrt(middle + math.sqrt(half * half + xy * xy))
+
+
+def slot_width(n_channels: int) -> int:
+    """Number of columns of a slot."""
+    return LANES * (1 + max(0, -(-(n_channels - 3) // LANES)))
+
+
+@kernel
+def slot_place(value):
+    """Column of the gradient of a value in a slot."""
+    return MOMENTS + value if value < 4 else LANES + value - 4
 
 
 @kernel
@@ -152,13 +164,13 @@ def project_backward(
         view: See `cpu.pack_view`. [26]
         means, quats, scales, opacities: The inputs, one row per Gaussian.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
-        slots: Moments and channel gradients of each pair of Gaussian and tile, depth after the channels. [S, 6 + B]
+        slots: Moments and gradients of the values of each pair of Gaussian and tile. [S, 16 k]
         with_geometry: Whether more than channels want a gradient.
         d_means, d_quats, d_scales, d_opacities, d_channels: Gradients. [N, ...]
         grad_norm: Norm of the gradient with respect to the projected centre in px. [N]
     """
     n, n_channels = d_channels.shape
-    width = MOMENTS + n_channels + 1
+    width = slots.shape[1]
     sums, rotation, axes = np.empty(width), np.empty(9), np.empty(6)
     d_axes, d_m, d_r = np.empty(6), np.empty(9), np.empty(9)
     for i in range(n * worker // workers, n * (worker + 1) // workers):
@@ -169,7 +181,7 @@ def project_backward(
             for c in range(width):
                 sums[c] += slots[slot, c]
         for c in range(n_channels):
-            d_channels[i, c] = sums[MOMENTS + c]
+            d_channels[i, c] = sums[slot_place(c)]
         if not with_geometry:
             continue
         d_opacities[i] = sums[0] / opacities[i]
@@ -208,7 +220,7 @@ def project_backward(
             d_j12 += d_b * r2 * s
             d_axes[k] = s
 
-        d_z = sums[width - 1]  # the depth channel
+        d_z = sums[slot_place(n_channels)]  # the depth follows the channels
         d_z -= (j00 * d_j00 + j01 * d_j01 + j02 * d_j02 + j11 * d_j11 + j12 * d_j12) * inverse_z
         d_x, d_y = j00 * d_x2d, j01 * d_x2d + j11 * d_y2d  # d_u / z and d_v / z
         if u == u_clamped:
@@ -239,18 +251,3 @@ def project_backward(
         d_quats[i, 1] = (d_qx - along * qx) * inverse_length
         d_quats[i, 2] = (d_qy - along * qy) * inverse_length
         d_quats[i, 3] = (d_qz - along * qz) * inverse_length
-
-
-@kernel
-def gather(worker, workers, order, geometry, depths, channels, ranked_geometry, ranked_values):
-    """Copy the visible Gaussians in depth order: geometry [V, 8]; channels, depth, zeros to a multiple of 4 [V, B]."""
-    n, n_channels, width = len(order), channels.shape[1], ranked_values.shape[1]
-    for rank in range(n * worker // workers, n * (worker + 1) // workers):
-        i = order[rank]
-        for c in range(GEOMETRY):
-            ranked_geometry[rank, c] = geometry[i, c]
-        for c in range(n_channels):
-            ranked_values[rank, c] = channels[i, c]
-        ranked_values[rank, n_channels] = depths[i]
-        for c in range(n_channels + 1, width):
-            ranked_values[rank, c] = float32(0)

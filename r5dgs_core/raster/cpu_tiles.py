@@ -10,45 +10,78 @@ import math
 
 import numpy as np
 
-from .compile import kernel
-from .cpu_projection import EXTENT_X, EXTENT_Y, L11, L22, MEAN_X, MEAN_Y, SHIFT
+from .compile import kernel, run_parts, threads
+from .cpu_projection import EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y
 
 TILE = 32  # px; larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
 
 _DIGIT = 11  # bits per pass of the radix sort
 _MARGIN = 0.01  # px added to the extents, far more than rounding takes away; exact decisions come later
+_WORTH_A_THREAD = 4000  # Gaussians
 
 
 @kernel
 def sort_by_depth(depths, radii):
     """Rows with a radius, by increasing depth, rows of equal depth in their order. -> [V] int32
 
-    The bits of positive floats are ordered like the floats: a radix sort with three passes, least digit first.
+    The bits of positive floats are ordered like the floats: a radix sort of the depths in float32, least digit first,
+    over the digits that differ at all; then runs that are equal in float32 are ordered by their float64 depths.
     """
-    count = 0
+    bits = depths.astype(np.float32).view(np.uint32)
+    count, least, most = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
     for i in range(len(depths)):
         if radii[i] > 0:
             count += 1
-    order, spare = np.empty(count, np.int32), np.empty(count, np.int32)
-    bits = depths.view(np.uint32)
+            least, most = min(least, bits[i]), max(most, bits[i])
+    items, spare = np.empty(count, np.uint64), np.empty(count, np.uint64)  # key above, row below
     count = 0
     for i in range(len(depths)):
         if radii[i] > 0:
-            order[count] = i
+            items[count] = np.uint64(bits[i] - least) << np.uint64(32) | np.uint64(i)
             count += 1
     starts = np.empty((1 << _DIGIT) + 1, np.int64)
-    for shift in range(0, 32, _DIGIT):
+    digit_mask, shift = np.uint64((1 << _DIGIT) - 1), np.uint64(32)
+    while count and np.uint64(most - least) >> (shift - np.uint64(32)):
         starts[:] = 0
         for k in range(count):
-            starts[((bits[order[k]] >> np.uint32(shift)) & np.uint32((1 << _DIGIT) - 1)) + 1] += 1
+            starts[(items[k] >> shift & digit_mask) + np.uint64(1)] += 1
         for digit in range(1 << _DIGIT):
             starts[digit + 1] += starts[digit]
         for k in range(count):
-            digit = (bits[order[k]] >> np.uint32(shift)) & np.uint32((1 << _DIGIT) - 1)
-            spare[starts[digit]] = order[k]
+            digit = items[k] >> shift & digit_mask
+            spare[starts[digit]] = items[k]
             starts[digit] += 1
-        order, spare = spare, order
+        items, spare = spare, items
+        shift += np.uint64(_DIGIT)
+    order = np.empty(count, np.int32)
+    for k in range(count):
+        order[k] = np.int32(items[k] & np.uint64(0xFFFFFFFF))
+    begin = 0
+    for k in range(1, count + 1):
+        if k == count or items[k] >> np.uint64(32) != items[begin] >> np.uint64(32):
+            if k - begin > 1:
+                _sort_run(order, begin, k, depths)
+            begin = k
     return order
+
+
+@kernel
+def _sort_run(order, begin, end, depths):
+    """Order a few rows by depth and then by row: Shell's sort, quick where they are in order already."""
+    gap = 1
+    while gap < (end - begin) // 3:
+        gap = 3 * gap + 1
+    while gap:
+        for k in range(begin + gap, end):
+            row, at = order[k], k
+            while at - gap >= begin:
+                other = order[at - gap]
+                if not (depths[row] < depths[other] or (depths[row] == depths[other] and row < other)):
+                    break
+                order[at] = other
+                at -= gap
+            order[at] = row
+        gap //= 3
 
 
 @kernel
@@ -60,70 +93,107 @@ def _tile_range(low, high, tiles):
 
 
 @kernel
-def assign_tiles(order, n, geometry, width, height):
+def _box(geometry, i, columns, rows):
+    """Tiles that the bounding box of Gaussian i touches: first and one past the last column, the same of rows."""
+    extent_x, extent_y = geometry[i, EXTENT_X] + _MARGIN, geometry[i, EXTENT_Y] + _MARGIN
+    x, y = geometry[i, MEAN_X], geometry[i, MEAN_Y]
+    left, right = _tile_range(x - extent_x, x + extent_x, columns)
+    top, bottom = _tile_range(y - extent_y, y + extent_y, rows)
+    return left, max(left, right), top, max(top, bottom)
+
+
+@kernel
+def _span(geometry, i, row, columns):
+    """First and one past the last column of tiles that the ellipse of Gaussian i touches in a row of tiles."""
+    x, y = geometry[i, MEAN_X], geometry[i, MEAN_Y]
+    extent_x, extent_y = geometry[i, EXTENT_X], geometry[i, EXTENT_Y]
+    shift, ratio = geometry[i, L12] / geometry[i, L11], geometry[i, L22] / geometry[i, L11]
+    tip = shift * extent_y * extent_y / extent_x  # dy of the point of the ellipse with the largest dx
+    low = max(row * TILE + 0.5 - y, -extent_y)
+    high = min(row * TILE + TILE - 0.5 - y, extent_y)
+    right = min(max(tip, low), high)
+    left = min(max(-tip, low), high)
+    x_high = shift * right + ratio * math.sqrt(max(extent_y * extent_y - right * right, 0.0))
+    x_low = shift * left - ratio * math.sqrt(max(extent_y * extent_y - left * left, 0.0))
+    first, last = _tile_range(x + x_low - _MARGIN, x + x_high + _MARGIN, columns)
+    return first, max(first, last)
+
+
+@kernel
+def count_pairs(worker, workers, order, geometry, columns, rows, tile_counts, slot_counts):
+    """Count the pairs of this worker's part of ``order``.
+
+    Args:
+        order: Rows of the visible Gaussians, near to far. [V]
+        geometry: Projected Gaussians. [N, 8]
+        columns, rows: Number of tiles.
+        tile_counts: Takes the number of pairs per tile, one row per worker. [workers, tiles] int64
+        slot_counts: Takes the number of pairs of each Gaussian, from its second entry on. [N + 1] int64, or empty
+    """
+    counts = tile_counts[worker]
+    counts[:] = 0
+    for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
+        i = order[rank]
+        left, right, top, bottom = _box(geometry, i, columns, rows)
+        first, last, slots = left, right, 0
+        trimmed = right - left > 1 and bottom - top > 1
+        for row in range(top, bottom):
+            if trimmed:
+                first, last = _span(geometry, i, row, columns)
+            slots += last - first
+            for column in range(first, last):
+                counts[row * columns + column] += 1
+        if len(slot_counts):
+            slot_counts[i + 1] = slots
+
+
+@kernel
+def fill_pairs(worker, workers, order, geometry, columns, rows, cursors, slot_starts, pair_rows, pair_slots):
+    """Write the pairs that `count_pairs` counted; ``cursors`` says where those of each worker begin in each tile."""
+    cursor = cursors[worker]
+    for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
+        i = order[rank]
+        left, right, top, bottom = _box(geometry, i, columns, rows)
+        first, last = left, right
+        trimmed = right - left > 1 and bottom - top > 1
+        slot = slot_starts[i] if len(slot_starts) else 0
+        for row in range(top, bottom):
+            if trimmed:
+                first, last = _span(geometry, i, row, columns)
+            for column in range(first, last):
+                pair = cursor[row * columns + column]
+                cursor[row * columns + column] += 1
+                pair_rows[pair] = i
+                if len(pair_slots):
+                    pair_slots[pair] = slot
+                    slot += 1
+
+
+def assign_tiles(order, geometry, width, height, with_slots):
     """List the pairs of depth-ordered Gaussians and tiles.
 
     Args:
-        order: Row of each visible Gaussian among all n, near to far. [V]
-        geometry: Projected Gaussians, near to far. [V, 8]
+        order: Rows of the visible Gaussians, near to far. [V] int32
+        geometry: Projected Gaussians. [N, 8]
         width, height: Size of the image, px.
+        with_slots: Whether gradients will be wanted.
 
     Returns:
         tile_starts: Pairs of tile t are tile_starts[t] : tile_starts[t + 1]; tiles row by row. [tiles + 1] int64
-        pair_ranks: Row of ``geometry``. [P] int32
-        pair_slots: Slot of the pair. [P] int32
-        slot_starts: Slots of Gaussian i, not of rank i, are slot_starts[i] : slot_starts[i + 1]. [n + 1] int64
+        pair_rows: Row of ``geometry``. [P] int32
+        pair_slots: Slot of the pair. [P] int32, or empty
+        slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1] int64, or empty
     """
-    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    visible = len(order)
-    # The span of tiles in each row of tiles is computed once and stored: rounding twice could count differently.
-    row_starts = np.zeros(visible + 1, np.int64)
-    first_rows = np.empty(visible, np.int32)
-    for rank in range(visible):
-        y, extent = np.float64(geometry[rank, MEAN_Y]), np.float64(geometry[rank, EXTENT_Y]) + _MARGIN
-        first, last = _tile_range(y - extent, y + extent, rows)
-        first_rows[rank] = first
-        row_starts[rank + 1] = row_starts[rank] + max(last - first, 0)
-    span_first, span_last = np.empty(row_starts[visible], np.int32), np.empty(row_starts[visible], np.int32)
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    parts = max(1, min(threads(), len(order) // _WORTH_A_THREAD))
+    slot_starts = np.zeros(len(geometry) + 1 if with_slots else 0, np.int64)
+    counts = np.empty((parts, columns * rows), np.int64)
+    run_parts(count_pairs, parts, order, geometry, columns, rows, counts, slot_starts)
+    np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(columns * rows + 1, np.int64)
-    slot_starts = np.zeros(n + 1, np.int64)
-    for rank in range(visible):
-        x, y = np.float64(geometry[rank, MEAN_X]), np.float64(geometry[rank, MEAN_Y])
-        extent_x, extent_y = np.float64(geometry[rank, EXTENT_X]), np.float64(geometry[rank, EXTENT_Y])
-        shift = np.float64(geometry[rank, SHIFT])
-        ratio = np.float64(geometry[rank, L22]) / np.float64(geometry[rank, L11])
-        tip = shift * extent_y * extent_y / extent_x  # dy of the point of the ellipse with the largest dx
-        slots = 0
-        for k in range(row_starts[rank], row_starts[rank + 1]):
-            row = first_rows[rank] + k - row_starts[rank]
-            low = max(row * TILE + 0.5 - y, -extent_y)
-            high = min(row * TILE + TILE - 0.5 - y, extent_y)
-            right = min(max(tip, low), high)
-            left = min(max(-tip, low), high)
-            x_high = shift * right + ratio * math.sqrt(max(extent_y * extent_y - right * right, 0.0))
-            x_low = shift * left - ratio * math.sqrt(max(extent_y * extent_y - left * left, 0.0))
-            first, last = _tile_range(x + x_low - _MARGIN, x + x_high + _MARGIN, columns)
-            last = max(last, first)
-            span_first[k], span_last[k] = first, last
-            slots += last - first
-            for column in range(first, last):
-                tile_starts[row * columns + column + 1] += 1
-        slot_starts[order[rank] + 1] = slots
-    for tile in range(columns * rows):
-        tile_starts[tile + 1] += tile_starts[tile]
-    for i in range(n):
-        slot_starts[i + 1] += slot_starts[i]
-
-    cursors = tile_starts[:-1].copy()
-    pair_ranks, pair_slots = np.empty(slot_starts[n], np.int32), np.empty(slot_starts[n], np.int32)
-    for rank in range(visible):
-        slot = slot_starts[order[rank]]
-        for k in range(row_starts[rank], row_starts[rank + 1]):
-            row = first_rows[rank] + k - row_starts[rank]
-            for column in range(span_first[k], span_last[k]):
-                pair = cursors[row * columns + column]
-                cursors[row * columns + column] += 1
-                pair_ranks[pair] = rank
-                pair_slots[pair] = slot
-                slot += 1
-    return tile_starts, pair_ranks, pair_slots, slot_starts
+    np.cumsum(counts.sum(0), out=tile_starts[1:])
+    cursors = tile_starts[:-1] + np.cumsum(counts, 0) - counts
+    pair_rows = np.empty(tile_starts[-1], np.int32)
+    pair_slots = np.empty(tile_starts[-1] if with_slots else 0, np.int32)
+    run_parts(fill_pairs, parts, order, geometry, columns, rows, cursors, slot_starts, pair_rows, pair_slots)
+    return tile_starts, pair_rows, pair_slots, slot_starts
