@@ -79,11 +79,11 @@ class _Rasterize(torch.autograd.Function):
         else:
             behind = background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
         view = pack_view(camera, settings)
-        radii = np.zeros(n, np.float32)
+        radii = np.empty(cpu_projection.padded_rows(n), np.float32)
         with_state = any(ctx.needs_input_grad)
         state, *results = _forward(arrays, behind, camera, labels, settings, view, radii, with_state)
         if stats is not None:
-            stats.radii = torch.from_numpy(radii)
+            stats.radii = torch.from_numpy(radii[:n])
             stats.visible = stats.radii > 0
             stats.grad_norm = torch.zeros(n)
         ctx.set_materialize_grads(False)
@@ -127,10 +127,10 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
     means, quats, scales, opacities, channels = arrays
     n, n_channels = channels.shape
     height, width = camera.height, camera.width
-    geometry, depths = _aligned((n, cpu_projection.GEOMETRY), np.float64), np.empty(n)
+    geometry, depths = _aligned((len(radii), cpu_projection.GEOMETRY), np.float64), np.empty(len(radii))
     run(
         cpu_projection.project, n // _WORTH_A_THREAD,
-        view, means, quats, scales, opacities, geometry, depths, radii,
+        view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, geometry, depths, radii,
     )  # fmt: skip
     order = cpu_tiles.sort_by_depth(depths, radii)
     tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(order, geometry, width, height, with_state)
@@ -138,7 +138,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
     if labels is not None and len(order):
         votes = labels.detach().cpu().numpy().clip(-1).astype(np.int32) + np.int32(1)
         planes = int(votes[order].max()) + 1
-        votes[radii == 0] = 0
+        votes[radii[:n] == 0] = 0
     limits = np.array(
         [
             math.log2(settings.alpha_min),
@@ -185,12 +185,14 @@ def _backward(state: _Pass, arrays, d_image, d_alpha, d_depth, with_geometry):
         channels, state.depths, state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth,
         with_geometry, slots,
     )  # fmt: skip
-    gradients = [np.zeros((n, k), np.float32) for k in (3, 4, 3)]
-    gradients += [np.zeros(n, np.float32), np.zeros((n, n_channels), np.float32)]
-    grad_norm = np.zeros(n, np.float32)
+    rows = cpu_projection.padded_rows(n)
+    gradients = [np.zeros(rows * k, np.float32) for k in (3, 4, 3, 1, n_channels)]
+    grad_norm = np.zeros(rows, np.float32)
     run(
         cpu_projection.project_backward, n // _WORTH_A_THREAD,
-        state.view, means, quats, scales, opacities, state.slot_starts, slots, with_geometry,
-        *gradients, grad_norm,
+        state.view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, state.slot_starts, slots,
+        with_geometry, n_channels, *gradients, grad_norm,
     )  # fmt: skip
-    return gradients, grad_norm
+    shapes = [means.shape, quats.shape, scales.shape, opacities.shape, channels.shape]
+    shaped = [g[: math.prod(shape)].reshape(shape) for g, shape in zip(gradients, shapes, strict=True)]
+    return shaped, grad_norm[:n]

@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numba import float32
 
-from .compile import kernel
+from .compile import helper, kernel
 from .cpu_exact import (
     ALPHA_MAX,
     BLOCK,
@@ -37,27 +37,19 @@ from .cpu_projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L12, L22, LOG2_OP
 from .cpu_tiles import TILE
 from .lanes import (
     LANES,
-    any_of,
-    bits_of,
     broadcast,
     exp2,
-    fma,
-    larger,
     load,
     load_rows,
     load_rows_of_three,
-    lowest_bit,
     mask_of,
-    prefetch,
-    select,
-    smaller,
     splat,
     store,
     store_rows,
     store_rows_of_three,
     totals,
-    unlikely,
 )
+from .vectors import any_of, bits_of, fma, larger, lowest_bit, prefetch, select, smaller, unlikely
 
 PIXELS = TILE * TILE
 BATCH = 64  # pairs
@@ -82,7 +74,7 @@ def padded_values(n_channels: int) -> int:
     return FIRST + max(0, -(-(n_channels + 1 - FIRST) // MORE)) * MORE
 
 
-@kernel
+@helper
 def aligned(count):
     """An array of float32 that begins where a vector of the machine would: loads and stores then never straddle."""
     array = np.empty(count + LANES, np.float32)
@@ -90,7 +82,7 @@ def aligned(count):
     return array[skip : skip + count]
 
 
-@kernel
+@helper
 def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths, table, blocks):
     """Copy pairs begin : end of a tile to rows of ``table``; ``blocks`` takes the blocks that their box touches.
 
@@ -139,7 +131,7 @@ def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths,
             row_of[c] = 0
 
 
-@kernel
+@helper
 def _start_tile(passed, x0, y0, width, height):
     """Set the transmittance of the pixels of a tile; returns the blocks that have pixels inside the image."""
     alive = np.uint64(0)
@@ -268,13 +260,13 @@ def blend(
         )
 
 
-@kernel
+@helper
 def padded(n_channels):
     """`padded_values` for kernels."""
     return FIRST + max(0, (n_channels + 1 - FIRST + MORE - 1) // MORE) * MORE
 
 
-@kernel
+@helper
 def _blend_more(drawn, n_values, weights, flat, value, buffer):
     """Add the values beyond the first four of one Gaussian to the blocks ``drawn``."""
     for chunk in range(FIRST, n_values, MORE):
@@ -297,7 +289,7 @@ def _blend_more(drawn, n_values, weights, flat, value, buffer):
             store(buffer, to + 7 * LANES, fma(weight, v7, load(buffer, to + 7 * LANES)))
 
 
-@kernel
+@helper
 def _place(channel, block):
     """Where the value of a block's first pixel lies in a tile buffer; that of its next pixel follows."""
     if channel < FIRST:
@@ -306,7 +298,7 @@ def _place(channel, block):
     return (FIRST + chunk * MORE) * PIXELS + (block * MORE + channel - FIRST - chunk * MORE) * LANES
 
 
-@kernel
+@helper
 def _finish_tile(
     x0, y0, n_values, planes, buffer, votes, passed, background, limits, image, alpha, depth, transmittance, ids
 ):
@@ -414,9 +406,7 @@ def blend_backward(
         tile_start, tile_end = tile_starts[tile], tile_ends[tile]
         if tile_end > tile_start:
             _start_tile(passed, x0, y0, width, height)
-            _start_backward(
-                x0, y0, n_values, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest
-            )
+            _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest)
         for begin in range(tile_start, tile_end, BATCH):
             end = min(begin + BATCH, tile_end)
             _load_batch(begin, end, tile_end, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
@@ -506,7 +496,7 @@ def blend_backward(
             slots[pair_slots[pair]] = 0
 
 
-@kernel
+@helper
 def _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest):
     """Fill the tile buffers: gradient with respect to each value, and the sum over all pairs and the background."""
     height, width, n_channels = image.shape
@@ -562,7 +552,7 @@ def _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha
                 rest[np.uint64(block * LANES) + lane] = remaining - transmittance[y, x] * to_alpha
 
 
-@kernel
+@helper
 def _inner_more(drawn, n_values, flat, value, gradient, inners):
     """Inner product of one Gaussian's values beyond the first four with the gradient, for the blocks ``drawn``."""
     for chunk in range(FIRST, n_values, MORE):
@@ -588,7 +578,7 @@ def _inner_more(drawn, n_values, flat, value, gradient, inners):
             store(inners, block * LANES, inner)
 
 
-@kernel
+@helper
 def _sum_more(drawn, n_values, weights, gradient, flat_slots, slot):
     """Gradients of one Gaussian's values beyond the first four, summed over the blocks ``drawn``."""
     zero = splat(float32(0))
@@ -601,7 +591,7 @@ def _sum_more(drawn, n_values, weights, gradient, flat_slots, slot):
         slot += LANES
 
 
-@kernel
+@helper
 def _sum_chunk(drawn, chunk, weights, gradient):
     zero = splat(float32(0))
     d0, d1, d2, d3, d4, d5, d6, d7 = zero, zero, zero, zero, zero, zero, zero, zero

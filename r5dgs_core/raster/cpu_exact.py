@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compile import kernel
+from .compile import helper
 from .cpu_projection import L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
 from .lanes import LANES
 
@@ -24,7 +24,7 @@ CLOSE_TRANSMITTANCE = 2e-4
 LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN = range(5)
 
 
-@kernel
+@helper
 def log2_alpha(geometry, i, x, y):
     """Logarithm to base 2 of what Gaussian i contributes, before the cap, at a point of the image in px."""
     dx, dy = x - geometry[i, MEAN_X], y - geometry[i, MEAN_Y]
@@ -33,7 +33,7 @@ def log2_alpha(geometry, i, x, y):
     return geometry[i, LOG2_OPACITY] - u * u - v * v
 
 
-@kernel
+@helper
 def lanes_at_least(bits, geometry, i, x0, y0, block, threshold):
     """Those of the lanes ``bits`` of a block where the contribution of Gaussian i reaches a threshold (log2)."""
     kept = np.uint64(0)
@@ -45,7 +45,7 @@ def lanes_at_least(bits, geometry, i, x0, y0, block, threshold):
     return kept
 
 
-@kernel
+@helper
 def lanes_that_finish(bits, geometry, pair_rows, pair_blocks, begin, end, x0, y0, block, limits):
     """Those of the lanes ``bits`` of a block whose pixel the pairs begin : end bring below the minimal transmittance.
 

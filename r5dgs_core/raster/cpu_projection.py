@@ -1,4 +1,4 @@
-"""Kernels that project Gaussians to the image and bring their gradients back, in float64 per Gaussian.
+"""Kernels that project Gaussians to the image and bring their gradients back, eight at a time in float64.
 
 Notation: p = (x, y, z) centre in the camera frame, u = x / z and v = y / z slopes, W world to camera rotation, R of the
 Gaussian, M = W R diag(s), J Jacobian of the projection, P = J M, C = P P^T + dilation.
@@ -13,8 +13,21 @@ import math
 
 import numpy as np
 
-from .compile import kernel
-from .lanes import LANES
+from .compile import helper, kernel
+from .doubles import (
+    DOUBLES,
+    column,
+    entry,
+    log2,
+    set_column,
+    spread,
+    sqrt,
+    store_doubles,
+    store_table,
+    widen,
+)
+from .lanes import LANES, load
+from .vectors import any_of, larger, select, smaller
 
 # Columns of the geometry table. Row of each Gaussian: centre in px; the whitening L scaled so that
 # log2(alpha) = LOG2_OPACITY - (l11 dx - l12 dy)^2 - (l22 dy)^2; half extents of the alpha_min ellipse in px.
@@ -32,114 +45,143 @@ MOMENTS = 6
 
 _WHITEN = 0.5 / math.log(2.0)  # squares of the scaled (u, v) are this times those of L d
 _UNWHITEN, _UNWHITEN_ROOT = 1 / _WHITEN, 1 / math.sqrt(_WHITEN)
+_TWICE_LN_2 = 2 * math.log(2.0)
 
 
-@kernel
+def padded_rows(n: int) -> int:
+    """Number of rows that tables written by the kernels of this module need for n Gaussians."""
+    return -(-n // DOUBLES) * DOUBLES
+
+
+@helper
 def _linearise(u, v, inverse_z, view):
     """The Jacobian of the projection at slopes u, v: j00, j01, j02, j11, j12; and the clamped slopes."""
-    u = min(max(u, view[U_LOW]), view[U_HIGH])
-    v = min(max(v, view[V_LOW]), view[V_HIGH])
-    j00, j01, j11 = view[FX] * inverse_z, view[SKEW] * inverse_z, view[FY] * inverse_z
-    return j00, j01, -(j00 * u + j01 * v), j11, -j11 * v, u, v
+    u = smaller(larger(u, entry(view, U_LOW)), entry(view, U_HIGH))
+    v = smaller(larger(v, entry(view, V_LOW)), entry(view, V_HIGH))
+    j00, j01, j11 = entry(view, FX) * inverse_z, entry(view, SKEW) * inverse_z, entry(view, FY) * inverse_z
+    return j00, j01, -(j00 * u + j01 * v), j11, -(j11 * v), u, v
 
 
-@kernel
-def _rotate(view, w, x, y, z, rotation):
-    """Write W R(q) for a unit quaternion to a flat array of nine."""
+@helper
+def _rotate_row(view, row, k):
+    """Row ``row`` of W R, with k the nine entries of R."""
+    a, b, c = entry(view, ROTATION + 3 * row), entry(view, ROTATION + 3 * row + 1), entry(view, ROTATION + 3 * row + 2)
+    return a * k[0] + b * k[3] + c * k[6], a * k[1] + b * k[4] + c * k[7], a * k[2] + b * k[5] + c * k[8]
+
+
+@helper
+def _rotate(view, w, x, y, z):
+    """W R(q) for unit quaternions, row by row."""
+    one, two = spread(1.0), spread(2.0)
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
     local = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        one - two * (yy + zz), two * (xy - wz), two * (xz + wy),
+        two * (xy + wz), one - two * (xx + zz), two * (yz - wx),
+        two * (xz - wy), two * (yz + wx), one - two * (xx + yy),
+    )  # fmt: skip
+    return _rotate_row(view, 0, local) + _rotate_row(view, 1, local) + _rotate_row(view, 2, local)
+
+
+@helper
+def _camera_row(view, row, a, b, c):
+    """Coordinate ``row`` of world points (a, b, c) in the camera frame."""
+    return (
+        entry(view, TRANSLATION + row)
+        + entry(view, ROTATION + 3 * row) * a
+        + entry(view, ROTATION + 3 * row + 1) * b
+        + entry(view, ROTATION + 3 * row + 2) * c
     )
-    for i in range(3):
-        a, b, c = view[ROTATION + 3 * i], view[ROTATION + 3 * i + 1], view[ROTATION + 3 * i + 2]
-        for k in range(3):
-            rotation[3 * i + k] = a * local[0][k] + b * local[1][k] + c * local[2][k]
 
 
-@kernel
-def _to_camera(view, means, i):
-    """Centre i in the camera frame."""
-    a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-    x = view[TRANSLATION] + view[ROTATION] * a + view[ROTATION + 1] * b + view[ROTATION + 2] * c
-    y = view[TRANSLATION + 1] + view[ROTATION + 3] * a + view[ROTATION + 4] * b + view[ROTATION + 5] * c
-    z = view[TRANSLATION + 2] + view[ROTATION + 6] * a + view[ROTATION + 7] * b + view[ROTATION + 8] * c
-    return x, y, z
-
-
-@kernel
-def _unit(quats, i):
-    """Quaternion i made one long, and one over its length; the zero quaternion counts as no rotation, with 0."""
-    w, x, y, z = np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3])
+@helper
+def _unit(quats, i, last):
+    """Quaternions i to i + 7 made one long, and one over their lengths; zero counts as no rotation, with 0."""
+    zero, one = spread(0.0), spread(1.0)
+    w, x, y, z = (
+        column(quats, i, last, 4, 0), column(quats, i, last, 4, 1),
+        column(quats, i, last, 4, 2), column(quats, i, last, 4, 3),
+    )  # fmt: skip
     square = w * w + x * x + y * y + z * z
-    if square == 0:
-        return 1.0, 0.0, 0.0, 0.0, 0.0
-    inverse = 1 / math.sqrt(square)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+    proper = square > zero
+    inverse = select(proper, one / sqrt(select(proper, square, one)), zero)
+    return select(proper, w * inverse, one), x * inverse, y * inverse, z * inverse, inverse
 
 
-@kernel
-def _covariance(j00, j01, j02, j11, j12, rotation, scales, i, dilation, axes):
-    """Write P (2 x 3, flat) and return c_xx, c_xy, c_yy with dilation, and the determinant.
+@helper
+def _axes(j, r, s0, s1, s2):
+    """P = J (W R) diag(s), row by row."""
+    j00, j01, j02, j11, j12 = j[0], j[1], j[2], j[3], j[4]
+    return (
+        (j00 * r[0] + j01 * r[3] + j02 * r[6]) * s0,
+        (j00 * r[1] + j01 * r[4] + j02 * r[7]) * s1,
+        (j00 * r[2] + j01 * r[5] + j02 * r[8]) * s2,
+        (j11 * r[3] + j12 * r[6]) * s0,
+        (j11 * r[4] + j12 * r[7]) * s1,
+        (j11 * r[5] + j12 * r[8]) * s2,
+    )
+
+
+@helper
+def _covariance(p, dilation):
+    """c_xx, c_xy, c_yy of P P^T with dilation, and the determinant.
 
     det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, and det(P P^T) is the sum of the squared minors of P (Cauchy and
     Binet): nothing cancels, however long and thin the Gaussian is.
     """
-    xx, xy, yy = 0.0, 0.0, 0.0
-    for k in range(3):
-        a = (j00 * rotation[k] + j01 * rotation[3 + k] + j02 * rotation[6 + k]) * np.float64(scales[i, k])
-        b = (j11 * rotation[3 + k] + j12 * rotation[6 + k]) * np.float64(scales[i, k])
-        axes[k], axes[3 + k] = a, b
-        xx += a * a
-        xy += a * b
-        yy += b * b
-    minor_01 = axes[0] * axes[4] - axes[1] * axes[3]
-    minor_02 = axes[0] * axes[5] - axes[2] * axes[3]
-    minor_12 = axes[1] * axes[5] - axes[2] * axes[4]
+    xx = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    xy = p[0] * p[3] + p[1] * p[4] + p[2] * p[5]
+    yy = p[3] * p[3] + p[4] * p[4] + p[5] * p[5]
+    minor_01, minor_02, minor_12 = p[0] * p[4] - p[1] * p[3], p[0] * p[5] - p[2] * p[3], p[1] * p[5] - p[2] * p[4]
     determinant = minor_01 * minor_01 + minor_02 * minor_02 + minor_12 * minor_12 + dilation * (xx + yy + dilation)
     return xx + dilation, xy, yy + dilation, determinant
 
 
 @kernel
 def project(worker, workers, view, means, quats, scales, opacities, geometry, depths, radii):
-    """Fill the rows of this worker: geometry [N, 8], depths [N] and radii [N] (0 where the image is not touched)."""
-    n = len(means)
-    rotation, axes = np.empty(9), np.empty(6)
-    for i in range(n * worker // workers, n * (worker + 1) // workers):
-        radii[i] = 0
-        opacity = np.float64(opacities[i])
-        if opacity < view[ALPHA_MIN]:
+    """Fill the rows of this worker: geometry [n, 8], depths [n] and radii [n] (0 where the image is not touched).
+
+    The inputs are flat; the results have n = `padded_rows` rows, of which those too many have no radius.
+    """
+    count = len(opacities)
+    last, blocks = count - 1, len(depths) // DOUBLES
+    flat = geometry.reshape(-1)
+    zero, one = spread(0.0), spread(1.0)
+    near, alpha_min, dilation = entry(view, NEAR), entry(view, ALPHA_MIN), entry(view, DILATION)
+    log2_alpha_min, width, height = log2(alpha_min), entry(view, WIDTH), entry(view, HEIGHT)
+    whiten, half = spread(_WHITEN), spread(0.5)
+    for block in range(blocks * worker // workers, blocks * (worker + 1) // workers):
+        i = block * DOUBLES
+        opacity = column(opacities, i, last, 1, 0)
+        a, b, c = column(means, i, last, 3, 0), column(means, i, last, 3, 1), column(means, i, last, 3, 2)
+        z = _camera_row(view, 2, a, b, c)
+        seen = (opacity >= alpha_min) & (z > near)
+        if not any_of(seen):
+            set_column(radii, i, 1, 0, zero)
             continue
-        x, y, z = _to_camera(view, means, i)
-        if z <= view[NEAR]:
-            continue
-        w, qx, qy, qz, _ = _unit(quats, i)
-        _rotate(view, w, qx, qy, qz, rotation)
+        x, y, z = _camera_row(view, 0, a, b, c), _camera_row(view, 1, a, b, c), select(seen, z, one)
+        inverse_z = one / z
         u, v = x / z, y / z
-        j00, j01, j02, j11, j12, _, _ = _linearise(u, v, 1 / z, view)
-        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales, i, view[DILATION], axes)
-        mean_x = view[FX] * u + view[SKEW] * v + view[CX]
-        mean_y = view[FY] * v + view[CY]
-        reach = 2 * math.log(opacity / view[ALPHA_MIN])
-        extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
-        if not (
-            mean_x + extent_x > 0
-            and mean_x - extent_x < view[WIDTH]
-            and mean_y + extent_y > 0
-            and mean_y - extent_y < view[HEIGHT]
-        ):
-            continue
-        geometry[i, MEAN_X] = mean_x
-        geometry[i, MEAN_Y] = mean_y
-        geometry[i, L11] = math.sqrt(_WHITEN * yy / determinant)
-        geometry[i, L12] = geometry[i, L11] * xy / yy
-        geometry[i, L22] = math.sqrt(_WHITEN / yy)
-        geometry[i, LOG2_OPACITY] = math.log2(opacity)
-        geometry[i, EXTENT_X] = extent_x
-        geometry[i, EXTENT_Y] = extent_y
-        depths[i] = z
-        middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-        radii[i] = 3 * math.sqrt(middle + math.sqrt(half * half + xy * xy))
+        mean_x = entry(view, FX) * u + entry(view, SKEW) * v + entry(view, CX)
+        mean_y = entry(view, FY) * v + entry(view, CY)
+        w, qx, qy, qz, _ = _unit(quats, i, last)
+        j = _linearise(u, v, inverse_z, view)
+        s0, s1, s2 = column(scales, i, last, 3, 0), column(scales, i, last, 3, 1), column(scales, i, last, 3, 2)
+        p = _axes(j, _rotate(view, w, qx, qy, qz), s0, s1, s2)
+        xx, xy, yy, determinant = _covariance(p, dilation)
+        log2_opacity = log2(select(seen, opacity, one))
+        reach = spread(_TWICE_LN_2) * larger(log2_opacity - log2_alpha_min, zero)
+        extent_x, extent_y = sqrt(reach * xx), sqrt(reach * yy)
+        seen = seen & (mean_x + extent_x > zero) & (width > mean_x - extent_x)
+        seen = seen & (mean_y + extent_y > zero) & (height > mean_y - extent_y)
+        l11 = sqrt(whiten * yy / determinant)
+        store_table(flat, i, (mean_x, mean_y, l11, l11 * xy / yy, sqrt(whiten / yy), log2_opacity, extent_x, extent_y))
+        store_doubles(depths, i, z)
+        middle, across = half * (xx + yy), half * (xx - yy)
+        radius = spread(3.0) * sqrt(middle + sqrt(across * across + xy * xy))
+        set_column(radii, i, 1, 0, select(seen, radius, zero))
+        for k in range(max(count - i, 0), DOUBLES):
+            radii[i + k] = 0
 
 
 def slot_width(n_channels: int) -> int:
@@ -147,107 +189,152 @@ def slot_width(n_channels: int) -> int:
     return LANES * (1 + max(0, -(-(n_channels - 3) // LANES)))
 
 
-@kernel
+@helper
 def slot_place(value):
     """Column of the gradient of a value in a slot."""
     return MOMENTS + value if value < 4 else LANES + value - 4
 
 
+@helper
+def _sum_slots(i, count, slot_starts, flat_slots, width, sums):
+    """Sum the slots of Gaussians i to i + 7 into the rows of ``sums``; returns a bit for each that has any."""
+    present = np.uint64(0)
+    for k in range(min(DOUBLES, count - i)):
+        begin, end = slot_starts[i + k], slot_starts[i + k + 1]
+        if begin == end:
+            continue
+        present |= np.uint64(1) << np.uint64(k)
+        for c in range(0, width, LANES):
+            low, high = widen(load(flat_slots, begin * width + c))
+            for slot in range(begin + 1, end):
+                more_low, more_high = widen(load(flat_slots, slot * width + c))
+                low, high = low + more_low, high + more_high
+            store_doubles(sums, k * width + c, low)
+            store_doubles(sums, k * width + c + DOUBLES, high)
+    return present
+
+
 @kernel
 def project_backward(
-    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, with_geometry, d_means, d_quats,
-    d_scales, d_opacities, d_channels, grad_norm,
+    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, with_geometry, n_channels, d_means,
+    d_quats, d_scales, d_opacities, d_channels, grad_norm,
 ):  # fmt: skip
-    """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay as they are.
+    """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay zero.
 
     Args:
         view: See `cpu.pack_view`. [26]
-        means, quats, scales, opacities: The inputs, one row per Gaussian.
+        means, quats, scales, opacities: The inputs, flat.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
         slots: Moments and gradients of the values of each pair of Gaussian and tile. [S, 16 k]
         with_geometry: Whether more than channels want a gradient.
-        d_means, d_quats, d_scales, d_opacities, d_channels: Gradients. [N, ...]
-        grad_norm: Norm of the gradient with respect to the projected centre in px. [N]
+        n_channels: D.
+        d_means, d_quats, d_scales, d_opacities, d_channels: Gradients, flat, zero, with `padded_rows` rows.
+        grad_norm: Norm of the gradient with respect to the projected centre in px, zero and padded, too.
     """
-    n, n_channels = d_channels.shape
-    width = slots.shape[1]
-    sums, rotation, axes = np.empty(width), np.empty(9), np.empty(6)
-    d_axes, d_m, d_r = np.empty(6), np.empty(9), np.empty(9)
-    for i in range(n * worker // workers, n * (worker + 1) // workers):
-        if slot_starts[i] == slot_starts[i + 1]:
+    count, width = len(opacities), slots.shape[1]
+    last, blocks = count - 1, len(grad_norm) // DOUBLES
+    sums, flat_slots = np.zeros(DOUBLES * width), slots.reshape(-1)
+    end, depth_at = DOUBLES - 1, slot_place(n_channels)
+    zero, one, two, half = spread(0.0), spread(1.0), spread(2.0), spread(0.5)
+    dilation = entry(view, DILATION)
+    for block in range(blocks * worker // workers, blocks * (worker + 1) // workers):
+        i = block * DOUBLES
+        present = _sum_slots(i, count, slot_starts, flat_slots, width, sums)
+        if not present:
             continue
-        sums[:] = 0
-        for slot in range(slot_starts[i], slot_starts[i + 1]):
-            for c in range(width):
-                sums[c] += slots[slot, c]
-        for c in range(n_channels):
-            d_channels[i, c] = sums[slot_place(c)]
+        for k in range(DOUBLES):
+            if present >> np.uint64(k) & np.uint64(1):
+                for c in range(n_channels):
+                    d_channels[(i + k) * n_channels + c] = sums[k * width + slot_place(c)]
+            else:
+                for c in range(width):
+                    sums[k * width + c] = 0
         if not with_geometry:
             continue
-        d_opacities[i] = sums[0] / opacities[i]
+        opacity = column(opacities, i, last, 1, 0)
+        drawn = opacity > zero
+        opacity = select(drawn, opacity, one)
+        set_column(d_opacities, i, 1, 0, column(sums, 0, end, width, 0) / opacity)
 
-        x, y, z = _to_camera(view, means, i)
-        w, qx, qy, qz, inverse_length = _unit(quats, i)
-        _rotate(view, w, qx, qy, qz, rotation)
-        inverse_z = 1 / z
-        u, v = x * inverse_z, y * inverse_z
-        j00, j01, j02, j11, j12, u_clamped, v_clamped = _linearise(u, v, inverse_z, view)
-        xx, xy, yy, determinant = _covariance(j00, j01, j02, j11, j12, rotation, scales, i, view[DILATION], axes)
-        l11, l22, shift = math.sqrt(yy / determinant), math.sqrt(1 / yy), xy / yy
+        a, b, c = column(means, i, last, 3, 0), column(means, i, last, 3, 1), column(means, i, last, 3, 2)
+        x, y, z = _camera_row(view, 0, a, b, c), _camera_row(view, 1, a, b, c), _camera_row(view, 2, a, b, c)
+        z = select(z > entry(view, NEAR), z, one)
+        w, qx, qy, qz, inverse_length = _unit(quats, i, last)
+        r = _rotate(view, w, qx, qy, qz)
+        inverse_z = one / z
+        u, v = x / z, y / z
+        j = _linearise(u, v, inverse_z, view)
+        j00, j01, j02, j11, j12, u_clamped, v_clamped = j
+        s = column(scales, i, last, 3, 0), column(scales, i, last, 3, 1), column(scales, i, last, 3, 2)
+        p = _axes(j, r, s[0], s[1], s[2])
+        xx, xy, yy, determinant = _covariance(p, dilation)
+        l11, l22, shift = sqrt(yy / determinant), sqrt(one / yy), xy / yy
 
         # To the centre: L^T (sum A u, sum A v). To the covariance: L^T (sums of squares) L / 2.
-        su, sv = sums[1] * _UNWHITEN_ROOT, sums[2] * _UNWHITEN_ROOT
-        suu, suv, svv = sums[3] * _UNWHITEN, sums[4] * _UNWHITEN, sums[5] * _UNWHITEN
+        root, square = spread(_UNWHITEN_ROOT), spread(_UNWHITEN)
+        su, sv = column(sums, 0, end, width, 1) * root, column(sums, 0, end, width, 2) * root
+        suu, suv = column(sums, 0, end, width, 3) * square, column(sums, 0, end, width, 4) * square
+        svv = column(sums, 0, end, width, 5) * square
         d_x2d = l11 * su
         d_y2d = l22 * sv - shift * d_x2d
-        grad_norm[i] = math.sqrt(d_x2d * d_x2d + d_y2d * d_y2d)
-        g_xx = 0.5 * l11 * l11 * suu
-        g_xy = 0.5 * l11 * l22 * suv - shift * g_xx
-        g_yy = 0.5 * l22 * l22 * svv - shift * l11 * l22 * suv + shift * shift * g_xx
+        set_column(grad_norm, i, 1, 0, sqrt(d_x2d * d_x2d + d_y2d * d_y2d))
+        g_xx = half * l11 * l11 * suu
+        g_xy = half * l11 * l22 * suv - shift * g_xx
+        g_yy = half * l22 * l22 * svv - shift * l11 * l22 * suv + shift * shift * g_xx
 
-        # C = P P^T, P = J M, M = W R diag(s)
-        d_j00, d_j01, d_j02, d_j11, d_j12 = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(3):
-            d_a = 2 * (g_xx * axes[k] + g_xy * axes[3 + k])
-            d_b = 2 * (g_xy * axes[k] + g_yy * axes[3 + k])
-            r0, r1, r2, s = rotation[k], rotation[3 + k], rotation[6 + k], np.float64(scales[i, k])
-            d_m[k], d_m[3 + k], d_m[6 + k] = j00 * d_a, j01 * d_a + j11 * d_b, j02 * d_a + j12 * d_b
-            d_scales[i, k] = d_m[k] * r0 + d_m[3 + k] * r1 + d_m[6 + k] * r2
-            d_j00 += d_a * r0 * s
-            d_j01 += d_a * r1 * s
-            d_j02 += d_a * r2 * s
-            d_j11 += d_b * r1 * s
-            d_j12 += d_b * r2 * s
-            d_axes[k] = s
+        # C = P P^T, P = J M, M = W R diag(s); d_m are the columns of dL/dM
+        d_a = two * (g_xx * p[0] + g_xy * p[3]), two * (g_xx * p[1] + g_xy * p[4]), two * (g_xx * p[2] + g_xy * p[5])
+        d_b = two * (g_xy * p[0] + g_yy * p[3]), two * (g_xy * p[1] + g_yy * p[4]), two * (g_xy * p[2] + g_yy * p[5])
+        d_m0 = j00 * d_a[0], j00 * d_a[1], j00 * d_a[2]
+        d_m1 = j01 * d_a[0] + j11 * d_b[0], j01 * d_a[1] + j11 * d_b[1], j01 * d_a[2] + j11 * d_b[2]
+        d_m2 = j02 * d_a[0] + j12 * d_b[0], j02 * d_a[1] + j12 * d_b[1], j02 * d_a[2] + j12 * d_b[2]
+        set_column(d_scales, i, 3, 0, d_m0[0] * r[0] + d_m1[0] * r[3] + d_m2[0] * r[6])
+        set_column(d_scales, i, 3, 1, d_m0[1] * r[1] + d_m1[1] * r[4] + d_m2[1] * r[7])
+        set_column(d_scales, i, 3, 2, d_m0[2] * r[2] + d_m1[2] * r[5] + d_m2[2] * r[8])
+        a0, a1, a2 = d_a[0] * s[0], d_a[1] * s[1], d_a[2] * s[2]
+        b0, b1, b2 = d_b[0] * s[0], d_b[1] * s[1], d_b[2] * s[2]
+        d_j00 = a0 * r[0] + a1 * r[1] + a2 * r[2]
+        d_j01 = a0 * r[3] + a1 * r[4] + a2 * r[5]
+        d_j02 = a0 * r[6] + a1 * r[7] + a2 * r[8]
+        d_j11 = b0 * r[3] + b1 * r[4] + b2 * r[5]
+        d_j12 = b0 * r[6] + b1 * r[7] + b2 * r[8]
 
-        d_z = sums[slot_place(n_channels)]  # the depth follows the channels
-        d_z -= (j00 * d_j00 + j01 * d_j01 + j02 * d_j02 + j11 * d_j11 + j12 * d_j12) * inverse_z
+        d_z = column(sums, 0, end, width, depth_at)
+        d_z = d_z - (j00 * d_j00 + j01 * d_j01 + j02 * d_j02 + j11 * d_j11 + j12 * d_j12) * inverse_z
         d_x, d_y = j00 * d_x2d, j01 * d_x2d + j11 * d_y2d  # d_u / z and d_v / z
-        if u == u_clamped:
-            d_x -= j00 * d_j02 * inverse_z
-        if v == v_clamped:
-            d_y -= (j01 * d_j02 + j11 * d_j12) * inverse_z
-        d_z -= d_x * u + d_y * v
+        inside_u, inside_v = (u >= u_clamped) & (u_clamped >= u), (v >= v_clamped) & (v_clamped >= v)
+        d_x = select(inside_u, d_x - j00 * d_j02 * inverse_z, d_x)
+        d_y = select(inside_v, d_y - (j01 * d_j02 + j11 * d_j12) * inverse_z, d_y)
+        d_z = d_z - (d_x * u + d_y * v)
         for k in range(3):
-            d_means[i, k] = view[ROTATION + k] * d_x + view[ROTATION + 3 + k] * d_y + view[ROTATION + 6 + k] * d_z
+            d_mean = (
+                entry(view, ROTATION + k) * d_x
+                + entry(view, ROTATION + 3 + k) * d_y
+                + entry(view, ROTATION + 6 + k) * d_z
+            )
+            set_column(d_means, i, 3, k, d_mean)
 
         # R = W^T (W R); then through the normalisation of the quaternion.
-        for row in range(3):
-            for k in range(3):
-                d_r[3 * row + k] = d_axes[k] * (
-                    view[ROTATION + row] * d_m[k]
-                    + view[ROTATION + 3 + row] * d_m[3 + k]
-                    + view[ROTATION + 6 + row] * d_m[6 + k]
-                )
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-            d_r[0], d_r[1], d_r[2], d_r[3], d_r[4], d_r[5], d_r[6], d_r[7], d_r[8]
-        )  # fmt: skip
-        d_w = 2 * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
-        d_qx = 2 * (qy * (r01 + r10) + qz * (r02 + r20) + w * (r21 - r12) - 2 * qx * (r11 + r22))
-        d_qy = 2 * (qx * (r01 + r10) + qz * (r12 + r21) + w * (r02 - r20) - 2 * qy * (r00 + r22))
-        d_qz = 2 * (qx * (r02 + r20) + qy * (r12 + r21) + w * (r10 - r01) - 2 * qz * (r00 + r11))
+        r00, r01, r02 = _turn_back(view, 0, d_m0, d_m1, d_m2, s)
+        r10, r11, r12 = _turn_back(view, 1, d_m0, d_m1, d_m2, s)
+        r20, r21, r22 = _turn_back(view, 2, d_m0, d_m1, d_m2, s)
+        d_w = two * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
+        d_qx = two * (qy * (r01 + r10) + qz * (r02 + r20) + w * (r21 - r12) - two * qx * (r11 + r22))
+        d_qy = two * (qx * (r01 + r10) + qz * (r12 + r21) + w * (r02 - r20) - two * qy * (r00 + r22))
+        d_qz = two * (qx * (r02 + r20) + qy * (r12 + r21) + w * (r10 - r01) - two * qz * (r00 + r11))
         along = w * d_w + qx * d_qx + qy * d_qy + qz * d_qz
-        d_quats[i, 0] = (d_w - along * w) * inverse_length
-        d_quats[i, 1] = (d_qx - along * qx) * inverse_length
-        d_quats[i, 2] = (d_qy - along * qy) * inverse_length
-        d_quats[i, 3] = (d_qz - along * qz) * inverse_length
+        set_column(d_quats, i, 4, 0, (d_w - along * w) * inverse_length)
+        set_column(d_quats, i, 4, 1, (d_qx - along * qx) * inverse_length)
+        set_column(d_quats, i, 4, 2, (d_qy - along * qy) * inverse_length)
+        set_column(d_quats, i, 4, 3, (d_qz - along * qz) * inverse_length)
+
+
+@helper
+def _turn_back(view, row, d_m0, d_m1, d_m2, s):
+    """Row ``row`` of W^T dL/dM diag(s)."""
+    a, b, c = entry(view, ROTATION + row), entry(view, ROTATION + 3 + row), entry(view, ROTATION + 6 + row)
+    return (
+        (a * d_m0[0] + b * d_m1[0] + c * d_m2[0]) * s[0],
+        (a * d_m0[1] + b * d_m1[1] + c * d_m2[1]) * s[1],
+        (a * d_m0[2] + b * d_m1[2] + c * d_m2[2]) * s[2],
+    )

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .compile import kernel, run_parts, threads
+from .compile import helper, kernel, run_parts, threads
 from .cpu_projection import EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y
 
 TILE = 32  # px; larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
@@ -20,14 +20,18 @@ _MARGIN = 0.01  # px added to the extents, far more than rounding takes away; ex
 _WORTH_A_THREAD = 4000  # Gaussians
 
 
-@kernel
 def sort_by_depth(depths, radii):
-    """Rows with a radius, by increasing depth, rows of equal depth in their order. -> [V] int32
+    """Rows with a radius, by increasing depth (float64), rows of equal depth in their order. -> [V] int32"""
+    return sort_bits(depths.astype(np.float32).view(np.uint32), depths, radii)
 
-    The bits of positive floats are ordered like the floats: a radix sort of the depths in float32, least digit first,
-    over the digits that differ at all; then runs that are equal in float32 are ordered by their float64 depths.
+
+@kernel
+def sort_bits(bits, depths, radii):
+    """Rows with a radius, by increasing depth, from the bits of their depths in float32.
+
+    The bits of positive floats are ordered like the floats: a radix sort, least digit first, over the digits that
+    differ at all; then runs that are equal in float32 are ordered by their float64 depths.
     """
-    bits = depths.astype(np.float32).view(np.uint32)
     count, least, most = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
     for i in range(len(depths)):
         if radii[i] > 0:
@@ -65,7 +69,7 @@ def sort_by_depth(depths, radii):
     return order
 
 
-@kernel
+@helper
 def _sort_run(order, begin, end, depths):
     """Order a few rows by depth and then by row: Shell's sort, quick where they are in order already."""
     gap = 1
@@ -84,7 +88,7 @@ def _sort_run(order, begin, end, depths):
         gap //= 3
 
 
-@kernel
+@helper
 def _tile_range(low, high, tiles):
     """First and one past the last tile that has pixel centres between two coordinates in px, within 0 .. tiles."""
     first = math.floor((max(low, 0.0) - 0.5) / TILE)
@@ -92,7 +96,7 @@ def _tile_range(low, high, tiles):
     return max(int(first), 0), min(int(last) + 1, tiles)
 
 
-@kernel
+@helper
 def _box(geometry, i, columns, rows):
     """Tiles that the bounding box of Gaussian i touches: first and one past the last column, the same of rows."""
     extent_x, extent_y = geometry[i, EXTENT_X] + _MARGIN, geometry[i, EXTENT_Y] + _MARGIN
@@ -102,7 +106,7 @@ def _box(geometry, i, columns, rows):
     return left, max(left, right), top, max(top, bottom)
 
 
-@kernel
+@helper
 def _span(geometry, i, row, columns):
     """First and one past the last column of tiles that the ellipse of Gaussian i touches in a row of tiles."""
     x, y = geometry[i, MEAN_X], geometry[i, MEAN_Y]

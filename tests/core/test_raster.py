@@ -218,7 +218,7 @@ def test_every_kernel_is_compiled_once_for_all_inputs():
     for n_channels, background, labels in ((1, None, None), (3, torch.rand(3), torch.arange(50)), (19, None, None)):
         draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
     kernels = [
-        *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_by_depth),
+        *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_bits),
         *(cpu_tiles.count_pairs, cpu_tiles.fill_pairs, cpu_blending.blend, cpu_blending.blend_backward),
     ]
     assert {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels} == {
