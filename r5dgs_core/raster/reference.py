@@ -190,9 +190,9 @@ def _blend(means2d, axes, opacities, values, labels, box, settings):
         keep = torch.cumprod(1 - alpha, 1) >= settings.transmittance_min
     alpha = torch.where(keep, alpha, 0)
     # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
-    log_passed = torch.cumsum(torch.log1p(-alpha), 1)
-    log_before = torch.cat([torch.zeros_like(log_passed[:, :1]), log_passed[:, :-1]], 1)
-    weights = alpha * torch.exp(log_before)
+    log_factors = torch.log1p(-alpha)
+    log_passed = torch.cumsum(log_factors, 1)
+    weights = alpha * torch.exp(log_passed - log_factors)
     transmittance = torch.exp(log_passed[:, -1]) if alpha.shape[1] else means2d.new_ones(len(pixels))
     ids = _heaviest(weights.detach(), labels, transmittance.detach(), settings)
     return (weights @ values).reshape(*shape, -1), transmittance.reshape(shape), ids.reshape(shape)
