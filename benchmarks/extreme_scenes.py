@@ -195,9 +195,9 @@ def ten_thousand_opaque_layers() -> Case:
 @case("ten thousand thin layers")
 def ten_thousand_thin_layers() -> Case:
     scene = cloud(10_000, seed=12)
-    scene[0] = torch.tensor([0.0, 0, 2]) + torch.linspace(0, 1, 10_000)[:, None] * torch.tensor([0.0, 0, 1])
+    scene[0] = torch.tensor([0.01, 0, 2]) + torch.linspace(0, 1, 10_000)[:, None] * torch.tensor([0.0, 0, 1])
     scene[2][:], scene[3][:] = torch.tensor([0.5, 0.4, 0.3]), 0.004
-    return Case(scene, view(1, 1), "the nearest 2,297", torch.tensor([0.2, 0.9, 0.4]))
+    return Case(scene, view(1, 1), "the nearest 2,298", torch.tensor([0.2, 0.9, 0.4]))
 
 
 @case("half transparent layers")

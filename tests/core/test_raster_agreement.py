@@ -55,7 +55,7 @@ def scenes(draw, place):
     values = (
         _to_world(view, means),
         random.normal(size=(n, 4)),
-        np.minimum(scales, 1e6),
+        scales * np.minimum(1e6 / scales.max(1, keepdims=True), 1),
         _opacities(random, n, draw(st.sampled_from(OPACITIES))),
         random.uniform(0, 1, (n, n_channels)),
     )
