@@ -15,6 +15,7 @@ from .reference import frustum_slopes
 from .settings import RasterSettings, RasterStats, SplatImage
 
 _WORTH_A_THREAD = 2000  # Gaussians; fewer are projected before a second thread would wake up
+_FEW_LABELS = 16  # labels below this are not looked through for gaps
 _EMPTY = np.empty((0, 0), np.float32)
 
 
@@ -33,6 +34,8 @@ class _Pass:
     pair_blocks: np.ndarray
     slot_starts: np.ndarray
     transmittance: np.ndarray
+    last_pairs: np.ndarray
+    background: np.ndarray
 
 
 def rasterize_splats(
@@ -127,18 +130,20 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
     means, quats, scales, opacities, channels = arrays
     n, n_channels = channels.shape
     height, width = camera.height, camera.width
-    geometry, depths = _aligned((len(radii), cpu_projection.GEOMETRY), np.float64), np.empty(len(radii))
+    geometry = _aligned((len(radii), cpu_projection.GEOMETRY), np.float64)
+    depths, boxes = np.empty(len(radii)), np.empty(len(radii))
     run(
         cpu_projection.project, n // _WORTH_A_THREAD,
-        view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, geometry, depths, radii,
+        view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, geometry, depths, boxes,
+        radii,
     )  # fmt: skip
     order = cpu_tiles.sort_by_depth(depths, radii)
-    tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(order, geometry, width, height, with_state)
-    votes, planes = np.zeros(0, np.int32), 0
-    if labels is not None and len(order):
-        votes = labels.detach().cpu().numpy().clip(-1).astype(np.int32) + np.int32(1)
-        planes = int(votes[order].max()) + 1
-        votes[radii[:n] == 0] = 0
+    tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
+        order, boxes, geometry, width, height, with_state
+    )
+    names, votes = np.empty(0, np.int32), np.empty(0, np.int32)
+    if labels is not None:
+        names, votes = _vote(labels.detach().numpy())
     limits = np.array(
         [
             math.log2(settings.alpha_min),
@@ -151,19 +156,28 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
     image = np.empty((height, width, n_channels), np.float32)
     alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     ids = np.full((height, width) if labels is not None else (0, 0), -1, np.int32)
-    transmittance = np.empty((height, width) if with_state else (0, 0), np.float32)
+    transmittance, last_pairs = (np.empty((height, width) if with_state else (0, 0), np.float32) for _ in range(2))
     tile_ends = np.empty(len(tile_starts) - 1, np.int64)
     pair_blocks = np.empty(len(pair_rows), np.uint64)
     run(
         cpu_blending.blend, len(tile_ends) // 2,
-        tile_starts, pair_rows, geometry, channels, depths, votes, planes, background, limits, image, alpha, depth,
-        transmittance, ids, tile_ends, pair_blocks,
+        tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image, alpha, depth,
+        transmittance, last_pairs, ids, tile_ends, pair_blocks,
     )  # fmt: skip
     state = _Pass(
         view, limits, geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts,
-        transmittance,
+        transmittance, last_pairs, background,
     )  # fmt: skip
     return state if with_state else None, image, alpha, depth, ids
+
+
+def _vote(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The labels that occur, rising, all negative ones as -1 [L], and the place of each Gaussian's among them [N]."""
+    labels = np.ascontiguousarray(labels)
+    if len(labels) and labels.max() < _FEW_LABELS and labels.min() >= -1:  # nothing to find: as many planes as numbers
+        return np.arange(-1, labels.max() + 1, dtype=np.int32), (labels + 1).astype(np.int32)
+    names, places = np.unique(np.maximum(labels, -1), return_inverse=True)
+    return names.astype(np.int32), places.astype(np.int32)
 
 
 def _aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
@@ -176,14 +190,14 @@ def _aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
 
 def _backward(state: _Pass, arrays, d_image, d_alpha, d_depth, with_geometry):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
-    means, quats, scales, opacities, channels, image, alpha, depth = arrays
+    means, quats, scales, opacities, channels, _, alpha, depth = arrays
     n, n_channels = channels.shape
     slots = _aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_rows, state.pair_slots, state.pair_blocks, state.geometry,
-        channels, state.depths, state.limits, image, alpha, depth, state.transmittance, d_image, d_alpha, d_depth,
-        with_geometry, slots,
+        channels, state.depths, state.background, state.limits, alpha, depth, state.transmittance, state.last_pairs,
+        d_image, d_alpha, d_depth, with_geometry, slots,
     )  # fmt: skip
     rows = cpu_projection.padded_rows(n)
     gradients = [np.zeros(rows * k, np.float32) for k in (3, 4, 3, 1, n_channels)]

@@ -33,8 +33,7 @@ from .cpu_exact import (
     lanes_at_least,
     lanes_that_finish,
 )
-from .cpu_projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
-from .cpu_tiles import TILE
+from .cpu_projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y, TILE
 from .lanes import (
     LANES,
     broadcast,
@@ -43,6 +42,7 @@ from .lanes import (
     load_rows,
     load_rows_of_three,
     mask_of,
+    reciprocal,
     splat,
     store,
     store_rows,
@@ -132,6 +132,22 @@ def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths,
 
 
 @helper
+def _exponent(flat, g, column, row, u_lanes, v_lanes, log2_opacity):
+    """Whitened offsets u and v of the pixels of a block from the Gaussian in a row of the table, and log2 of alpha."""
+    u = u_lanes + broadcast(flat, g + U_COLUMN + column) + broadcast(flat, g + U_ROW + row)
+    v = v_lanes + broadcast(flat, g + V_ROW + row)
+    return u, v, fma(-u, u, fma(-v, v, log2_opacity))
+
+
+@helper
+def _settle(valid, close, geometry, i, x0, y0, block, threshold):
+    """The lanes that reach a threshold (log2 of alpha), where those that are ``close`` to it are looked at again."""
+    open_bits = bits_of(close)
+    kept = lanes_at_least(open_bits, geometry, i, x0, y0, block, threshold)
+    return mask_of((bits_of(valid) & ~open_bits) | kept)
+
+
+@helper
 def _start_tile(passed, x0, y0, width, height):
     """Set the transmittance of the pixels of a tile; returns the blocks that have pixels inside the image."""
     alive = np.uint64(0)
@@ -148,8 +164,8 @@ def _start_tile(passed, x0, y0, width, height):
 
 @kernel
 def blend(
-    worker, workers, tile_starts, pair_rows, geometry, channels, depths, labels, planes, background, limits, image,
-    alpha, depth, transmittance, ids, tile_ends, pair_blocks,
+    worker, workers, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image,
+    alpha, depth, transmittance, last_pairs, ids, tile_ends, pair_blocks,
 ):  # fmt: skip
     """Blend every workers-th tile.
 
@@ -157,12 +173,13 @@ def blend(
         tile_starts, pair_rows: Pairs, see `cpu_tiles`.
         geometry: Projected Gaussians. [N, 8] float64
         channels, depths: What is blended. [N, D], [N]
-        labels: Plane of each Gaussian's votes, 0 for label -1. [N] int32, or empty
-        planes: Number of planes, 0 for no labels.
+        votes: Place of each Gaussian's label among ``names``. [N] int32, or empty
+        names: The labels, rising. [L] int32, or empty
         background: One row per pixel, or one for all. [H * W or 1, D]
         limits: Thresholds. [5] float64
         image, alpha, depth: Results. [H, W, D], [H, W], [H, W]
         transmittance: Its end, for the backward pass. [H, W], or empty
+        last_pairs: Pairs of the tile that a pixel saw before it was finished, likewise. [H, W] float32, or empty
         ids: Label of each pixel. [H, W], or empty
         tile_ends: One past the last pair that had a pixel left to draw on. [tiles]
         pair_blocks: The blocks that each pair drew on. [P] uint64
@@ -170,10 +187,9 @@ def blend(
     height, width, n_channels = image.shape
     n_values = padded(n_channels)
     columns = (width + TILE - 1) // TILE
-    more = n_values > FIRST
-    buffer = aligned(n_values * PIXELS)
-    votes = aligned(planes * PIXELS)
-    passed, weights = aligned(PIXELS), aligned(PIXELS)
+    more, planes = n_values > FIRST, len(names)
+    buffer, ballot = aligned(n_values * PIXELS), aligned(planes * PIXELS)
+    passed, weights, last = aligned(PIXELS), aligned(PIXELS), aligned(PIXELS)
     table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat = table.reshape(-1)
     cut, zero = limits[LOG2_ALPHA_MIN], splat(float32(0))
@@ -186,7 +202,8 @@ def blend(
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         tile_start, tile_stop = tile_starts[tile], tile_starts[tile + 1]
         buffer[:] = 0
-        votes[:] = 0
+        ballot[:] = 0
+        last[:] = tile_stop - tile_start
         alive = _start_tile(passed, x0, y0, width, height)
         begin, end = tile_start, tile_start
         while begin < tile_stop and alive:
@@ -202,24 +219,20 @@ def blend(
                     log2_opacity = broadcast(flat, g + T_LOG2_OPACITY)
                     value_0, value_1 = broadcast(flat, g + VALUES), broadcast(flat, g + VALUES + 1)
                     value_2, value_3 = broadcast(flat, g + VALUES + 2), broadcast(flat, g + VALUES + 3)
-                    vote = np.int64(labels[pair_rows[begin + k]]) * PIXELS if planes else np.int64(0)
+                    vote = np.int64(votes[pair_rows[begin + k]]) * PIXELS if planes else np.int64(0)
                     while touched:
                         block = lowest_bit(touched)
                         bit = touched & (~touched + np.uint64(1))
                         touched ^= bit
                         column, row, at = block & 7, block >> 3, block * LANES
-                        u = u_lanes + broadcast(flat, g + U_COLUMN + column) + broadcast(flat, g + U_ROW + row)
-                        v = v_lanes + broadcast(flat, g + V_ROW + row)
-                        exponent = fma(-u, u, fma(-v, v, log2_opacity))
+                        _, _, exponent = _exponent(flat, g, column, row, u_lanes, v_lanes, log2_opacity)
                         before = load(passed, at)
                         valid = (exponent >= cut_low) & (before > zero)
                         if not any_of(valid):
                             continue
                         if unlikely(any_of(valid & (cut_high > exponent))):
-                            sure = bits_of(valid & (exponent >= cut_high))
-                            rest = bits_of(valid) ^ sure
                             i = pair_rows[begin + k]
-                            valid = mask_of(sure | lanes_at_least(rest, geometry, i, x0, y0, block, cut))
+                            valid = _settle(valid, valid & (cut_high > exponent), geometry, i, x0, y0, block, cut)
                         opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
                         weight = before * opaque
                         after = before - weight
@@ -237,6 +250,7 @@ def blend(
                                 ))  # fmt: skip
                             weight = select(ends, zero, weight)
                             after = select(ends, -before, after)
+                            store(last, at, select(ends, splat(float32(begin + k - tile_start)), load(last, at)))
                             if not any_of(after > zero):
                                 alive ^= bit
                         drawn |= bit
@@ -249,15 +263,16 @@ def blend(
                         if more:
                             store(weights, at, weight)
                         if planes:
-                            store(votes, vote + at, weight + load(votes, vote + at))
+                            store(ballot, vote + at, weight + load(ballot, vote + at))
                     if more and drawn:
                         _blend_more(drawn, n_values, weights, flat, g + VALUES, buffer)
                 pair_blocks[begin + k] = drawn
             begin = end
         tile_ends[tile] = end
         _finish_tile(
-            x0, y0, n_values, planes, buffer, votes, passed, background, limits, image, alpha, depth, transmittance, ids
-        )
+            x0, y0, names, buffer, ballot, passed, last, background, limits, image, alpha, depth,
+            transmittance, last_pairs, ids,
+        )  # fmt: skip
 
 
 @helper
@@ -299,11 +314,19 @@ def _place(channel, block):
 
 
 @helper
+def _name(names, place):
+    """The label at a place, -1 for none."""
+    return names[np.uint64(place)] if place >= 0 else np.int32(-1)
+
+
+@helper
 def _finish_tile(
-    x0, y0, n_values, planes, buffer, votes, passed, background, limits, image, alpha, depth, transmittance, ids
-):
+    x0, y0, names, buffer, ballot, passed, last, background, limits, image, alpha, depth, transmittance,
+    last_pairs, ids,
+):  # fmt: skip
     """Write the pixels of a tile."""
     height, width, n_channels = image.shape
+    planes = len(names)
     zero, one, nobody = splat(float32(0)), splat(float32(1)), splat(float32(-1))
     id_alpha_min = splat(float32(limits[ID_ALPHA_MIN]))
     one_background = len(background) == 1
@@ -312,7 +335,7 @@ def _finish_tile(
     at_alpha, at_depth, at_id = n_channels * LANES, (n_channels + 1) * LANES, (n_channels + 2) * LANES
     flat_image, flat_alpha, flat_depth = image.reshape(-1), alpha.reshape(-1), depth.reshape(-1)
     flat_end, flat_background = transmittance.reshape(-1), background.reshape(-1)
-    flat_ids = ids.reshape(-1)
+    flat_ids, flat_last = ids.reshape(-1), last_pairs.reshape(-1)
     for block in range(BLOCKS * BLOCKS):
         left, top, at = x0 + block % BLOCKS * BLOCK, y0 + block // BLOCKS * BLOCK, block * LANES
         if left >= width or top >= height:
@@ -332,9 +355,9 @@ def _finish_tile(
         if planes:
             most, winner = zero, nobody
             for plane in range(planes):
-                weight = load(votes, plane * PIXELS + at)
+                weight = load(ballot, plane * PIXELS + at)
                 wins = weight > most
-                most, winner = select(wins, weight, most), select(wins, splat(float32(plane - 1)), winner)
+                most, winner = select(wins, weight, most), select(wins, splat(float32(plane)), winner)
             store(pixels, at_id, select(covers >= id_alpha_min, winner, nobody))
         if left + BLOCK <= width and top + BLOCK <= height and three:
             pixel = top * width + left
@@ -342,8 +365,9 @@ def _finish_tile(
             store_rows(flat_depth, pixel, width, load(pixels, at_depth))
             if len(transmittance):
                 store_rows(flat_end, pixel, width, passes)
+                store_rows(flat_last, pixel, width, load(last, at))
             for lane in range(LANES if planes else 0):
-                flat_ids[pixel + lane // BLOCK * width + lane % BLOCK] = np.int32(pixels[at_id + lane])
+                flat_ids[pixel + lane // BLOCK * width + lane % BLOCK] = _name(names, pixels[at_id + lane])
             red, green, blue = load(pixels, 0), load(pixels, LANES), load(pixels, 2 * LANES)
             if not one_background:
                 behind = load_rows_of_three(flat_background, 3 * pixel, 3 * width)
@@ -358,8 +382,9 @@ def _finish_tile(
                 flat_depth[pixel] = pixels[np.uint64(at_depth) + lane]
                 if len(transmittance):
                     flat_end[pixel] = passed[np.uint64(at) + lane]
+                    flat_last[pixel] = last[np.uint64(at) + lane]
                 if planes:
-                    flat_ids[pixel] = np.int32(pixels[np.uint64(at_id) + lane])
+                    flat_ids[pixel] = _name(names, pixels[np.uint64(at_id) + lane])
                 to = pixel * np.uint64(n_channels)
                 for c in range(np.uint64(n_channels)):
                     flat_image[to + c] = pixels[c * np.uint64(LANES) + lane]
@@ -370,47 +395,52 @@ def _finish_tile(
 
 @kernel
 def blend_backward(
-    worker, workers, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, geometry, channels, depths, limits,
-    image, alpha, depth, transmittance, d_image, d_alpha, d_depth, with_geometry, slots,
+    worker, workers, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, geometry, channels, depths, background,
+    limits, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, with_geometry, slots,
 ):  # fmt: skip
     """Write the gradient slot of every pair of every workers-th tile: moments, the gradients of values, zeros.
 
-    Goes near to far like `blend`. With s_i the inner product of values and gradient, w_i the weight and h the gradient
-    of what lies behind, dL/d(alpha_i) = T_i s_i - rest_i / (1 - alpha_i), where the rest, the sum of w_j s_j over j > i
-    plus T_end h, is the known total minus the terms passed so far: one number per pixel serves all channels.
+    Goes far to near. With s_i the inner product of values and gradient, and B_i what lies behind i as if it were seen
+    through nothing, dL/d(alpha_i) = T_i (s_i - B_i) and B_{i-1} = B_i + alpha_i (s_i - B_i), beginning with the inner
+    product of background and gradient: one number per pixel serves all channels, and nothing cancels behind opaque
+    Gaussians. T_i is found again as T_{i+1} / (1 - alpha_i).
 
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
             latter two empty where there is none; with_geometry is whether more than channels want a gradient, or else
-            the moments are zero; slots [S, 16 + 8 k] the result, see `cpu_projection.SLOT_VALUES`.
+            the moments are zero; slots [S, 16 k] the result, see `cpu_projection.MOMENTS`.
     """
-    height, width, n_channels = image.shape
+    height, width, n_channels = d_image.shape
     n_values, n_slots = padded(n_channels), slots.shape[1]
     columns = (width + TILE - 1) // TILE
     more = n_values > FIRST
     gradient = aligned(n_values * PIXELS)
-    passed, rest = aligned(PIXELS), aligned(PIXELS)
+    passed, behind, last = aligned(PIXELS), aligned(PIXELS), aligned(PIXELS)
     weights, inners = aligned(PIXELS), aligned(PIXELS)
     table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat, flat_slots = table.reshape(-1), slots.reshape(-1)
-    cut, zero, one = limits[LOG2_ALPHA_MIN], splat(float32(0)), splat(float32(1))
+    cut, cap = limits[LOG2_ALPHA_MIN], limits[LOG2_ALPHA_MAX]
+    zero, one = splat(float32(0)), splat(float32(1))
     cut_low, cut_high = splat(float32(cut - CLOSE_LOG2)), splat(float32(cut + CLOSE_LOG2))
     cut_lanes, alpha_max = splat(float32(cut)), splat(float32(limits[ALPHA_MAX]))
-    cap_low = splat(float32(limits[LOG2_ALPHA_MAX] - CLOSE_LOG2))
-    cap_high = splat(float32(limits[LOG2_ALPHA_MAX] + CLOSE_LOG2))
-    end_low = splat(float32(limits[TRANSMITTANCE_MIN] * (1 - CLOSE_TRANSMITTANCE)))
-    end_high = splat(float32(limits[TRANSMITTANCE_MIN] * (1 + CLOSE_TRANSMITTANCE)))
+    cap_low, cap_high = splat(float32(cap - CLOSE_LOG2)), splat(float32(cap + CLOSE_LOG2))
     lane_x, lane_y = load(_X, 0), load(_Y, 0)
     for tile in range(worker, len(tile_starts) - 1, workers):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         tile_start, tile_end = tile_starts[tile], tile_ends[tile]
-        if tile_end > tile_start:
-            _start_tile(passed, x0, y0, width, height)
-            _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest)
-        for begin in range(tile_start, tile_end, BATCH):
+        for pair in range(tile_end, tile_starts[tile + 1]):
+            slots[pair_slots[pair]] = 0
+        if tile_end == tile_start:
+            continue
+        _start_backward(
+            x0, y0, background, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, gradient, passed,
+            behind, last,
+        )  # fmt: skip
+        for batch in range((tile_end - tile_start - 1) // BATCH, -1, -1):
+            begin = tile_start + batch * BATCH
             end = min(begin + BATCH, tile_end)
-            _load_batch(begin, end, tile_end, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
-            for k in range(end - begin):
+            _load_batch(begin, end, end, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
+            for k in range(end - begin - 1, -1, -1):
                 drawn = pair_blocks[begin + k]
                 slot = np.int64(pair_slots[begin + k]) * n_slots
                 if not drawn:
@@ -425,6 +455,7 @@ def blend_backward(
                 log2_opacity = broadcast(flat, g + T_LOG2_OPACITY)
                 value_0, value_1 = broadcast(flat, g + VALUES), broadcast(flat, g + VALUES + 1)
                 value_2, value_3 = broadcast(flat, g + VALUES + 2), broadcast(flat, g + VALUES + 3)
+                number = splat(float32(begin + k - tile_start))
                 a, au, av, auu, auv, avv = zero, zero, zero, zero, zero, zero
                 d_0, d_1, d_2, d_3 = zero, zero, zero, zero
                 touched = drawn
@@ -432,34 +463,16 @@ def blend_backward(
                     block = lowest_bit(touched)
                     touched &= touched - np.uint64(1)
                     column, row, at = block & 7, block >> 3, block * LANES
-                    u = u_lanes + broadcast(flat, g + U_COLUMN + column) + broadcast(flat, g + U_ROW + row)
-                    v = v_lanes + broadcast(flat, g + V_ROW + row)
-                    exponent = fma(-u, u, fma(-v, v, log2_opacity))
-                    before = load(passed, at)
-                    valid = (exponent >= cut_low) & (before > zero)
+                    u, v, exponent = _exponent(flat, g, column, row, u_lanes, v_lanes, log2_opacity)
+                    valid = (exponent >= cut_low) & (load(last, at) > number)
                     if unlikely(any_of(valid & (cut_high > exponent))):
-                        sure = bits_of(valid & (exponent >= cut_high))
-                        open_bits = bits_of(valid) ^ sure
                         i = pair_rows[begin + k]
-                        valid = mask_of(sure | lanes_at_least(open_bits, geometry, i, x0, y0, block, cut))
+                        valid = _settle(valid, valid & (cut_high > exponent), geometry, i, x0, y0, block, cut)
                     opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
-                    weight = before * opaque
-                    after = before - weight
-                    weight = select(valid, weight, zero)
-                    after = select(valid, after, before)
-                    ends = valid & (end_high > after)
-                    if unlikely(any_of(ends)):
-                        close = bits_of(ends & (after >= end_low))
-                        if close:
-                            ending = bits_of(ends) ^ close
-                            ends = mask_of(ending | lanes_that_finish(
-                                close, geometry, pair_rows, pair_blocks, tile_start, begin + k + 1, x0, y0, block,
-                                limits,
-                            ))  # fmt: skip
-                        weight = select(ends, zero, weight)
-                        after = select(ends, -before, after)
-                        valid = valid & ~ends
-                    store(passed, at, after)
+                    after = load(passed, at)
+                    before = select(valid, after * reciprocal(one - opaque), after)
+                    store(passed, at, before)
+                    weight = select(valid, before * opaque, zero)
                     of = at * FIRST
                     g_0, g_1 = load(gradient, of), load(gradient, of + LANES)
                     g_2, g_3 = load(gradient, of + 2 * LANES), load(gradient, of + 3 * LANES)
@@ -472,19 +485,16 @@ def blend_backward(
                     inner = fma(value_3, g_3, fma(value_2, g_2, fma(value_1, g_1, value_0 * g_0)))
                     if more:
                         inner = inner + load(inners, at)
-                    own = weight * inner
-                    remaining = load(rest, at) - own
-                    store(rest, at, remaining)
+                    seen_behind = load(behind, at)
+                    gained = inner - seen_behind
+                    store(behind, at, select(valid, fma(opaque, gained, seen_behind), seen_behind))
                     # dL/d(ln alpha); zero where the cap holds, as the capped alpha does not move
-                    capped = exponent >= cap_low
-                    if unlikely(any_of(valid & capped)):
-                        sure = bits_of(valid & (exponent >= cap_high))
-                        open_bits = bits_of(valid & capped) ^ sure
-                        if open_bits:
-                            i = pair_rows[begin + k]
-                            sure |= lanes_at_least(open_bits, geometry, i, x0, y0, block, limits[LOG2_ALPHA_MAX])
-                        valid = valid & ~mask_of(sure)
-                    to_log = select(valid, own - remaining * opaque / (one - opaque), zero)
+                    to_log = weight * gained
+                    capped = valid & (exponent >= cap_low)
+                    if unlikely(any_of(capped)):
+                        i = pair_rows[begin + k]
+                        capped = _settle(capped, capped & (cap_high > exponent), geometry, i, x0, y0, block, cap)
+                        to_log = select(capped, zero, to_log)
                     to_u, to_v = to_log * u, to_log * v
                     a, au, av = a + to_log, au + to_u, av + to_v
                     auu, auv, avv = fma(to_u, u, auu), fma(to_u, v, auv), fma(to_v, v, avv)
@@ -492,64 +502,72 @@ def blend_backward(
                 store(flat_slots, slot, sums)
                 if more:
                     _sum_more(drawn, n_values, weights, gradient, flat_slots, slot + LANES)
-        for pair in range(tile_end, tile_starts[tile + 1]):
-            slots[pair_slots[pair]] = 0
 
 
 @helper
-def _start_backward(x0, y0, image, alpha, depth, transmittance, d_image, d_alpha, d_depth, gradient, rest):
-    """Fill the tile buffers: gradient with respect to each value, and the sum over all pairs and the background."""
-    height, width, n_channels = image.shape
+def _start_backward(
+    x0, y0, background, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, gradient, passed, behind,
+    last,
+):  # fmt: skip
+    """Fill the tile buffers: gradient with respect to each value, transmittance, and what lies behind everything."""
+    height, width, n_channels = d_image.shape
     gradient[:] = 0
-    rest[:] = 0
-    flat_image, flat_gradient = image.reshape(-1), d_image.reshape(-1)
-    places = np.empty(n_channels, np.uint64)
-    zero, one, three = splat(float32(0)), splat(float32(1)), n_channels == 3
+    flat_gradient, flat_background = d_image.reshape(-1), background.reshape(-1)
+    flat_end, flat_last = transmittance.reshape(-1), last_pairs.reshape(-1)
+    flat_alpha, flat_depth = alpha.reshape(-1), depth.reshape(-1)
+    to_alpha, to_depth = d_alpha.reshape(-1), d_depth.reshape(-1)
+    zero, one = splat(float32(0)), splat(float32(1))
+    one_background = len(background) == 1
     for block in range(BLOCKS * BLOCKS):
-        left, top = x0 + block % BLOCKS * BLOCK, y0 + block // BLOCKS * BLOCK
+        left, top, at = x0 + block % BLOCKS * BLOCK, y0 + block // BLOCKS * BLOCK, block * LANES
+        store(passed, at, one)
+        store(behind, at, zero)
+        store(last, at, -one)
         if left >= width or top >= height:
             continue
-        depth_at = _place(n_channels, block)
-        if three and left + BLOCK <= width and top + BLOCK <= height:
-            pixel = top * width + left
+        pixel = top * width + left
+        if n_channels == 3 and left + BLOCK <= width and top + BLOCK <= height:
             red, green, blue = load_rows_of_three(flat_gradient, 3 * pixel, 3 * width)
-            seen_red, seen_green, seen_blue = load_rows_of_three(flat_image, 3 * pixel, 3 * width)
-            of = block * FIRST * LANES
+            of = at * FIRST
             store(gradient, of, red)
             store(gradient, of + LANES, green)
             store(gradient, of + 2 * LANES, blue)
-            remaining = fma(red, seen_red, fma(green, seen_green, blue * seen_blue))
-            to_alpha = zero
-            if d_alpha.size:
-                to_alpha = load_rows(d_alpha.reshape(-1), pixel, width)
-            if d_depth.size:
-                covers = load_rows(alpha.reshape(-1), pixel, width)
-                to_depth = select(covers > zero, load_rows(d_depth.reshape(-1), pixel, width), zero)
-                distance = load_rows(depth.reshape(-1), pixel, width)
-                per_weight = to_depth / select(covers > zero, covers, one)
+            if one_background:
+                seen = fma(broadcast(flat_background, 0), red, broadcast(flat_background, 1) * green)
+                seen = fma(broadcast(flat_background, 2), blue, seen)
+            else:
+                shown = load_rows_of_three(flat_background, 3 * pixel, 3 * width)
+                seen = fma(shown[0], red, fma(shown[1], green, shown[2] * blue))
+            if len(to_alpha):
+                seen = seen - load_rows(to_alpha, pixel, width)
+            if len(to_depth):
+                covers = load_rows(flat_alpha, pixel, width)
+                per_weight = select(covers > zero, load_rows(to_depth, pixel, width), zero)
+                per_weight = per_weight / select(covers > zero, covers, one)
                 store(gradient, of + 3 * LANES, per_weight)
-                remaining = fma(to_depth, distance, remaining)
-                to_alpha = to_alpha - per_weight * distance
-            passes = load_rows(transmittance.reshape(-1), pixel, width)
-            store(rest, block * LANES, remaining - passes * to_alpha)
+                seen = fma(per_weight, load_rows(flat_depth, pixel, width), seen)
+            store(behind, at, seen)
+            store(passed, at, load_rows(flat_end, pixel, width))
+            store(last, at, load_rows(flat_last, pixel, width))
             continue
-        for c in range(n_channels):
-            places[c] = _place(c, block)
         for y in range(top, min(top + BLOCK, height)):
             for x in range(left, min(left + BLOCK, width)):
-                lane = np.uint64((y - top) * BLOCK + x - left)
-                of = np.uint64((y * width + x) * n_channels)
-                remaining = float32(0)
+                pixel, lane = np.uint64(y * width + x), np.uint64((y - top) * BLOCK + x - left)
+                of = pixel * np.uint64(n_channels)
+                shown_at = np.uint64(0) if one_background else of
+                seen = float32(0)
                 for c in range(np.uint64(n_channels)):
-                    gradient[places[c] + lane] = flat_gradient[of + c]
-                    remaining += flat_gradient[of + c] * flat_image[of + c]
-                to_alpha = d_alpha[y, x] if d_alpha.size else float32(0)
-                if d_depth.size and alpha[y, x] > 0:
-                    per_weight = d_depth[y, x] / alpha[y, x]
-                    gradient[np.uint64(depth_at) + lane] = per_weight
-                    remaining += d_depth[y, x] * depth[y, x]
-                    to_alpha -= per_weight * depth[y, x]
-                rest[np.uint64(block * LANES) + lane] = remaining - transmittance[y, x] * to_alpha
+                    gradient[np.uint64(_place(c, block)) + lane] = flat_gradient[of + c]
+                    seen += flat_gradient[of + c] * flat_background[shown_at + c]
+                if len(to_alpha):
+                    seen -= to_alpha[pixel]
+                if len(to_depth) and flat_alpha[pixel] > 0:
+                    per_weight = to_depth[pixel] / flat_alpha[pixel]
+                    gradient[np.uint64(_place(n_channels, block)) + lane] = per_weight
+                    seen += per_weight * flat_depth[pixel]
+                behind[np.uint64(at) + lane] = seen
+                passed[np.uint64(at) + lane] = flat_end[pixel]
+                last[np.uint64(at) + lane] = flat_last[pixel]
 
 
 @helper

@@ -18,6 +18,7 @@ from .doubles import (
     DOUBLES,
     column,
     entry,
+    floor,
     log2,
     set_column,
     spread,
@@ -38,6 +39,12 @@ GEOMETRY = 8
 FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATION, ALPHA_MIN = range(14)
 ROTATION, TRANSLATION = 14, 23
 VIEW = 26
+
+# Tiles of the image: side in px, and the most along one side, so that four numbers of tiles fit into one float64.
+TILE = 32  # larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
+MOST_TILES = 8191
+BOX_DIGIT = MOST_TILES + 1
+BOX_MARGIN = 0.01  # px added to the extents, far more than rounding takes away; exact decisions come later
 
 # A slot begins with sums over pixels of A, A u, A v, A u u, A u v, A v v with A = dL/d(ln alpha) and (u, v) = L d
 # scaled as above; then come the gradients of four values, zeros to a whole vector, and the gradients of further values.
@@ -137,11 +144,27 @@ def _covariance(p, dilation):
     return xx + dilation, xy, yy + dilation, determinant
 
 
+@helper
+def _tiles(low, high, count):
+    """First and one past the last of ``count`` tiles with pixel centres between two coordinates in px."""
+    zero, side, half = spread(0.0), spread(1.0 * TILE), spread(0.5)
+    first = larger(floor((larger(low, zero) - half) / side), zero)
+    end = smaller(floor((smaller(high, count * side) - half) / side) + spread(1.0), count)
+    return first, larger(end, first)
+
+
 @kernel
-def project(worker, workers, view, means, quats, scales, opacities, geometry, depths, radii):
-    """Fill the rows of this worker: geometry [n, 8], depths [n] and radii [n] (0 where the image is not touched).
+def project(worker, workers, view, means, quats, scales, opacities, geometry, depths, boxes, radii):
+    """Fill the rows of this worker.
 
     The inputs are flat; the results have n = `padded_rows` rows, of which those too many have no radius.
+
+    Args:
+        geometry: Projected Gaussians. [n, 8]
+        depths: z in the camera frame. [n]
+        boxes: Tiles of the bounding box as digits to the base `BOX_DIGIT` of one number: one past the last row, the
+            first row, one past the last column, the first column. [n] float64
+        radii: Three standard deviations along the long axis, px, 0 where the image is not touched. [n]
     """
     count = len(opacities)
     last, blocks = count - 1, len(depths) // DOUBLES
@@ -149,7 +172,8 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
     zero, one = spread(0.0), spread(1.0)
     near, alpha_min, dilation = entry(view, NEAR), entry(view, ALPHA_MIN), entry(view, DILATION)
     log2_alpha_min, width, height = log2(alpha_min), entry(view, WIDTH), entry(view, HEIGHT)
-    whiten, half = spread(_WHITEN), spread(0.5)
+    whiten, half, margin, digit = spread(_WHITEN), spread(0.5), spread(BOX_MARGIN), spread(1.0 * BOX_DIGIT)
+    columns, rows = spread(1.0 * ((view[WIDTH] + TILE - 1) // TILE)), spread(1.0 * ((view[HEIGHT] + TILE - 1) // TILE))
     for block in range(blocks * worker // workers, blocks * (worker + 1) // workers):
         i = block * DOUBLES
         opacity = column(opacities, i, last, 1, 0)
@@ -177,6 +201,9 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         l11 = sqrt(whiten * yy / determinant)
         store_table(flat, i, (mean_x, mean_y, l11, l11 * xy / yy, sqrt(whiten / yy), log2_opacity, extent_x, extent_y))
         store_doubles(depths, i, z)
+        left, right = _tiles(mean_x - extent_x - margin, mean_x + extent_x + margin, columns)
+        top, bottom = _tiles(mean_y - extent_y - margin, mean_y + extent_y + margin, rows)
+        store_doubles(boxes, i, ((bottom * digit + top) * digit + right) * digit + left)
         middle, across = half * (xx + yy), half * (xx - yy)
         radius = spread(3.0) * sqrt(middle + sqrt(across * across + xy * xy))
         set_column(radii, i, 1, 0, select(seen, radius, zero))
@@ -235,7 +262,7 @@ def project_backward(
     last, blocks = count - 1, len(grad_norm) // DOUBLES
     sums, flat_slots = np.zeros(DOUBLES * width), slots.reshape(-1)
     end, depth_at = DOUBLES - 1, slot_place(n_channels)
-    zero, one, two, half = spread(0.0), spread(1.0), spread(2.0), spread(0.5)
+    zero, one, two = spread(0.0), spread(1.0), spread(2.0)
     dilation = entry(view, DILATION)
     for block in range(blocks * worker // workers, blocks * (worker + 1) // workers):
         i = block * DOUBLES
@@ -270,7 +297,7 @@ def project_backward(
         xx, xy, yy, determinant = _covariance(p, dilation)
         l11, l22, shift = sqrt(yy / determinant), sqrt(one / yy), xy / yy
 
-        # To the centre: L^T (sum A u, sum A v). To the covariance: L^T (sums of squares) L / 2.
+        # To the centre: L^T (sum A u, sum A v).
         root, square = spread(_UNWHITEN_ROOT), spread(_UNWHITEN)
         su, sv = column(sums, 0, end, width, 1) * root, column(sums, 0, end, width, 2) * root
         suu, suv = column(sums, 0, end, width, 3) * square, column(sums, 0, end, width, 4) * square
@@ -278,13 +305,10 @@ def project_backward(
         d_x2d = l11 * su
         d_y2d = l22 * sv - shift * d_x2d
         set_column(grad_norm, i, 1, 0, sqrt(d_x2d * d_x2d + d_y2d * d_y2d))
-        g_xx = half * l11 * l11 * suu
-        g_xy = half * l11 * l22 * suv - shift * g_xx
-        g_yy = half * l22 * l22 * svv - shift * l11 * l22 * suv + shift * shift * g_xx
 
-        # C = P P^T, P = J M, M = W R diag(s); d_m are the columns of dL/dM
-        d_a = two * (g_xx * p[0] + g_xy * p[3]), two * (g_xx * p[1] + g_xy * p[4]), two * (g_xx * p[2] + g_xy * p[5])
-        d_b = two * (g_xy * p[0] + g_yy * p[3]), two * (g_xy * p[1] + g_yy * p[4]), two * (g_xy * p[2] + g_yy * p[5])
+        # C = P P^T, P = J M, M = W R diag(s). dL/dP = L^T S L P with S the sums of squares; L P comes from the minors
+        # of P, because L^T S L expanded cancels for needles. d_m are the columns of dL/dM.
+        d_a, d_b = _to_axes(p, (suu, suv, svv), l11, l22, shift, one / yy, dilation)
         d_m0 = j00 * d_a[0], j00 * d_a[1], j00 * d_a[2]
         d_m1 = j01 * d_a[0] + j11 * d_b[0], j01 * d_a[1] + j11 * d_b[1], j01 * d_a[2] + j11 * d_b[2]
         d_m2 = j02 * d_a[0] + j12 * d_b[0], j02 * d_a[1] + j12 * d_b[1], j02 * d_a[2] + j12 * d_b[2]
@@ -327,6 +351,26 @@ def project_backward(
         set_column(d_quats, i, 4, 1, (d_qx - along * qx) * inverse_length)
         set_column(d_quats, i, 4, 2, (d_qy - along * qy) * inverse_length)
         set_column(d_quats, i, 4, 3, (d_qz - along * qz) * inverse_length)
+
+
+@helper
+def _to_axes(p, sums, l11, l22, shift, inverse_yy, dilation):
+    """L^T S L P, row by row, with S = ((suu, suv), (suv, svv))."""
+    a0, a1, a2, b0, b1, b2 = p
+    suu, suv, svv = sums
+    m01, m02, m12 = a0 * b1 - a1 * b0, a0 * b2 - a2 * b0, a1 * b2 - a2 * b1
+    scale = l11 * inverse_yy
+    w0 = scale * (dilation * a0 + b1 * m01 + b2 * m02)
+    w1 = scale * (dilation * a1 - b0 * m01 + b2 * m12)
+    w2 = scale * (dilation * a2 - b0 * m02 - b1 * m12)
+    z0, z1, z2 = l22 * b0, l22 * b1, l22 * b2
+    d_a = l11 * (suu * w0 + suv * z0), l11 * (suu * w1 + suv * z1), l11 * (suu * w2 + suv * z2)
+    d_b = (
+        l22 * (suv * w0 + svv * z0) - shift * d_a[0],
+        l22 * (suv * w1 + svv * z1) - shift * d_a[1],
+        l22 * (suv * w2 + svv * z2) - shift * d_a[2],
+    )
+    return d_a, d_b
 
 
 @helper

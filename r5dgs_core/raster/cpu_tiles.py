@@ -11,12 +11,9 @@ import math
 import numpy as np
 
 from .compile import helper, kernel, run_parts, threads
-from .cpu_projection import EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y
-
-TILE = 32  # px; larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
+from .cpu_projection import BOX_DIGIT, BOX_MARGIN, EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y, TILE
 
 _DIGIT = 11  # bits per pass of the radix sort
-_MARGIN = 0.01  # px added to the extents, far more than rounding takes away; exact decisions come later
 _WORTH_A_THREAD = 4000  # Gaussians
 
 
@@ -97,13 +94,12 @@ def _tile_range(low, high, tiles):
 
 
 @helper
-def _box(geometry, i, columns, rows):
+def _box(boxes, i):
     """Tiles that the bounding box of Gaussian i touches: first and one past the last column, the same of rows."""
-    extent_x, extent_y = geometry[i, EXTENT_X] + _MARGIN, geometry[i, EXTENT_Y] + _MARGIN
-    x, y = geometry[i, MEAN_X], geometry[i, MEAN_Y]
-    left, right = _tile_range(x - extent_x, x + extent_x, columns)
-    top, bottom = _tile_range(y - extent_y, y + extent_y, rows)
-    return left, max(left, right), top, max(top, bottom)
+    packed = np.int64(boxes[i])
+    left, packed = packed % BOX_DIGIT, packed // BOX_DIGIT
+    right, packed = packed % BOX_DIGIT, packed // BOX_DIGIT
+    return left, right, packed % BOX_DIGIT, packed // BOX_DIGIT
 
 
 @helper
@@ -119,18 +115,18 @@ def _span(geometry, i, row, columns):
     left = min(max(-tip, low), high)
     x_high = shift * right + ratio * math.sqrt(max(extent_y * extent_y - right * right, 0.0))
     x_low = shift * left - ratio * math.sqrt(max(extent_y * extent_y - left * left, 0.0))
-    first, last = _tile_range(x + x_low - _MARGIN, x + x_high + _MARGIN, columns)
+    first, last = _tile_range(x + x_low - BOX_MARGIN, x + x_high + BOX_MARGIN, columns)
     return first, max(first, last)
 
 
 @kernel
-def count_pairs(worker, workers, order, geometry, columns, rows, tile_counts, slot_counts):
+def count_pairs(worker, workers, order, boxes, geometry, columns, tile_counts, slot_counts):
     """Count the pairs of this worker's part of ``order``.
 
     Args:
         order: Rows of the visible Gaussians, near to far. [V]
-        geometry: Projected Gaussians. [N, 8]
-        columns, rows: Number of tiles.
+        boxes, geometry: Projected Gaussians, see `cpu_projection.project`. [N], [N, 8]
+        columns: Number of tiles side by side.
         tile_counts: Takes the number of pairs per tile, one row per worker. [workers, tiles] int64
         slot_counts: Takes the number of pairs of each Gaussian, from its second entry on. [N + 1] int64, or empty
     """
@@ -138,7 +134,7 @@ def count_pairs(worker, workers, order, geometry, columns, rows, tile_counts, sl
     counts[:] = 0
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
         i = order[rank]
-        left, right, top, bottom = _box(geometry, i, columns, rows)
+        left, right, top, bottom = _box(boxes, i)
         first, last, slots = left, right, 0
         trimmed = right - left > 1 and bottom - top > 1
         for row in range(top, bottom):
@@ -152,12 +148,12 @@ def count_pairs(worker, workers, order, geometry, columns, rows, tile_counts, sl
 
 
 @kernel
-def fill_pairs(worker, workers, order, geometry, columns, rows, cursors, slot_starts, pair_rows, pair_slots):
+def fill_pairs(worker, workers, order, boxes, geometry, columns, cursors, slot_starts, pair_rows, pair_slots):
     """Write the pairs that `count_pairs` counted; ``cursors`` says where those of each worker begin in each tile."""
     cursor = cursors[worker]
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
         i = order[rank]
-        left, right, top, bottom = _box(geometry, i, columns, rows)
+        left, right, top, bottom = _box(boxes, i)
         first, last = left, right
         trimmed = right - left > 1 and bottom - top > 1
         slot = slot_starts[i] if len(slot_starts) else 0
@@ -173,12 +169,12 @@ def fill_pairs(worker, workers, order, geometry, columns, rows, cursors, slot_st
                     slot += 1
 
 
-def assign_tiles(order, geometry, width, height, with_slots):
+def assign_tiles(order, boxes, geometry, width, height, with_slots):
     """List the pairs of depth-ordered Gaussians and tiles.
 
     Args:
         order: Rows of the visible Gaussians, near to far. [V] int32
-        geometry: Projected Gaussians. [N, 8]
+        boxes, geometry: Projected Gaussians, see `cpu_projection.project`. [N], [N, 8]
         width, height: Size of the image, px.
         with_slots: Whether gradients will be wanted.
 
@@ -192,12 +188,12 @@ def assign_tiles(order, geometry, width, height, with_slots):
     parts = max(1, min(threads(), len(order) // _WORTH_A_THREAD))
     slot_starts = np.zeros(len(geometry) + 1 if with_slots else 0, np.int64)
     counts = np.empty((parts, columns * rows), np.int64)
-    run_parts(count_pairs, parts, order, geometry, columns, rows, counts, slot_starts)
+    run_parts(count_pairs, parts, order, boxes, geometry, columns, counts, slot_starts)
     np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(columns * rows + 1, np.int64)
     np.cumsum(counts.sum(0), out=tile_starts[1:])
     cursors = tile_starts[:-1] + np.cumsum(counts, 0) - counts
     pair_rows = np.empty(tile_starts[-1], np.int32)
     pair_slots = np.empty(tile_starts[-1] if with_slots else 0, np.int32)
-    run_parts(fill_pairs, parts, order, geometry, columns, rows, cursors, slot_starts, pair_rows, pair_slots)
+    run_parts(fill_pairs, parts, order, boxes, geometry, columns, cursors, slot_starts, pair_rows, pair_slots)
     return tile_starts, pair_rows, pair_slots, slot_starts

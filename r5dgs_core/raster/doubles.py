@@ -134,6 +134,14 @@ def sqrt(typingctx, a):
     )
 
 
+@operation
+def floor(typingctx, a):
+    """The largest whole number that is not larger."""
+    return doubles(doubles), lambda context, builder, sig, args: call(
+        builder, f"llvm.floor.v{DOUBLES}f64", _DOUBLES, args
+    )
+
+
 _FRACTION = (1 << 52) - 1
 _ONE = 1023 << 52
 _TWO_TO_52 = 1075 << 52

@@ -201,3 +201,21 @@ def exp2(typingctx, a):
         return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _FLOATS)
 
     return lanes(lanes), emit
+
+
+@operation
+def reciprocal(typingctx, a):
+    """One over each lane, for positive normal lanes: relative error below 2e-7, in a fraction of a division's time.
+
+    Newton's method from a first guess that turns the exponent round, 12 % off at most.
+    """
+
+    def emit(context, builder, sig, args):
+        first = builder.sub(ir.Constant(_INTS, [0x7EF127EA] * LANES), builder.bitcast(args[0], _INTS))
+        guess, negative = builder.bitcast(first, _FLOATS), builder.fneg(args[0])
+        for _ in range(3):
+            error = call(builder, f"llvm.fma.v{LANES}f32", _FLOATS, [negative, guess, _number(1.0)])
+            guess = call(builder, f"llvm.fma.v{LANES}f32", _FLOATS, [guess, error, guess])
+        return guess
+
+    return lanes(lanes), emit

@@ -5,7 +5,7 @@ import pytest
 
 numba = pytest.importorskip("numba", reason="lanes live in numba kernels")
 
-from r5dgs_core.raster import lanes  # noqa: E402
+from r5dgs_core.raster import doubles, lanes, vectors  # noqa: E402
 
 
 @numba.njit
@@ -15,13 +15,28 @@ def apply_exp2(values, result):
 
 
 @numba.njit
+def apply_reciprocal(values, result):
+    for at in range(0, len(values), lanes.LANES):
+        lanes.store(result, at, lanes.reciprocal(lanes.load(values, at)))
+
+
+def test_reciprocal_is_good_to_float32_rounding():
+    values = np.concatenate([np.linspace(0.009, 1.0, 80_000), np.geomspace(1e-30, 1e30, 1600)]).astype(np.float32)
+    result = np.empty_like(values)
+    apply_reciprocal(values, result)
+    assert np.abs(result * values.astype(np.float64) - 1).max() < 2e-7
+
+
+@numba.njit
 def choose(a, b, c, result):
     x, y, z = lanes.load(a, 0), lanes.load(b, 0), lanes.load(c, 0)
     condition = (x >= y) & ~(lanes.splat(np.float32(0)) >= z) | (y > lanes.broadcast(a, 3))
-    lanes.store(result, 0, lanes.select(condition, lanes.fma(x, y, z), lanes.smaller(x, y) - lanes.larger(y, z)))
-    bits = lanes.bits_of(condition)
-    lanes.store(result, lanes.LANES, lanes.select(lanes.mask_of(bits), -x, y / x))
-    return lanes.any_of(condition), lanes.unlikely(lanes.any_of(condition)), bits
+    lanes.store(
+        result, 0, vectors.select(condition, vectors.fma(x, y, z), vectors.smaller(x, y) - vectors.larger(y, z))
+    )
+    bits = vectors.bits_of(condition)
+    lanes.store(result, lanes.LANES, vectors.select(lanes.mask_of(bits), -x, y / x))
+    return vectors.any_of(condition), vectors.unlikely(vectors.any_of(condition)), bits
 
 
 @numba.njit
@@ -41,7 +56,7 @@ def copy_blocks(image, other, result, other_result, width):
 
 @numba.njit
 def find_lowest_bit(bits):
-    return lanes.lowest_bit(bits)
+    return vectors.lowest_bit(bits)
 
 
 def test_exp2_is_good_to_float32_rounding():
@@ -100,3 +115,43 @@ def test_blocks_of_an_image_come_back_where_they_were():
 def test_the_lowest_bit_is_found(bit):
     assert find_lowest_bit(np.uint64(1 << bit)) == bit
     assert find_lowest_bit(np.uint64((1 << bit) | (1 << 63))) == bit
+
+
+@numba.njit
+def work_on_doubles(table, bases, result, rows, wide):
+    a, b = doubles.column(table, 2, 8, 3, 1), doubles.column(table, 2, 8, 3, 2)
+    root, third = doubles.sqrt(a), doubles.floor(a * doubles.spread(3.0))
+    columns = (a, b, root, third, doubles.log2(a), vectors.select(a > b, a, b), doubles.entry(bases, 1), -a)
+    doubles.store_table(rows, 1, columns)
+    doubles.set_column(result, 0, 2, 1, root)
+    low, high = doubles.widen(lanes.load(table, 0))
+    doubles.store_doubles(wide, 0, low)
+    doubles.store_doubles(wide, 8, high)
+
+
+def test_doubles_read_and_write_columns_and_tables():
+    table = np.random.default_rng(3).uniform(1e-3, 40, size=(9, 3)).astype(np.float32)
+    result, rows, wide = np.zeros((8, 2), np.float32), np.zeros((9, 8)), np.zeros(16)
+    work_on_doubles(table.ravel(), np.array([1.5, 2.5]), result.ravel(), rows.ravel(), wide)
+    taken = np.minimum(np.arange(2, 10), 8)  # the table ends one row early
+    a, b = table[taken, 1].astype(np.float64), table[taken, 2].astype(np.float64)
+    expected = [a, b, np.sqrt(a), np.floor(3 * a), np.log2(a), np.maximum(a, b), np.full(8, 2.5), -a]
+    np.testing.assert_allclose(rows[1:], np.stack(expected, 1), rtol=1e-15, atol=1e-15)
+    assert not rows[0].any() and not result[:, 0].any()
+    np.testing.assert_array_equal(result[:, 1], np.sqrt(a).astype(np.float32))
+    np.testing.assert_array_equal(wide, table.ravel()[:16])
+
+
+@numba.njit
+def logarithms(values, result):
+    for at in range(0, len(values), doubles.DOUBLES):
+        vector = doubles.column(values, at, len(values) - 1, 1, 0)
+        doubles.store_doubles(result, at, doubles.log2(vector))
+
+
+def test_log2_is_good_to_float64_rounding():
+    values = np.concatenate([np.geomspace(1e-300, 1e300, 8000), np.linspace(0.5, 2, 8000), [1.0, 2.0, 0.5, 1024.0] * 2])
+    result = np.empty_like(values)
+    logarithms(values, result)
+    np.testing.assert_allclose(result, np.log2(values), rtol=4e-16, atol=4e-16)
+    np.testing.assert_array_equal(result[-4:], [0, 1, -1, 10])
