@@ -190,6 +190,7 @@ def blend(
     more, planes = n_values > FIRST, len(names)
     buffer, ballot = aligned(n_values * PIXELS), aligned(planes * PIXELS)
     passed, weights, last = aligned(PIXELS), aligned(PIXELS), aligned(PIXELS)
+    covered = aligned(PIXELS)  # sum of weights: unlike 1 - T it is exact where little is covered
     table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat = table.reshape(-1)
     cut, zero = limits[LOG2_ALPHA_MIN], splat(float32(0))
@@ -203,6 +204,7 @@ def blend(
         tile_start, tile_stop = tile_starts[tile], tile_starts[tile + 1]
         buffer[:] = 0
         ballot[:] = 0
+        covered[:] = 0
         last[:] = tile_stop - tile_start
         alive = _start_tile(passed, x0, y0, width, height)
         begin, end = tile_start, tile_start
@@ -255,6 +257,7 @@ def blend(
                                 alive ^= bit
                         drawn |= bit
                         store(passed, at, after)
+                        store(covered, at, weight + load(covered, at))
                         to = at * FIRST
                         store(buffer, to, fma(weight, value_0, load(buffer, to)))
                         store(buffer, to + LANES, fma(weight, value_1, load(buffer, to + LANES)))
@@ -270,7 +273,7 @@ def blend(
             begin = end
         tile_ends[tile] = end
         _finish_tile(
-            x0, y0, names, buffer, ballot, passed, last, background, limits, image, alpha, depth,
+            x0, y0, names, buffer, ballot, passed, covered, last, background, limits, image, alpha, depth,
             transmittance, last_pairs, ids,
         )  # fmt: skip
 
@@ -321,7 +324,7 @@ def _name(names, place):
 
 @helper
 def _finish_tile(
-    x0, y0, names, buffer, ballot, passed, last, background, limits, image, alpha, depth, transmittance,
+    x0, y0, names, buffer, ballot, passed, covered, last, background, limits, image, alpha, depth, transmittance,
     last_pairs, ids,
 ):  # fmt: skip
     """Write the pixels of a tile."""
@@ -343,7 +346,7 @@ def _finish_tile(
         passes = load(passed, at)
         passes = larger(passes, -passes)
         store(passed, at, passes)
-        covers = one - passes
+        covers = load(covered, at)
         store(pixels, at_alpha, covers)
         distance = load(buffer, _place(n_channels, block)) / select(covers > zero, covers, one)
         store(pixels, at_depth, select(covers > zero, distance, zero))
