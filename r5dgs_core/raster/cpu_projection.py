@@ -182,6 +182,7 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         seen = (opacity >= alpha_min) & (z > near)
         if not any_of(seen):
             set_column(radii, i, 1, 0, zero)
+            store_doubles(depths, i, one)
             continue
         x, y, z = _camera_row(view, 0, a, b, c), _camera_row(view, 1, a, b, c), select(seen, z, one)
         inverse_z = one / z

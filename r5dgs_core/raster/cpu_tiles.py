@@ -19,51 +19,74 @@ _WORTH_A_THREAD = 4000  # Gaussians
 
 def sort_by_depth(depths, radii):
     """Rows with a radius, by increasing depth (float64), rows of equal depth in their order. -> [V] int32"""
-    return sort_bits(depths.astype(np.float32).view(np.uint32), depths, radii)
+    bits = depths.astype(np.float32).view(np.uint32)
+    parts = max(1, min(threads(), len(bits) // _WORTH_A_THREAD))
+    # Every part sorts a range of depths; where the ranges end does not change the result.
+    bounds = np.zeros(parts + 1, np.int64)
+    bounds[-1] = 1 << 32
+    if parts > 1:
+        step = max(1, len(bits) // 1024)
+        sample = np.append(np.sort(bits[::step][radii[::step] > 0]), bounds[-1])
+        bounds[1:-1] = sample[np.arange(1, parts) * len(sample) // parts]
+    order, counts = np.empty(len(bits), np.int32), np.empty(parts, np.int64)
+    run_parts(sort_part, parts, bits, depths, radii, bounds, order, counts)
+    return order[: counts.sum()]
 
 
 @kernel
-def sort_bits(bits, depths, radii):
-    """Rows with a radius, by increasing depth, from the bits of their depths in float32.
+def sort_part(worker, workers, bits, depths, radii, bounds, order, counts):
+    """Write the rows with a radius whose depths lie in this worker's range to their places in ``order``.
 
-    The bits of positive floats are ordered like the floats: a radix sort, least digit first, over the digits that
-    differ at all; then runs that are equal in float32 are ordered by their float64 depths.
+    The bits of positive floats are ordered like the floats: a radix sort of the depths in float32, least digit first,
+    over the digits that differ at all; then runs that are equal in float32 are ordered by their float64 depths.
+
+    Args:
+        bits: Of the depths in float32. [n] uint32
+        depths, radii: See `cpu_projection.project`. [n]
+        bounds: Where the ranges of bits begin, and the end of the last. [workers + 1] int64
+        order: The result; the caller cuts it to the sum of ``counts``. [n] int32
+        counts: Takes the number of rows of each worker. [workers] int64
     """
-    count, least, most = 0, np.uint32(0xFFFFFFFF), np.uint32(0)
-    for i in range(len(depths)):
+    low, high = bounds[worker], bounds[worker + 1]
+    before, count, least, most = 0, 0, high, low
+    for i in range(np.uint64(len(bits))):
         if radii[i] > 0:
-            count += 1
-            least, most = min(least, bits[i]), max(most, bits[i])
+            depth = np.int64(bits[i])
+            before += depth < low
+            if low <= depth < high:
+                count += 1
+                least, most = min(least, depth), max(most, depth)
     items, spare = np.empty(count, np.uint64), np.empty(count, np.uint64)  # key above, row below
-    count = 0
-    for i in range(len(depths)):
-        if radii[i] > 0:
-            items[count] = np.uint64(bits[i] - least) << np.uint64(32) | np.uint64(i)
-            count += 1
+    at = 0
+    for i in range(np.uint64(len(bits))):
+        depth = np.int64(bits[i])
+        if radii[i] > 0 and low <= depth < high:
+            items[at] = np.uint64(depth - least) << np.uint64(32) | i
+            at += 1
     starts = np.empty((1 << _DIGIT) + 1, np.int64)
     digit_mask, shift = np.uint64((1 << _DIGIT) - 1), np.uint64(32)
     while count and np.uint64(most - least) >> (shift - np.uint64(32)):
         starts[:] = 0
-        for k in range(count):
+        for k in range(np.uint64(count)):
             starts[(items[k] >> shift & digit_mask) + np.uint64(1)] += 1
         for digit in range(1 << _DIGIT):
             starts[digit + 1] += starts[digit]
-        for k in range(count):
+        for k in range(np.uint64(count)):
             digit = items[k] >> shift & digit_mask
-            spare[starts[digit]] = items[k]
+            spare[np.uint64(starts[digit])] = items[k]
             starts[digit] += 1
         items, spare = spare, items
         shift += np.uint64(_DIGIT)
-    order = np.empty(count, np.int32)
-    for k in range(count):
-        order[k] = np.int32(items[k] & np.uint64(0xFFFFFFFF))
+    part = order[before : before + count]
+    for k in range(np.uint64(count)):
+        part[k] = np.int32(items[k] & np.uint64(0xFFFFFFFF))
     begin = 0
     for k in range(1, count + 1):
         if k == count or items[k] >> np.uint64(32) != items[begin] >> np.uint64(32):
             if k - begin > 1:
-                _sort_run(order, begin, k, depths)
+                _sort_run(part, begin, k, depths)
             begin = k
-    return order
+    counts[worker] = count
 
 
 @helper

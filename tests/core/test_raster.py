@@ -200,6 +200,23 @@ def test_results_do_not_depend_on_the_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_are_sorted_by_depth_and_then_by_row_on_any_number_of_threads(seed):
+    random = np.random.default_rng(seed)
+    depths = 1 + random.integers(0, 40, 30_000) * (2.0**-20 if seed else 1.0)
+    depths += random.integers(0, 3, 30_000) * 1e-12  # equal in float32
+    radii = random.integers(0, 2, 30_000).astype(np.float32)
+    expected = np.argsort(depths, kind="stable")
+    expected = expected[radii[expected] > 0]
+    before = compilation.threads()
+    try:
+        for count in (1, 2, 3):
+            compilation.set_threads(count)
+            np.testing.assert_array_equal(cpu_tiles.sort_by_depth(depths, radii), expected)
+    finally:
+        compilation.set_threads(before)
+
+
 def test_two_python_threads_may_draw_at_once():
     scene, view = splats(5000, 3, seed=11, radius_px=4.0), camera(150, 130, 160.0)
     expected = draw(scene, view, "cpu")[1]
@@ -218,7 +235,7 @@ def test_every_kernel_is_compiled_once_for_all_inputs():
     for n_channels, background, labels in ((1, None, None), (3, torch.rand(3), torch.arange(50)), (19, None, None)):
         draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
     kernels = [
-        *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_bits),
+        *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_part),
         *(cpu_tiles.count_pairs, cpu_tiles.fill_pairs, cpu_blending.blend, cpu_blending.blend_backward),
     ]
     assert {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels} == {
