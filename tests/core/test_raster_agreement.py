@@ -1,7 +1,7 @@
 """The `cpu` backend draws random scenes as the float64 reference does, whatever they hold.
 
 Hypothesis chooses what kind of scene it is; its numbers come from a seed, rounded to float32 so that both precisions
-see the same scene. Bars: 2e-5 for what is seen, 1e-4 of the largest entry for gradients.
+see the same scene.
 """
 
 import numpy as np
@@ -119,7 +119,7 @@ def _opacities(random, n, kind):
 @settings(max_examples=100 // len(PLACES), derandomize=True, deadline=None)
 def test_cpu_draws_any_scene_as_the_reference_does(place, data):
     inputs, view, background, labels = data.draw(scenes(place))
-    found, _ = assert_within_bars(inputs, view, background, labels=labels)
+    found, _ = assert_within_bars(inputs, view, background, upstreams=3, labels=labels)
     if labels is not None:
         assert_ids_are_heaviest(inputs, view, labels, found)
 
