@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,10 +78,7 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, means, quats, scales, opacities, channels, background, camera, labels, settings, stats):
         arrays = [t.detach().contiguous().numpy() for t in (means, quats, scales, opacities, channels)]
         n, n_channels = channels.shape
-        if background is None:
-            behind = np.zeros((1, n_channels), np.float32)
-        else:
-            behind = background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
+        behind = pack_background(background, n_channels)
         view = pack_view(camera, settings)
         radii = np.empty(cpu_projection.padded_rows(n), np.float32)
         with_state = any(ctx.needs_input_grad)
@@ -125,26 +123,21 @@ class _Rasterize(torch.autograd.Function):
         return (*wanted, d_background, None, None, None, None)
 
 
-def _forward(arrays, background, camera, labels, settings, view, radii, with_state):
-    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state or None, image, alpha, depth and ids."""
-    means, quats, scales, opacities, channels = arrays
-    n, n_channels = channels.shape
-    height, width = camera.height, camera.width
-    geometry = _aligned((len(radii), cpu_projection.GEOMETRY), np.float64)
-    depths, boxes = np.empty(len(radii)), np.empty(len(radii))
+def project(
+    view: np.ndarray, arrays: Sequence[np.ndarray], geometry: np.ndarray, depths: np.ndarray, boxes: np.ndarray,
+    radii: np.ndarray,
+) -> None:  # fmt: skip
+    """Project means, quats, scales and opacities; the results are those of `cpu_projection.project`."""
+    means, quats, scales, opacities = arrays
     run(
-        cpu_projection.project, n // _WORTH_A_THREAD,
-        view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, geometry, depths, boxes,
-        radii,
+        cpu_projection.project, len(opacities) // _WORTH_A_THREAD,
+        view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, geometry, depths, boxes, radii,
     )  # fmt: skip
-    order = cpu_tiles.sort_by_depth(depths, radii)
-    tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
-        order, boxes, geometry, width, height, with_state
-    )
-    names, votes = np.empty(0, np.int32), np.empty(0, np.int32)
-    if labels is not None:
-        names, votes = _vote(labels.detach().numpy())
-    limits = np.array(
+
+
+def pack_limits(settings: RasterSettings) -> np.ndarray:
+    """The thresholds in the order of the constants in `cpu_exact`. [5] float64"""
+    return np.array(
         [
             math.log2(settings.alpha_min),
             math.log2(settings.alpha_max),
@@ -153,25 +146,16 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
             settings.id_alpha_min,
         ]
     )
-    image = np.empty((height, width, n_channels), np.float32)
-    alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    ids = np.full((height, width) if labels is not None else (0, 0), -1, np.int32)
-    transmittance, last_pairs = (np.empty((height, width) if with_state else (0, 0), np.float32) for _ in range(2))
-    tile_ends = np.empty(len(tile_starts) - 1, np.int64)
-    pair_blocks = np.empty(len(pair_rows), np.uint64)
-    run(
-        cpu_blending.blend, len(tile_ends) // 2,
-        tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image, alpha, depth,
-        transmittance, last_pairs, ids, tile_ends, pair_blocks,
-    )  # fmt: skip
-    state = _Pass(
-        view, limits, geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts,
-        transmittance, last_pairs, background,
-    )  # fmt: skip
-    return state if with_state else None, image, alpha, depth, ids
 
 
-def _vote(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pack_background(background: torch.Tensor | None, n_channels: int) -> np.ndarray:
+    """One row for all pixels [1, D], or one for each [H * W, D]; float32."""
+    if background is None:
+        return np.zeros((1, n_channels), np.float32)
+    return background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
+
+
+def pack_labels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The labels that occur, rising, all negative ones as -1 [L], and the place of each Gaussian's among them [N]."""
     labels = np.ascontiguousarray(labels)
     if len(labels) and labels.max() < _FEW_LABELS and labels.min() >= -1:  # nothing to find: as many planes as numbers
@@ -180,7 +164,7 @@ def _vote(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return names.astype(np.int32), places.astype(np.int32)
 
 
-def _aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
+def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
     """An array whose rows of 64 bytes each lie in one cache line."""
     size = shape[0] * shape[1] * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
@@ -188,11 +172,44 @@ def _aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
     return memory[skip : skip + size].view(dtype).reshape(shape)
 
 
+def _forward(arrays, background, camera, labels, settings, view, radii, with_state):
+    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state or None, image, alpha, depth and ids."""
+    *shapes, channels = arrays
+    height, width = camera.height, camera.width
+    geometry = aligned((len(radii), cpu_projection.GEOMETRY), np.float64)
+    depths, boxes = np.empty(len(radii)), np.empty(len(radii))
+    project(view, shapes, geometry, depths, boxes, radii)
+    order = cpu_tiles.sort_by_depth(depths, radii)
+    tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
+        order, boxes, geometry, width, height, with_state
+    )
+    names, votes = np.empty(0, np.int32), np.empty(0, np.int32)
+    if labels is not None:
+        names, votes = pack_labels(labels.detach().numpy())
+    limits = pack_limits(settings)
+    image = np.empty((height, width, channels.shape[1]), np.float32)
+    alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    ids = np.full((height, width) if labels is not None else (0, 0), -1, np.int32)
+    transmittance, last_pairs = (np.empty((height, width) if with_state else (0, 0), np.float32) for _ in range(2))
+    tiles = np.arange(len(tile_starts) - 1)
+    tile_ends, pair_blocks = np.empty(len(tiles), np.int64), np.empty(len(pair_rows), np.uint64)
+    run(
+        cpu_blending.blend, len(tiles) // 2,
+        tiles, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image, alpha,
+        depth, transmittance, last_pairs, ids, tile_ends, pair_blocks,
+    )  # fmt: skip
+    state = _Pass(
+        view, limits, geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts,
+        transmittance, last_pairs, background,
+    )  # fmt: skip
+    return state if with_state else None, image, alpha, depth, ids
+
+
 def _backward(state: _Pass, arrays, d_image, d_alpha, d_depth, with_geometry):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
     means, quats, scales, opacities, channels, _, alpha, depth = arrays
     n, n_channels = channels.shape
-    slots = _aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
+    slots = aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
     run(
         cpu_blending.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_rows, state.pair_slots, state.pair_blocks, state.geometry,

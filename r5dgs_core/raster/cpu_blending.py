@@ -164,13 +164,14 @@ def _start_tile(passed, x0, y0, width, height):
 
 @kernel
 def blend(
-    worker, workers, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image,
+    worker, workers, tiles, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image,
     alpha, depth, transmittance, last_pairs, ids, tile_ends, pair_blocks,
 ):  # fmt: skip
-    """Blend every workers-th tile.
+    """Blend every workers-th of some tiles; the pixels of others stay as they are.
 
     Args:
-        tile_starts, pair_rows: Pairs, see `cpu_tiles`.
+        tiles: Which tiles, numbered row by row. [K]
+        tile_starts, pair_rows: Their pairs, see `cpu_tiles`. [K + 1], [P]
         geometry: Projected Gaussians. [N, 8] float64
         channels, depths: What is blended. [N, D], [N]
         votes: Place of each Gaussian's label among ``names``. [N] int32, or empty
@@ -181,7 +182,7 @@ def blend(
         transmittance: Its end, for the backward pass. [H, W], or empty
         last_pairs: Pairs of the tile that a pixel saw before it was finished, likewise. [H, W] float32, or empty
         ids: Label of each pixel. [H, W], or empty
-        tile_ends: One past the last pair that had a pixel left to draw on. [tiles]
+        tile_ends: One past the last pair that had a pixel left to draw on. [K]
         pair_blocks: The blocks that each pair drew on. [P] uint64
     """
     height, width, n_channels = image.shape
@@ -199,9 +200,9 @@ def blend(
     end_low = splat(float32(limits[TRANSMITTANCE_MIN] * (1 - CLOSE_TRANSMITTANCE)))
     end_high = splat(float32(limits[TRANSMITTANCE_MIN] * (1 + CLOSE_TRANSMITTANCE)))
     lane_x, lane_y = load(_X, 0), load(_Y, 0)
-    for tile in range(worker, len(tile_starts) - 1, workers):
-        x0, y0 = tile % columns * TILE, tile // columns * TILE
-        tile_start, tile_stop = tile_starts[tile], tile_starts[tile + 1]
+    for place in range(worker, len(tiles), workers):
+        x0, y0 = tiles[place] % columns * TILE, tiles[place] // columns * TILE
+        tile_start, tile_stop = tile_starts[place], tile_starts[place + 1]
         buffer[:] = 0
         ballot[:] = 0
         covered[:] = 0
@@ -271,7 +272,7 @@ def blend(
                         _blend_more(drawn, n_values, weights, flat, g + VALUES, buffer)
                 pair_blocks[begin + k] = drawn
             begin = end
-        tile_ends[tile] = end
+        tile_ends[place] = end
         _finish_tile(
             x0, y0, names, buffer, ballot, passed, covered, last, background, limits, image, alpha, depth,
             transmittance, last_pairs, ids,

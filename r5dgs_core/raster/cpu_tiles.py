@@ -220,3 +220,32 @@ def assign_tiles(order, boxes, geometry, width, height, with_slots):
     pair_slots = np.empty(tile_starts[-1] if with_slots else 0, np.int32)
     run_parts(fill_pairs, parts, order, boxes, geometry, columns, cursors, slot_starts, pair_rows, pair_slots)
     return tile_starts, pair_rows, pair_slots, slot_starts
+
+
+@kernel
+def merge_pairs(worker, workers, depths, spans, rows, other_spans, other_rows, merged_starts, merged_rows):
+    """Merge two lists of pairs, tile by tile, both near to far.
+
+    Of two rows at the same depth the lower one is nearer, as in `sort_by_depth`.
+
+    Args:
+        depths: Of all rows. [n]
+        spans, rows: First and one past the last pair of each tile, and the rows of the pairs. [K, 2], [P]
+        other_spans, other_rows: The same of the other list.
+        merged_starts: Where those of each tile go. [K + 1]
+        merged_rows: The result.
+    """
+    tiles = len(merged_starts) - 1
+    for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
+        a, a_end, b, b_end = spans[tile, 0], spans[tile, 1], other_spans[tile, 0], other_spans[tile, 1]
+        for at in range(merged_starts[tile], merged_starts[tile + 1]):
+            first = b == b_end
+            if a < a_end and b < b_end:
+                row, other = rows[a], other_rows[b]
+                first = depths[row] < depths[other] or (depths[row] == depths[other] and row < other)
+            if first:
+                merged_rows[at] = rows[a]
+                a += 1
+            else:
+                merged_rows[at] = other_rows[b]
+                b += 1

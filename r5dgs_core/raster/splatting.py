@@ -61,7 +61,7 @@ def rasterize_splats(
     Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
     """
     settings = settings or RasterSettings()
-    _check(means, quats, scales, opacities, channels, camera, background, labels)
+    check_splats(means, quats, scales, opacities, channels, camera, background, labels)
     chosen = choose_backend(backend, means)
     if chosen == "reference":
         from . import reference as implementation
@@ -198,7 +198,7 @@ def _warn_once(message: str) -> None:
     log.warning(message)
 
 
-def _check(means, quats, scales, opacities, channels, camera, background, labels) -> None:
+def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
     """Raise ValueError naming the first input whose shape, dtype or content cannot be drawn."""
     n = len(means)
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
