@@ -85,7 +85,8 @@ def main(arguments: list[str] | None = None) -> None:
         scene = CASES[name]()
         errors = compare(draw(scene, options.backend), draw(scene, "reference"))
         worst = max(errors.gradients, key=lambda key: errors.gradients[key])
-        figures = f"{errors.image:.0e} | {errors.depth:.0e} | {errors.gradients[worst]:.0e}"
+        numbers = (errors.image, errors.depth, errors.gradients[worst])
+        figures = " | ".join(f"{number:.0e}" if number else "0" for number in numbers)
         print(f"| {name} | {scene.gives} | {figures} | {worst} |", flush=True)
 
 
