@@ -159,14 +159,14 @@ def render_frame(
     if isinstance(background, str):
         if background != "scene":
             raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")
-        background = _behind(scene, camera)
+        background = behind(scene, camera)
     with torch.no_grad():
         return rasterize(
-            _Gaussians(posed),
+            PosedGaussians(posed),
             camera,
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
-            None if background is None else _tensor(background),
-            colors=_tensor(colors(posed, camera)),
+            None if background is None else tensor(background),
+            colors=tensor(colors(posed, camera)),
             settings=settings or RasterSettings(near_plane=scene.near_plane),
             backend=backend,
         )
@@ -188,17 +188,17 @@ def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
         return rgb
     with torch.no_grad():
         seen = harmonics.seen_colors(
-            _tensor(posed.means),
-            _tensor(posed.sh),
+            tensor(posed.means),
+            tensor(posed.sh),
             camera.center,
             view_maps=posed.view_maps,
             pose_ids=posed.pose_ids,
-            factor=None if factor is None else _tensor(factor),
+            factor=None if factor is None else tensor(factor),
         )
     return seen.numpy()
 
 
-def _behind(scene: Scene, camera: Camera) -> np.ndarray:
+def behind(scene: Scene, camera: Camera) -> np.ndarray:
     """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
     image = sky(scene, camera)
     return image[0, 0] if len(scene.background_sh) == 1 else image
@@ -209,23 +209,24 @@ def to_numpy(value: Any, dtype: type) -> np.ndarray:
     return value.detach().cpu().numpy().astype(dtype, copy=False)
 
 
-class _Gaussians:
-    """What `rasterize` reads of the posed Gaussians, beside their colours.
+class PosedGaussians:
+    """What the rasterizer reads of a posed scene, beside its colours.
 
     numpy computes it, like everything else of a frame before the kernels: torch would wake its threads for that, and
     they get in the way of ours.
     """
 
     def __init__(self, posed: PosedScene):
-        self.means = _tensor(posed.means)
-        self.quats = _tensor(posed.quats)
-        self.scales = _tensor(np.exp(posed.log_scales))
+        self.means = tensor(posed.means)
+        self.quats = tensor(posed.quats)
+        self.scales = tensor(np.exp(posed.log_scales))
         with np.errstate(over="ignore"):
-            self.opacities = _tensor(1 / (1 + np.exp(-posed.opacity_logits)))
+            self.opacities = tensor(1 / (1 + np.exp(-posed.opacity_logits)))
         self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
 
 
-def _tensor(array: np.ndarray) -> torch.Tensor:
+def tensor(array: np.ndarray) -> torch.Tensor:
+    """A float32 tensor of an array, which stays as it is."""
     array = np.ascontiguousarray(array, np.float32)
     return torch.from_numpy(array if array.flags.writeable else array.copy())
 
