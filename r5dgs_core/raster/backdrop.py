@@ -57,7 +57,7 @@ class Backdrop:
             self._labels[: len(means)] = _array(labels)
         cpu.project(self._view, shapes, self._geometry, self._depths, self._boxes, self._radii)
         self._starts, self._rows = self._assign(0)
-        self._names, self._votes = self._vote()
+        self._names, self._votes = cpu.pack_labels(self._labels)
         size = (camera.height, camera.width)
         self._image = np.empty((*size, channels.shape[1]), np.float32)
         self._alpha, self._depth = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -93,7 +93,7 @@ class Backdrop:
             new = _array(labels)
             if not np.array_equal(self._labels[begin : begin + len(new)], new):
                 self._labels[begin : begin + len(new)] = new
-                self._names, self._votes = self._vote()
+                self._names, self._votes = cpu.pack_labels(self._labels)
         moving_starts, moving_rows = self._assign(begin, begin + rows)
         touched = np.flatnonzero(np.diff(moving_starts))
         starts, merged = self._merge(touched, moving_starts, moving_rows)
@@ -119,7 +119,7 @@ class Backdrop:
         self._radii, self._channels = longer(self._radii, 0), longer(self._channels, 0)
         if self._labels is not None:
             self._labels = longer(self._labels, -1)
-            self._names, self._votes = self._vote()
+            self._names, self._votes = cpu.pack_labels(self._labels)
 
     def _assign(self, begin: int, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of some rows: where those of each tile begin, and the rows."""
@@ -143,11 +143,6 @@ class Backdrop:
             self._depths, spans[0], rows[0], spans[1], rows[1], starts, merged,
         )  # fmt: skip
         return starts, merged
-
-    def _vote(self) -> tuple[np.ndarray, np.ndarray]:
-        if self._labels is None:
-            return np.empty(0, np.int32), np.empty(0, np.int32)
-        return cpu.pack_labels(self._labels)
 
     def _blend(self, tiles, starts, rows, results) -> None:
         image, alpha, depth, ids = results

@@ -3,11 +3,16 @@
 A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work and releases the interpreter
 lock. Plain Python threads run the shares: compiling takes a fraction of what numba's own parallel loops take, calls
 from several threads at once are safe, and results cannot depend on a threading layer.
+
+What one process compiles the next one loads. The first compilation of a process is told by a warning, or as `telling`
+says.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import hashlib
 import logging
 import os
@@ -15,12 +20,14 @@ import stat
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import event as numba_events
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +43,10 @@ def kernel(function) -> Any:
         folder = _cache_folder(before)
         numba.config.CACHE_DIR = folder or before  # type: ignore[attr-defined]
         try:
-            compiled = numba.njit(nogil=True, cache=folder is not None, error_model="numpy", no_cfunc_wrapper=True)
-            return compiled(function)
+            compile = numba.njit(nogil=True, cache=folder is not None, error_model="numpy", no_cfunc_wrapper=True)
+            compiled = compile(function)
+            _watch.kernels.add(compiled)
+            return compiled
         finally:
             numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
 
@@ -45,6 +54,61 @@ def kernel(function) -> Any:
 def helper(function) -> Any:
     """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own."""
     return numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+
+
+class _Watch(numba_events.Listener):
+    """Sees every compilation by numba, one at a time, as numba's own lock is held; code from its cache passes unseen.
+
+    The collector of garbage rests meanwhile: looking through all that the compiler has made, again and again, would
+    take a twelfth of the time.
+    """
+
+    def __init__(self) -> None:
+        self.kernels: weakref.WeakSet = weakref.WeakSet()
+        self.compiled = 0
+        self.tell: Callable[[str], None] | None = None
+        self._depth = 0
+        self._collects = False
+
+    def on_start(self, event) -> None:
+        ours = event.data["dispatcher"] in self.kernels
+        if ours or self._depth:
+            self._depth += 1
+        if self._depth != 1:
+            return
+        self.compiled += 1
+        if self.compiled == 1:
+            (self.tell or log.warning)(NOTICE if _cache_folder(_chosen()) else NOTICE_UNKEPT)
+        self._collects = gc.isenabled()
+        gc.disable()
+
+    def on_end(self, event) -> None:
+        self._depth -= self._depth > 0
+        if self._depth == 0 and self._collects:
+            self._collects = False
+            gc.enable()
+
+
+_watch = _Watch()
+numba_events.register("numba:compile", _watch)
+
+
+def compiled() -> int:
+    """Number of kernels that this process has compiled so far, as no earlier one had."""
+    return _watch.compiled
+
+
+@contextlib.contextmanager
+def telling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell of the process's first compilation by calling ``tell`` with a line of text, in place of a warning in the log.
+
+    Whoever shows progress wraps its work in this; ``tell`` may be called from any thread.
+    """
+    before, _watch.tell = _watch.tell, tell
+    try:
+        yield
+    finally:
+        _watch.tell = before
 
 
 def set_threads(count: int) -> None:

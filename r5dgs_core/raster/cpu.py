@@ -17,6 +17,7 @@ from .settings import RasterSettings, RasterStats, SplatImage
 
 _WORTH_A_THREAD = 2000  # Gaussians; fewer are projected before a second thread would wake up
 _FEW_LABELS = 16  # labels below this are not looked through for gaps
+_MOST_LABEL = 1 << 24  # labels below this are whole numbers in float32
 _EMPTY = np.empty((0, 0), np.float32)
 
 
@@ -155,13 +156,22 @@ def pack_background(background: torch.Tensor | None, n_channels: int) -> np.ndar
     return background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
 
 
-def pack_labels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The labels that occur, rising, all negative ones as -1 [L], and the place of each Gaussian's among them [N]."""
+def pack_labels(labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The labels that occur, rising, all negative ones as -1 [L] float32, and the place of each Gaussian's in that [N].
+
+    Raises:
+        ValueError: A label is too large to be counted.
+    """
+    if labels is None:
+        return np.empty(0, np.float32), np.empty(0, np.int32)
     labels = np.ascontiguousarray(labels)
-    if len(labels) and labels.max() < _FEW_LABELS and labels.min() >= -1:  # nothing to find: as many planes as numbers
-        return np.arange(-1, labels.max() + 1, dtype=np.int32), (labels + 1).astype(np.int32)
+    most = labels.max(initial=-1)
+    if most >= _MOST_LABEL:
+        raise ValueError(f"labels: expected at most {_MOST_LABEL - 1}, found {most} at index {labels.argmax()}")
+    if most < _FEW_LABELS and labels.min(initial=-1) >= -1:  # nothing to find: as many planes as numbers
+        return np.arange(-1, most + 1, dtype=np.float32), (labels + 1).astype(np.int32)
     names, places = np.unique(np.maximum(labels, -1), return_inverse=True)
-    return names.astype(np.int32), places.astype(np.int32)
+    return names.astype(np.float32), places.astype(np.int32)
 
 
 def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
@@ -183,9 +193,7 @@ def _forward(arrays, background, camera, labels, settings, view, radii, with_sta
     tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
         order, boxes, geometry, width, height, with_state
     )
-    names, votes = np.empty(0, np.int32), np.empty(0, np.int32)
-    if labels is not None:
-        names, votes = pack_labels(labels.detach().numpy())
+    names, votes = pack_labels(None if labels is None else labels.detach().numpy())
     limits = pack_limits(settings)
     image = np.empty((height, width, channels.shape[1]), np.float32)
     alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)

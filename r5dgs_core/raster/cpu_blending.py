@@ -47,6 +47,7 @@ from .lanes import (
     store,
     store_rows,
     store_rows_of_three,
+    store_whole_rows,
     totals,
 )
 from .vectors import any_of, bits_of, fma, larger, lowest_bit, prefetch, select, smaller, unlikely
@@ -83,7 +84,7 @@ def aligned(count):
 
 
 @helper
-def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths, table, blocks):
+def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths, votes, table, blocks):
     """Copy pairs begin : end of a tile to rows of ``table``; ``blocks`` takes the blocks that their box touches.
 
     What the pairs up to ``stop`` need is asked for a few pairs ahead, as it lies anywhere in memory.
@@ -99,6 +100,8 @@ def _load_batch(begin, end, stop, x0, y0, pair_rows, geometry, channels, depths,
             prefetch(flat_geometry, coming * GEOMETRY)
             prefetch(flat_channels, coming * n_channels)
             prefetch(depths, coming)
+            if len(votes):
+                prefetch(votes, coming)
         i = np.uint64(pair_rows[begin + k])
         l11, l12, l22 = geometry[i, L11], geometry[i, L12], geometry[i, L22]
         dx, dy = middle_x - geometry[i, MEAN_X], middle_y - geometry[i, MEAN_Y]
@@ -175,7 +178,7 @@ def blend(
         geometry: Projected Gaussians. [N, 8] float64
         channels, depths: What is blended. [N, D], [N]
         votes: Place of each Gaussian's label among ``names``. [N] int32, or empty
-        names: The labels, rising. [L] int32, or empty
+        names: The labels, rising, -1 or more. [L] float32, or empty
         background: One row per pixel, or one for all. [H * W or 1, D]
         limits: Thresholds. [5] float64
         image, alpha, depth: Results. [H, W, D], [H, W], [H, W]
@@ -211,7 +214,7 @@ def blend(
         begin, end = tile_start, tile_start
         while begin < tile_stop and alive:
             end = min(begin + BATCH, tile_stop)
-            _load_batch(begin, end, tile_stop, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
+            _load_batch(begin, end, tile_stop, x0, y0, pair_rows, geometry, channels, depths, votes, table, blocks)
             for k in range(end - begin):
                 touched = blocks[k] & alive
                 drawn = np.uint64(0)
@@ -318,12 +321,6 @@ def _place(channel, block):
 
 
 @helper
-def _name(names, place):
-    """The label at a place, -1 for none."""
-    return names[np.uint64(place)] if place >= 0 else np.int32(-1)
-
-
-@helper
 def _finish_tile(
     x0, y0, names, buffer, ballot, passed, covered, last, background, limits, image, alpha, depth, transmittance,
     last_pairs, ids,
@@ -361,7 +358,7 @@ def _finish_tile(
             for plane in range(planes):
                 weight = load(ballot, plane * PIXELS + at)
                 wins = weight > most
-                most, winner = select(wins, weight, most), select(wins, splat(float32(plane)), winner)
+                most, winner = select(wins, weight, most), select(wins, broadcast(names, plane), winner)
             store(pixels, at_id, select(covers >= id_alpha_min, winner, nobody))
         if left + BLOCK <= width and top + BLOCK <= height and three:
             pixel = top * width + left
@@ -370,8 +367,8 @@ def _finish_tile(
             if len(transmittance):
                 store_rows(flat_end, pixel, width, passes)
                 store_rows(flat_last, pixel, width, load(last, at))
-            for lane in range(LANES if planes else 0):
-                flat_ids[pixel + lane // BLOCK * width + lane % BLOCK] = _name(names, pixels[at_id + lane])
+            if planes:
+                store_whole_rows(flat_ids, pixel, width, load(pixels, at_id))
             red, green, blue = load(pixels, 0), load(pixels, LANES), load(pixels, 2 * LANES)
             if not one_background:
                 behind = load_rows_of_three(flat_background, 3 * pixel, 3 * width)
@@ -388,7 +385,7 @@ def _finish_tile(
                     flat_end[pixel] = passed[np.uint64(at) + lane]
                     flat_last[pixel] = last[np.uint64(at) + lane]
                 if planes:
-                    flat_ids[pixel] = _name(names, pixels[np.uint64(at_id) + lane])
+                    flat_ids[pixel] = np.int32(pixels[np.uint64(at_id) + lane])
                 to = pixel * np.uint64(n_channels)
                 for c in range(np.uint64(n_channels)):
                     flat_image[to + c] = pixels[c * np.uint64(LANES) + lane]
@@ -423,6 +420,7 @@ def blend_backward(
     weights, inners = aligned(PIXELS), aligned(PIXELS)
     table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat, flat_slots = table.reshape(-1), slots.reshape(-1)
+    no_votes = np.empty(0, np.int32)
     cut, cap = limits[LOG2_ALPHA_MIN], limits[LOG2_ALPHA_MAX]
     zero, one = splat(float32(0)), splat(float32(1))
     cut_low, cut_high = splat(float32(cut - CLOSE_LOG2)), splat(float32(cut + CLOSE_LOG2))
@@ -443,7 +441,7 @@ def blend_backward(
         for batch in range((tile_end - tile_start - 1) // BATCH, -1, -1):
             begin = tile_start + batch * BATCH
             end = min(begin + BATCH, tile_end)
-            _load_batch(begin, end, end, x0, y0, pair_rows, geometry, channels, depths, table, blocks)
+            _load_batch(begin, end, end, x0, y0, pair_rows, geometry, channels, depths, no_votes, table, blocks)
             for k in range(end - begin - 1, -1, -1):
                 drawn = pair_blocks[begin + k]
                 slot = np.int64(pair_slots[begin + k]) * n_slots

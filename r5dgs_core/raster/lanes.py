@@ -74,6 +74,22 @@ def store_rows(typingctx, array, index, stride, value):
 
 
 @operation
+def store_whole_rows(typingctx, array, index, stride, value):
+    """Like `store_rows` for an array of int32; the lanes are whole numbers."""
+
+    def emit(context, builder, sig, args):
+        array, at, stride, value = args
+        value = builder.fptosi(value, _INTS)
+        for row in range(ROWS):
+            part = shuffle(builder, value, value, range(row * ROWS, (row + 1) * ROWS))
+            _store_part(context, builder, sig.args[0], array, at, part)
+            at = builder.add(at, stride)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, lanes), emit
+
+
+@operation
 def store_rows_of_three(typingctx, array, index, stride, a, b, c):
     """Like `store_rows` for an array that holds three values per pixel, from three vectors; the stride in floats."""
 

@@ -383,6 +383,26 @@ def test_ids_agree_between_backends():
     assert len(found.unique()) == 7
 
 
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_ids_are_the_labels_however_large_and_sparse_they_are(backend):
+    scene, view = splats(200, 1, seed=15), camera()
+    few = torch.randint(-1, 6, (200,), generator=torch.Generator().manual_seed(3))
+    names = torch.tensor([0, 7, 300, 301, 70_000, 2**20, -1])  # the last is reached as -1
+    expected = draw(scene, view, backend, labels=few)[0].ids
+    many = torch.where(few < 0, -5, names[few])
+    if backend == "reference":  # a plane per number: keep it small
+        many, names = many.clamp_max(301), names.clamp_max(301)
+        few = torch.where(few > 3, 3, few)
+        expected = draw(scene, view, backend, labels=few)[0].ids
+    found = draw(scene, view, backend, labels=many)[0].ids
+    assert torch.equal(found.long(), torch.where(expected < 0, -1, names[expected.long()]))
+
+
+def test_a_label_that_cannot_be_counted_is_named():
+    with pytest.raises(ValueError, match=r"labels.*16777216 at index 2"):
+        rasterize_splats(*[t.float() for t in splats(4, 1)], camera(), labels=torch.tensor([0, 1, 2**24, 3]))
+
+
 def gaussians(n=300, k=16, seed=16):
     means, quats, scales, opacities, colors = (t.float() for t in splats(n, 3, seed=seed))
     sh = torch.cat([spherical_harmonics.rgb_to_dc(colors)[:, None], 0.2 * torch.randn(n, k - 1, 3)], 1)
