@@ -239,11 +239,9 @@ def blend(
                         if unlikely(any_of(valid & (cut_high > exponent))):
                             i = pair_rows[begin + k]
                             valid = _settle(valid, valid & (cut_high > exponent), geometry, i, x0, y0, block, cut)
-                        opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
+                        opaque = select(valid, smaller(exp2(larger(exponent, cut_lanes)), alpha_max), zero)
                         weight = before * opaque
                         after = before - weight
-                        weight = select(valid, weight, zero)
-                        after = select(valid, after, before)
                         ends = valid & (end_high > after)
                         if unlikely(any_of(ends)):
                             close = bits_of(ends & (after >= end_low))
@@ -470,11 +468,10 @@ def blend_backward(
                     if unlikely(any_of(valid & (cut_high > exponent))):
                         i = pair_rows[begin + k]
                         valid = _settle(valid, valid & (cut_high > exponent), geometry, i, x0, y0, block, cut)
-                    opaque = smaller(exp2(larger(exponent, cut_lanes)), alpha_max)
-                    after = load(passed, at)
-                    before = select(valid, after * reciprocal(one - opaque), after)
+                    opaque = select(valid, smaller(exp2(larger(exponent, cut_lanes)), alpha_max), zero)
+                    before = load(passed, at) * select(valid, reciprocal(one - opaque), one)
                     store(passed, at, before)
-                    weight = select(valid, before * opaque, zero)
+                    weight = before * opaque
                     of = at * FIRST
                     g_0, g_1 = load(gradient, of), load(gradient, of + LANES)
                     g_2, g_3 = load(gradient, of + 2 * LANES), load(gradient, of + 3 * LANES)
@@ -489,7 +486,7 @@ def blend_backward(
                         inner = inner + load(inners, at)
                     seen_behind = load(behind, at)
                     gained = inner - seen_behind
-                    store(behind, at, select(valid, fma(opaque, gained, seen_behind), seen_behind))
+                    store(behind, at, fma(opaque, gained, seen_behind))
                     # dL/d(ln alpha); zero where the cap holds, as the capped alpha does not move
                     to_log = weight * gained
                     capped = valid & (exponent >= cap_low)

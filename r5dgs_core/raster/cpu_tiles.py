@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from .compile import helper, kernel, run_parts, threads
-from .cpu_projection import BOX_DIGIT, BOX_MARGIN, EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y, TILE
+from .cpu_projection import BOX_DIGIT, BOX_MARGIN, EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y, MOST_TILES, TILE
 
+_BOX_BITS = np.uint64(BOX_DIGIT.bit_length() - 1)
 _DIGIT = 11  # bits per pass of the radix sort
 _WORTH_A_THREAD = 4000  # Gaussians
 
@@ -119,10 +120,10 @@ def _tile_range(low, high, tiles):
 @helper
 def _box(boxes, i):
     """Tiles that the bounding box of Gaussian i touches: first and one past the last column, the same of rows."""
-    packed = np.int64(boxes[i])
-    left, packed = packed % BOX_DIGIT, packed // BOX_DIGIT
-    right, packed = packed % BOX_DIGIT, packed // BOX_DIGIT
-    return left, right, packed % BOX_DIGIT, packed // BOX_DIGIT
+    packed, mask = np.uint64(boxes[i]), np.uint64(MOST_TILES)
+    left, packed = packed & mask, packed >> _BOX_BITS
+    right, packed = packed & mask, packed >> _BOX_BITS
+    return np.int64(left), np.int64(right), np.int64(packed & mask), np.int64(packed >> _BOX_BITS)
 
 
 @helper
