@@ -1,4 +1,4 @@
-"""The ``r5dgs`` command: demo, train, bake, evaluate, info.
+"""The ``r5dgs`` command: demo, train, bake, evaluate, info, warm-up.
 
 Each sub-command is a function ``run_<name>`` that does the work and can be called without the command line.
 """
@@ -135,6 +135,37 @@ def run_info(path: Path, *, as_json: bool) -> None:
             print(f"{key}: {_short(value)}")
 
 
+def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
+    """Compile the kernels of rasterizer and training, so that no first picture has to wait for that.
+
+    Args:
+        progress_kind: How progress is shown (`progress.make`).
+
+    Returns:
+        ``seconds`` it took, kernels ``compiled`` (none where an earlier call did that) and the ``folder`` that keeps
+        them, None where there is no place.
+    """
+    from .progress import make
+
+    try:
+        from .raster import compile as compilation
+        from .train import warming
+    except ImportError as error:
+        raise errors.BackendError(f"warm-up: {sys.executable} lacks '{error.name}'; install r5dgs again") from error
+
+    with make(progress_kind) as progress, compilation.telling(lambda text: progress({"event": "first", "text": text})):
+        seconds = warming.warm_up(lambda stage: progress({"event": "prepare", "text": stage}))
+        folder = compilation.cache_folder()
+        compiled = compilation.compiled()
+        result = {"seconds": round(seconds, 2), "compiled": compiled, "folder": None if folder is None else str(folder)}
+        if progress_kind == "json":
+            progress({"event": "ready", **result})
+    if progress_kind != "json":
+        done = f"compiled {compiled} kernels in {seconds:.1f} s" if compiled else f"ready: loaded in {seconds:.1f} s"
+        print(f"{done}; kept in {folder}" if folder else f"{done}; not kept, as no folder can be written")
+    return result
+
+
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
@@ -182,6 +213,9 @@ def parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="say what is in a scene file")
     info.add_argument("file", type=Path, help=".r5dgs file")
     info.add_argument("--json", action="store_true", help="as JSON")
+
+    warm_up = commands.add_parser("warm-up", help="compile the kernels now, once, instead of at the first picture")
+    add_progress(warm_up)
     return top
 
 
@@ -226,6 +260,8 @@ def _dispatch(args: argparse.Namespace) -> None:
         run_evaluate(
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress
         )
+    elif args.command == "warm-up":
+        run_warm_up(progress_kind=args.progress)
     else:
         run_info(args.file, as_json=args.json)
 

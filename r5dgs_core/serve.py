@@ -7,17 +7,23 @@ arrays that the line announces, in order:
     <- {"id": 1, "ok": true, "result": {...}, "arrays": [{"name": "color", "dtype": "<f4", "shape": [H, W, 3]}]} + bytes
     <- {"id": 1, "ok": false, "error": {"kind": "SceneFileError", "message": "..."}}
 
-One scene stays loaded. The worker ends when its input ends. Torch and the rasterizer are imported when first needed,
-so that ``hello`` can say what is missing.
+One scene stays loaded. The worker ends when its input ends. Torch and the rasterizer are imported after the first
+answer, so that ``hello`` can say what is missing; the rasterizer is then made ready beside the requests, and who wants
+a picture sooner waits for it. Where it has to be compiled for that, lines of no request say so, between answers:
+
+    <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
+    <- {"event": "ready", "seconds": 7.9, "arrays": []}
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
 import platform
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -31,16 +37,60 @@ from .scene import lookup, playback, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
 
-PROTOCOL = 1
+PROTOCOL = 2
 NEEDED = ("torch", "numba")
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
-class Server:
-    """Answers requests; holds the scene that was loaded last."""
+class Warming:
+    """Makes the rasterizer's kernels for pictures ready, in a thread of its own.
 
-    def __init__(self) -> None:
+    Args:
+        tell: Called with an event, from that thread, when kernels have to be compiled and when that is over.
+    """
+
+    def __init__(self, tell: Callable[[dict[str, Any]], None]):
+        self._tell = tell
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin, unless that was done before."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="r5dgs warm-up", daemon=True)
+            self._thread.start()
+
+    def wait(self) -> None:
+        """Return when it is over, at once where it has not begun."""
+        if self._thread is not None:
+            self._thread.join()
+
+    @property
+    def busy(self) -> bool:
+        """Whether it has begun and is not over."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            from .raster import compile as compilation
+            from .raster import warming
+        except ImportError:  # whoever asks for a picture hears of it
+            return
+        with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
+            seconds = warming.warm_up(gradients=False)
+        if compilation.compiled():
+            self._tell({"event": "ready", "seconds": round(seconds, 2)})
+
+
+class Server:
+    """Answers requests; holds the scene that was loaded last.
+
+    Args:
+        warming: What is waited for before the first picture.
+    """
+
+    def __init__(self, warming: Warming | None = None) -> None:
+        self._warming = warming
         self._scene: Scene | None = None
         self._stamp: tuple[str, int, int] | None = None
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
@@ -48,6 +98,7 @@ class Server:
             "load": self._load,
             "render": self._render,
             "query": self._query,
+            "warm_up": self._warm_up,
         }
 
     def answer(self, request: dict[str, Any]) -> Answer:
@@ -100,7 +151,7 @@ class Server:
         unknown = set(want) - {"depth", "alpha", "ids"}
         if unknown:
             raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are alpha, depth, ids")
-        scene_render = _rasterizer()
+        scene_render = self._rasterizer()
         started = time.perf_counter()
         if "instances" in request:
             pose = scene_render.pose_instances(scene, [_instance(entry) for entry in request["instances"]])
@@ -118,6 +169,15 @@ class Server:
         milliseconds = {"ms_motion": 1e3 * (posed - started), "ms_raster": 1e3 * (ended - posed)}
         return {**milliseconds, "gaussians": len(pose.means)}, arrays
 
+    def _warm_up(self, _: dict[str, Any]) -> Answer:
+        """Make the rasterizer ready; how many kernels this process had to ``compile`` for that."""
+        self._rasterizer()
+        from .raster import compile as compilation
+        from .raster import warming
+
+        warming.warm_up(gradients=False)
+        return {"compiled": compilation.compiled()}, {}
+
     def _query(self, request: dict[str, Any]) -> Answer:
         """``text``: ranked objects of the loaded scene."""
         found = lookup.search(self._loaded(), _need(request, "text", str))
@@ -127,6 +187,12 @@ class Server:
         if self._scene is None:
             raise errors.ConfigError("worker: no scene is loaded; send 'load' first")
         return self._scene
+
+    def _rasterizer(self):
+        """`raster.scene_render`, once it is warm."""
+        if self._warming is not None:
+            self._warming.wait()
+        return _rasterizer()
 
 
 def _rasterizer():
@@ -173,14 +239,29 @@ def _instance(value: dict[str, Any]):
     return _rasterizer().Instance(start, count, _matrix(value.get("matrix"), 4, f"the matrix of rows {start}"))
 
 
-def serve(requests: BinaryIO, answers: BinaryIO) -> None:
+def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
     """Answer requests until the input ends or ``shutdown`` comes.
 
     Args:
         requests: JSON lines.
         answers: Where the answers go.
+        warm: Whether to make the rasterizer ready after the first answer, see `Warming`.
+
+    Returns:
+        Whether that is still going on.
     """
-    server = Server()
+    lock = threading.Lock()
+
+    def send(header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
+        with lock:
+            _send(answers, header, arrays or {})
+
+    def tell(event: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+            send(event)
+
+    warming = Warming(tell) if warm else None
+    server = Server(warming)
     for line in requests:
         if not line.strip():
             continue
@@ -191,18 +272,21 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
                 raise errors.ConfigError("worker: a request has to be a JSON object")
             number = request.get("id")
             if request.get("command") == "shutdown":
-                _send(answers, {"id": number, "ok": True, "result": {}}, {})
-                return
+                send({"id": number, "ok": True, "result": {}})
+                break
             result, arrays = server.answer(request)
         except errors.R5dgsError as error:
-            _send(answers, _failure(number, type(error).__name__, str(error)), {})
+            send(_failure(number, type(error).__name__, str(error)))
         except json.JSONDecodeError as error:
-            _send(answers, _failure(number, "ConfigError", f"worker: a request is not JSON: {error}"), {})
+            send(_failure(number, "ConfigError", f"worker: a request is not JSON: {error}"))
         except Exception as error:  # the worker outlives a failed request; the traceback goes to its log
             traceback.print_exc()
-            _send(answers, _failure(number, type(error).__name__, str(error)), {})
+            send(_failure(number, type(error).__name__, str(error)))
         else:
-            _send(answers, {"id": number, "ok": True, "result": result}, arrays)
+            send({"id": number, "ok": True, "result": result}, arrays)
+        if warming is not None:
+            warming.start()
+    return warming is not None and warming.busy
 
 
 def _failure(number: Any, kind: str, message: str) -> dict[str, Any]:
@@ -221,7 +305,9 @@ def main() -> None:
     """Serve on standard input and output; whatever else prints goes to standard error."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    serve(sys.stdin.buffer, answers)
+    if serve(sys.stdin.buffer, answers, warm=True):
+        sys.stderr.flush()
+        os._exit(0)  # a thread that is compiling can neither be stopped nor outlive the interpreter
 
 
 if __name__ == "__main__":

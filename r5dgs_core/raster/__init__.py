@@ -1,6 +1,7 @@
 """Differentiable rasterizer of Gaussians, one signature: `cpu` (numba), `cuda` and `reference` (plain torch)."""
 
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
-from .splatting import rasterize, rasterize_splats, warm_up
+from .splatting import rasterize, rasterize_splats
+from .warming import warm_up
 
 __all__ = ["RasterSettings", "RasterStats", "RenderOutput", "SplatImage", "rasterize", "rasterize_splats", "warm_up"]

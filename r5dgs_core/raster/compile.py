@@ -31,6 +31,11 @@ from numba.core import event as numba_events
 
 log = logging.getLogger(__name__)
 
+NOTICE = "rasterizer: compiling its kernels for this machine, once; about 10 s"
+NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep them; about 10 s in every process"
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _threads = max(1, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
@@ -43,8 +48,7 @@ def kernel(function) -> Any:
         folder = _cache_folder(before)
         numba.config.CACHE_DIR = folder or before  # type: ignore[attr-defined]
         try:
-            compile = numba.njit(nogil=True, cache=folder is not None, error_model="numpy", no_cfunc_wrapper=True)
-            compiled = compile(function)
+            compiled = numba.njit(cache=folder is not None, **_OPTIONS)(function)
             _watch.kernels.add(compiled)
             return compiled
         finally:
@@ -53,40 +57,39 @@ def kernel(function) -> Any:
 
 def helper(function) -> Any:
     """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own."""
-    return numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+    return numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
 class _Watch(numba_events.Listener):
-    """Sees every compilation by numba, one at a time, as numba's own lock is held; code from its cache passes unseen.
+    """Sees every compilation in this process, one at a time under numba's own lock; what is loaded passes unseen.
 
-    The collector of garbage rests meanwhile: looking through all that the compiler has made, again and again, would
-    take a twelfth of the time.
+    The garbage collector rests meanwhile: again and again it would look through all that the compiler holds, which is
+    a twelfth of the time.
     """
 
     def __init__(self) -> None:
         self.kernels: weakref.WeakSet = weakref.WeakSet()
         self.compiled = 0
-        self.tell: Callable[[str], None] | None = None
-        self._depth = 0
+        self.tell: Callable[[str], object] = log.warning
+        self._depth = 0  # of a kernel, and of the helpers in it
         self._collects = False
 
     def on_start(self, event) -> None:
-        ours = event.data["dispatcher"] in self.kernels
-        if ours or self._depth:
-            self._depth += 1
-        if self._depth != 1:
+        if not self._depth and event.data["dispatcher"] not in self.kernels:
             return
-        self.compiled += 1
-        if self.compiled == 1:
-            (self.tell or log.warning)(NOTICE if _cache_folder(_chosen()) else NOTICE_UNKEPT)
+        self._depth += 1
+        if self._depth > 1:
+            return
         self._collects = gc.isenabled()
         gc.disable()
+        self.compiled += 1
+        if self.compiled == 1:
+            self.tell(NOTICE if cache_folder() else NOTICE_UNKEPT)
 
     def on_end(self, event) -> None:
-        self._depth -= self._depth > 0
-        if self._depth == 0 and self._collects:
-            self._collects = False
+        if self._depth == 1 and self._collects:
             gc.enable()
+        self._depth = max(0, self._depth - 1)
 
 
 _watch = _Watch()
@@ -94,21 +97,24 @@ numba_events.register("numba:compile", _watch)
 
 
 def compiled() -> int:
-    """Number of kernels that this process has compiled so far, as no earlier one had."""
+    """Number of kernels that this process had to compile so far, as no earlier one did."""
     return _watch.compiled
 
 
 @contextlib.contextmanager
-def telling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Tell of the process's first compilation by calling ``tell`` with a line of text, in place of a warning in the log.
-
-    Whoever shows progress wraps its work in this; ``tell`` may be called from any thread.
-    """
+def telling(tell: Callable[[str], object]) -> Iterator[None]:
+    """Tell of the process's first compilation by ``tell(text)`` instead of a warning in the log; from any thread."""
     before, _watch.tell = _watch.tell, tell
     try:
         yield
     finally:
         _watch.tell = before
+
+
+def cache_folder() -> Path | None:
+    """Where the machine code of this version is kept; None where no place can be written."""
+    folder = _cache_folder(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+    return None if folder is None else Path(folder)
 
 
 def set_threads(count: int) -> None:

@@ -18,12 +18,12 @@ import numpy as np
 from numba import float32
 
 from ..model.spherical_harmonics import C0, C1, C2_XX_YY, C2_XY, C2_ZZ, C3_0, C3_1, C3_2, C3_2_DIFFERENCE, C3_3
-from .compile import kernel
+from .compile import helper, kernel
 
 BASES = 16  # to degree 3
 
 
-@kernel
+@helper
 def _direction(means, eyes, view_maps, i, pose):
     """Unit direction d of Gaussian i, and one over the length that it had; all zero at the eye."""
     a = np.float64(means[i, 0]) - eyes[pose, 0]
@@ -37,7 +37,7 @@ def _direction(means, eyes, view_maps, i, pose):
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@kernel
+@helper
 def evaluate_basis(x, y, z, count, basis):
     """Write b_1 .. b_(count - 1) to ``basis`` from entry 1 on; count is 4, 9 or 16."""
     basis[1] = -C1 * y
@@ -62,7 +62,7 @@ def evaluate_basis(x, y, z, count, basis):
     basis[15] = -C3_3 * x * (xx - 3 * yy)
 
 
-@kernel
+@helper
 def _differentiate_basis(x, y, z, count, h):
     """Gradient of sum_k h_k b_k with respect to x, y, z as free variables."""
     d_x, d_y, d_z = -C1 * h[3], -C1 * h[1], C1 * h[2]
@@ -84,7 +84,7 @@ def _differentiate_basis(x, y, z, count, h):
     return d_x, d_y, d_z
 
 
-@kernel
+@helper
 def _sum_basis(basis, count, constants, start, rest, rest_start):
     """The three channels of 0.5 + C0 sh_0 + sum_k b_k sh_k, not clamped."""
     first, at = np.uint64(start), np.uint64(rest_start)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import float32
 
 from ..model.spherical_harmonics import C0
-from .compile import kernel
+from .compile import helper, kernel
 from .cpu_harmonics import BASES, evaluate_basis
 
 
@@ -37,7 +37,7 @@ def draw_sky(worker, workers, rays, sh, image):
                 image[y, x, c] = min(max(row[x], float32(0)), float32(1))
 
 
-@kernel
+@helper
 def _evaluate_row(rays, y, count, basis):
     """Write the basis functions of a row of pixels. [K, W]"""
     values = np.empty(BASES, np.float32)
@@ -50,7 +50,7 @@ def _evaluate_row(rays, y, count, basis):
             basis[k, x] = values[k]
 
 
-@kernel
+@helper
 def _add_scaled(row, scale, values):
     for x in range(len(row)):
         row[x] += scale * values[x]

@@ -6,7 +6,6 @@ import functools
 import importlib.util
 import logging
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -132,19 +131,6 @@ def rasterize(
         features=splats.image[..., 3:] if features is not None else None,
         ids=splats.ids,
     )
-
-
-def warm_up() -> float:
-    """Compile the kernels of the `cpu` backend, or load them where an earlier process did; returns the seconds it took.
-
-    The first call of a fresh installation takes about ten seconds; whoever shows progress calls this first and says so.
-    """
-    start = time.perf_counter()
-    view = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
-    row = torch.ones(1, 3, requires_grad=True)
-    quats = torch.ones(1, 4)
-    rasterize_splats(row, quats, row, row[:, 0], row, view, backend="cpu").image.sum().backward()
-    return time.perf_counter() - start
 
 
 def seen_colors(gaussians: Any, camera: Camera, *, fused: bool = True) -> torch.Tensor:

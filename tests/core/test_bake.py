@@ -249,4 +249,6 @@ def test_an_object_that_comes_late_holds_its_first_pose_and_is_measured_where_it
             scene.track_poses,
         ),
     )
-    assert evaluate.object_errors(moved, truth) == evaluate.object_errors(scene, truth)
+    found, expected = evaluate.object_errors(moved, truth), evaluate.object_errors(scene, truth)
+    # Not to the last digit: 3 x 0.15 lies a rounding before the knot at 0.45, and takes 1e-16 of the pose before it.
+    assert found == [pytest.approx(row, rel=1e-9) for row in expected]

@@ -18,6 +18,11 @@ from r5dgs_core.raster.compile import kernel
 def double(x):
     return 2 * x
 
+@kernel
+def triple(x):
+    return 3 * x
+
+triple(14)
 print(double(21), sum(double.stats.cache_hits.values()), sum(double.stats.cache_misses.values()))
 """
 
@@ -36,8 +41,8 @@ def blocked(tmp_path: Path) -> Path:
     return path
 
 
-def run_toy(tmp_path, **environment):
-    (tmp_path / "toy.py").write_text(TOY)
+def run_toy(tmp_path, script=TOY, **environment):
+    (tmp_path / "toy.py").write_text(script)
     kept = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "TMPDIR")}
     root = str(Path(__file__).resolve().parents[2])
     return subprocess.run(
@@ -67,6 +72,64 @@ def test_the_users_choice_and_the_users_cache_come_first(tmp_path, monkeypatch):
     assert Path(compilation._cache_folder(str(blocked(tmp_path) / "deeper"))).parent == tmp_path / "user"
 
 
+def test_the_first_compilation_of_a_machine_is_told_once_and_loading_never(tmp_path):
+    first, second = (run_toy(tmp_path, NUMBA_CACHE_DIR=tmp_path / "cache") for _ in range(2))
+    assert first.stderr.splitlines() == [compilation.NOTICE] and second.stderr == ""
+
+
+TOLD = """
+import gc, threading, numba
+from r5dgs_core.raster import compile
+from r5dgs_core.raster.compile import helper, kernel
+
+told = []
+gc_inside = []
+
+@numba.njit
+def other(x):
+    return x + 1
+
+@helper
+def inner(x):
+    return x + 1
+
+@kernel
+def outer(x):
+    return inner(x)
+
+def tell(text):
+    told.append(text)
+    gc_inside.append(gc.isenabled())
+
+with compile.telling(tell):
+    other(1)
+    assert not told and compile.compiled() == 0
+    threads = [threading.Thread(target=outer, args=(x,)) for x in (1, 1, 1.0)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+assert told == [compile.NOTICE] and compile.compiled() == 2  # two kinds of argument
+assert gc_inside == [False] and gc.isenabled()
+gc.disable()
+outer(1j)
+assert not gc.isenabled() and compile.compiled() == 3 and len(told) == 1
+"""
+
+
+def test_only_kernels_are_told_of_and_the_collector_is_left_as_it_was(tmp_path):
+    assert run_toy(tmp_path, TOLD, NUMBA_CACHE_DIR=tmp_path / "cache").stderr == ""
+
+
+def test_without_a_place_the_notice_says_so_in_every_process(tmp_path):
+    script = TOY.replace(
+        "from r5dgs_core", "import r5dgs_core.raster.compile as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core", 1
+    )
+    complaints = [run_toy(tmp_path, script).stderr.splitlines() for _ in range(2)]
+    assert complaints[0] == complaints[1] and complaints[0][1:] == [compilation.NOTICE_UNKEPT]
+    assert "no place to keep compiled code" in complaints[0][0]
+
+
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
 @pytest.mark.parametrize("kind", ["writable by others", "a link", "a file"])
 def test_a_temporary_folder_that_others_could_fill_is_not_used(tmp_path, monkeypatch, kind):
@@ -89,7 +152,8 @@ def test_without_any_place_nothing_is_kept_and_one_line_says_so(tmp_path, monkey
     with caplog.at_level("WARNING"):
         kernels = [compilation.kernel(function) for function in (lambda x: 2 * x, lambda x: 3 * x)]
     assert [kernel(21) for kernel in kernels] == [42, 63]
-    assert len(caplog.records) == 1 and "NUMBA_CACHE_DIR" in caplog.text and "a file" in caplog.text
+    (record,) = [record for record in caplog.records if "NUMBA_CACHE_DIR" in record.getMessage()]
+    assert "a file" in record.getMessage()
 
 
 def test_no_home_is_no_error(tmp_path, monkeypatch):

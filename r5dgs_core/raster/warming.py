@@ -1,0 +1,74 @@
+"""Compiling the kernels of the `cpu` backend before they are needed, or loading them where an earlier process did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ..scene.cameras import Camera
+from . import harmonics, splatting
+
+_VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
+_SH = 4  # coefficients: degree 1, the least that has kernels
+
+
+def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:
+    """Make every kernel of the `cpu` backend ready.
+
+    The first call of a fresh installation takes ten to fifteen seconds, later processes well below one.
+
+    Args:
+        gradients: Whether those of the backward passes are wanted, too; viewers do without.
+        progress: Called with the name of each stage before it begins.
+
+    Returns:
+        The seconds it took.
+
+    Raises:
+        BackendError: There is no numba.
+    """
+    start = time.perf_counter()
+    stages: list[tuple[str, Callable[[], object]]] = [("splats", _splats), ("colors", _colors), ("sky", _sky)]
+    if gradients:
+        stages += [("gradients of splats", _splat_gradients), ("gradients of colors", _color_gradients)]
+    for name, stage in stages:
+        if progress is not None:
+            progress(name)
+        stage()
+    return time.perf_counter() - start
+
+
+def _draw(row: torch.Tensor) -> torch.Tensor:
+    labels = torch.zeros(1, dtype=torch.int32)
+    return splatting.rasterize_splats(
+        row, torch.ones(1, 4), row, row[:, 0], row, _VIEW, labels=labels, backend="cpu"
+    ).image
+
+
+def _shade(row: torch.Tensor) -> torch.Tensor:
+    return harmonics.seen_colors(row, row.expand(1, _SH, 3), np.zeros(3))
+
+
+def _splats() -> None:
+    _draw(torch.ones(1, 3))
+
+
+def _splat_gradients() -> None:
+    with torch.enable_grad():
+        _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
+
+
+def _colors() -> None:
+    _shade(torch.ones(1, 3))
+
+
+def _color_gradients() -> None:
+    with torch.enable_grad():
+        _shade(torch.ones(1, 3, requires_grad=True)).sum().backward()
+
+
+def _sky() -> None:
+    harmonics.sky(np.zeros((_SH, 3)), _VIEW)
