@@ -93,6 +93,7 @@ class Server:
         self._warming = warming
         self._scene: Scene | None = None
         self._stamp: tuple[str, int, int] | None = None
+        self._stage = None  # of the scene, from the first picture on
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
@@ -134,7 +135,7 @@ class Server:
             ) from error
         stamp = (str(path), status.st_mtime_ns, status.st_size)
         if self._scene is None or stamp != self._stamp:
-            self._scene, self._stamp = None, None
+            self._scene, self._stamp, self._stage = None, None, None
             self._scene, self._stamp = scene_file.read(path), stamp
         return {"name": self._scene.name, "gaussians": len(self._scene.means)}, {}
 
@@ -151,23 +152,27 @@ class Server:
         unknown = set(want) - {"depth", "alpha", "ids"}
         if unknown:
             raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are alpha, depth, ids")
-        scene_render = self._rasterizer()
+        scene_render, sky = self._rasterizer(), request.get("background", True)
         started = time.perf_counter()
         if "instances" in request:
-            pose = scene_render.pose_instances(scene, [_instance(entry) for entry in request["instances"]])
+            instances = [_instance(entry) for entry in request["instances"]]
+            if self._stage is None:
+                from .raster import stage
+
+                self._stage = stage.Stage(scene)
+            output = self._stage.render(instances, camera, sky=bool(sky))
+            ms_motion, count = self._stage.ms_motion, sum(instance.count for instance in instances)
         else:
             pose = scene_render.pose_frame(scene, playback.frame(scene, float(_need(request, "t", (int, float)))))
-        posed = time.perf_counter()
-        background = "scene" if request.get("background", True) else None
-        output = scene_render.render_frame(scene, pose, camera, background=background)
-        ended = time.perf_counter()
+            ms_motion, count = 1e3 * (time.perf_counter() - started), len(pose.means)
+            output = scene_render.render_frame(scene, pose, camera, background="scene" if sky else None)
+        ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
         for name in want:
             value = getattr(output, name)
             if value is not None:
                 arrays[name] = scene_render.to_numpy(value, np.int32 if name == "ids" else np.float32)
-        milliseconds = {"ms_motion": 1e3 * (posed - started), "ms_raster": 1e3 * (ended - posed)}
-        return {**milliseconds, "gaussians": len(pose.means)}, arrays
+        return {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count}, arrays
 
     def _warm_up(self, _: dict[str, Any]) -> Answer:
         """Make the rasterizer ready; how many kernels this process had to ``compile`` for that."""

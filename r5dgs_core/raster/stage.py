@@ -9,6 +9,7 @@ shown or behind it, everything is drawn; from the next frame on, the instances t
 from __future__ import annotations
 
 import importlib.util
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,9 +25,14 @@ WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; with more, keeping 
 
 
 class Stage:
-    """Draws one scene again and again, on the CPU in float32."""
+    """Draws one scene again and again, on the CPU in float32.
+
+    Attributes:
+        ms_motion: What bringing Gaussians to their places took in the last frame, milliseconds.
+    """
 
     def __init__(self, scene: Scene):
+        self.ms_motion = 0.0
         self._scene = scene
         self._shown: tuple | None = None  # camera, background and ranges of the last frame
         self._places: list[np.ndarray] = []  # of all instances, where they stood first
@@ -44,6 +50,7 @@ class Stage:
         Returns:
             Colour (not clamped at 1), alpha, depth and object ids, tensors without gradient.
         """
+        self.ms_motion = 0.0
         view = (camera.width, camera.height, camera.intrinsics.tobytes(), camera.T_cam_world.tobytes())
         shown = (view, sky, tuple((instance.start, instance.count) for instance in instances))
         if shown != self._shown:
@@ -81,11 +88,18 @@ class Stage:
 
     def _splats(self, instances: list[Instance], camera: Camera) -> tuple[torch.Tensor, ...]:
         """Means, quats, scales, opacities, colours and object ids."""
-        posed = scene_render.pose_instances(self._scene, instances)
+        posed = self._pose(instances)
         gaussians = scene_render.PosedGaussians(posed)
         colors = scene_render.tensor(scene_render.colors(posed, camera))
         return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.object_ids
 
     def _render_all(self, instances: Sequence[Instance], camera: Camera, sky: bool) -> RenderOutput:
+        return scene_render.render_frame(
+            self._scene, self._pose(instances), camera, background="scene" if sky else None
+        )
+
+    def _pose(self, instances: Sequence[Instance]) -> scene_render.PosedScene:
+        start = time.perf_counter()
         posed = scene_render.pose_instances(self._scene, instances)
-        return scene_render.render_frame(self._scene, posed, camera, background="scene" if sky else None)
+        self.ms_motion += 1e3 * (time.perf_counter() - start)
+        return posed
