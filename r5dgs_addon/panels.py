@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import objects, timeline
+from . import objects, timeline, worker
 
 TAB = "R5DGS"
 
@@ -86,6 +86,8 @@ class R5DGS_PT_preview(_WithScene, bpy.types.Panel):
     def draw(self, context):
         layout = self.layout
         layout.operator("r5dgs.preview", icon="RENDER_STILL")
+        if worker.notice():
+            layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
         session = context.window_manager.r5dgs
         if session.preview_size:
             layout.label(text=f"{session.preview_size} in {session.preview_ms:.0f} ms", icon="TIME")

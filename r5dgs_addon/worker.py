@@ -1,13 +1,15 @@
 """The add-on's side of the worker: a Python with torch, started when it is first needed, kept until the add-on ends.
 
 The protocol is that of `r5dgs_core.serve`: a JSON line each way, and after an answer's line the raw bytes that it
-announces. A worker that dies, hangs or talks nonsense is dropped with a clear error; the next request starts another.
+announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that dies,
+hangs or talks nonsense is dropped with a clear error; the next request starts another.
 """
 
 import atexit
 import collections
 import contextlib
 import json
+import logging
 import os
 import queue
 import subprocess
@@ -24,6 +26,9 @@ from . import preferences
 ROOT = Path(__file__).resolve().parent.parent
 START_TIMEOUT_S = 120.0
 STDERR_LINES = 12
+COMPILING = "preparing the rasterizer (first use, about 10 s)"
+
+log = logging.getLogger(__name__)
 
 
 class Worker:
@@ -39,6 +44,7 @@ class Worker:
     def __init__(self, python: str):
         self.python = python
         self.hello: dict[str, Any] = {}
+        self.notice = ""  # what pictures wait for, where it is not their own making
         self._number = 0
         self._answers: queue.Queue = queue.Queue()
         self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
@@ -172,6 +178,9 @@ class Worker:
         try:
             while line := stream.readline():
                 header = json.loads(line)
+                if "event" in header:
+                    self._hear(header)
+                    continue
                 arrays = {}
                 for entry in header.get("arrays", ()):
                     dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
@@ -185,6 +194,11 @@ class Worker:
             self._stderr.append(f"unreadable answer: {error}")
         finally:
             self._answers.put(None)
+
+    def _hear(self, event: dict[str, Any]) -> None:
+        self.notice = COMPILING if event["event"] == "compiling" else ""
+        if self.notice:
+            log.warning("R5DGS worker: %s", self.notice)
 
     def _read_stderr(self) -> None:
         stream = self._process.stderr
@@ -214,7 +228,8 @@ class Job:
     """
 
     def __init__(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]):
-        self.doing = "starting the worker"
+        self._step = "starting the worker"
+        self._worker = running
         self._started = time.monotonic()
         self._answer: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
         self._error: BaseException | None = None
@@ -222,6 +237,11 @@ class Job:
             target=self._run, args=(running, timeout_s, steps), name="r5dgs worker job", daemon=True
         )
         self._thread.start()
+
+    @property
+    def doing(self) -> str:
+        """What it waits for, in a few words."""
+        return self._worker.notice or self._step
 
     @property
     def done(self) -> bool:
@@ -248,7 +268,7 @@ class Job:
     def _run(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]) -> None:
         try:
             running.greet()
-            for self.doing, command, arguments in steps:
+            for self._step, command, arguments in steps:
                 self._answer = running.request(command, timeout_s, **arguments)
         except BaseException as error:  # raised again where the answer is asked for
             self._error = error
@@ -295,6 +315,11 @@ def start(steps: list[tuple[str, str, dict[str, Any]]]) -> Job:
     global _job
     _job = Job(_running(), preferences.worker_timeout_s(), steps)
     return _job
+
+
+def notice() -> str:
+    """What pictures of the running worker wait for at present beside their own making; else empty."""
+    return _worker.notice if _worker is not None and _worker.alive else ""
 
 
 def busy() -> bool:

@@ -35,6 +35,7 @@ NOTICE = "rasterizer: compiling its kernels for this machine, once; about 10 s"
 NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep them; about 10 s in every process"
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -57,7 +58,7 @@ def kernel(function) -> Any:
 
 def helper(function) -> Any:
     """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own."""
-    return numba.njit(no_cpython_wrapper=True, **_OPTIONS)(function)
+    return numba.njit(**_OPTIONS, **_INNER)(function)
 
 
 class _Watch(numba_events.Listener):

@@ -31,7 +31,10 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
         BackendError: There is no numba.
     """
     start = time.perf_counter()
-    stages: list[tuple[str, Callable[[], object]]] = [("splats", _splats), ("colors", _colors), ("sky", _sky)]
+    stages: list[tuple[str, Callable[[], object]]] = [
+        *(("splats", _splats), ("splats before others", _backdrop)),
+        *(("colors", _colors), ("sky", _sky)),
+    ]
     if gradients:
         stages += [("gradients of splats", _splat_gradients), ("gradients of colors", _color_gradients)]
     for name, stage in stages:
@@ -41,11 +44,13 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     return time.perf_counter() - start
 
 
+def _inputs(row: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    return row, torch.ones(1, 4), row, row[:, 0], row
+
+
 def _draw(row: torch.Tensor) -> torch.Tensor:
     labels = torch.zeros(1, dtype=torch.int32)
-    return splatting.rasterize_splats(
-        row, torch.ones(1, 4), row, row[:, 0], row, _VIEW, labels=labels, backend="cpu"
-    ).image
+    return splatting.rasterize_splats(*_inputs(row), _VIEW, labels=labels, backend="cpu").image
 
 
 def _shade(row: torch.Tensor) -> torch.Tensor:
@@ -54,6 +59,13 @@ def _shade(row: torch.Tensor) -> torch.Tensor:
 
 def _splats() -> None:
     _draw(torch.ones(1, 3))
+
+
+def _backdrop() -> None:
+    from . import backdrop  # needs numba, which whoever imports the package may do without
+
+    still = moving = _inputs(torch.ones(1, 3))
+    backdrop.Backdrop(*still, _VIEW).draw(*moving)
 
 
 def _splat_gradients() -> None:

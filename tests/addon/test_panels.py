@@ -92,6 +92,14 @@ def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar
     assert "Nothing matches 'submarine'" in sidebar()
 
 
+def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, scene_path, monkeypatch):
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    before = sidebar()
+    monkeypatch.setattr(worker, "notice", lambda: worker.COMPILING)
+    assert [text for text in sidebar() if text not in before] == ["Preparing the rasterizer (first use, about 10 s)"]
+
+
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
     for menu, operator in (("import", "r5dgs.load_scene"), ("export", "r5dgs.capture_dataset")):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import signal
 import stat
 import sys
@@ -335,9 +336,45 @@ def test_a_wrong_python_is_named(blender, loaded, monkeypatch, tmp_path, kind):
         blender.ops.r5dgs.preview()
 
 
-def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blender, worker):
+def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blender, worker, capfd):
     assert blender.ops.r5dgs.check_worker() == {"FINISHED"}
+    assert re.search(r"Worker ready: .*, rasterizer (ready|compiled in \d+ s, once)$", capfd.readouterr().out, re.M)
     running = worker.current()
     worker.unregister()
     assert not running.alive
     worker.register()
+
+
+COMPILES = """
+import json, os, sys
+
+def say(header):
+    print(json.dumps({**header, "arrays": []}), flush=True)
+
+for line in sys.stdin:
+    request = json.loads(line)
+    if request["command"] == "warm":
+        say({"event": "compiling", "text": "compiling"})
+        os.read(os.open(os.environ["GATE"], os.O_RDONLY), 1)
+        say({"event": "ready", "seconds": 1.0})
+    say({"id": request["id"], "ok": True, "result": {"missing": []}})
+"""
+
+
+def test_who_waits_for_the_compiler_is_told_so(blender, loaded, worker, windowed, monkeypatch, tmp_path, caplog):
+    os.mkfifo(tmp_path / "gate")
+    monkeypatch.setenv("GATE", str(tmp_path / "gate"))
+    monkeypatch.setenv("R5DGS_PYTHON", fake_python(tmp_path / "python", COMPILES))
+    assert worker.notice() == ""
+    job = worker.start([("rendering", "warm", {})])
+    with open(tmp_path / "gate", "w"):  # from here on the worker waits for the end of this block
+        while not worker.notice():
+            time.sleep(0.01)
+        assert "rasterizer" in worker.notice() and job.doing == worker.notice()
+        assert worker.notice() in caplog.text
+        window = Window(blender, importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview, job)
+        window.send("TIMER")
+        assert worker.notice() in window.said[-1]
+    job.answer()
+    assert worker.notice() == "" and job.doing == "rendering"
+    worker.stop()

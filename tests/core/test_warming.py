@@ -23,13 +23,20 @@ ROOT = Path(__file__).resolve().parents[2]
 USE_EVERYTHING = """
 import sys
 from pathlib import Path
-from r5dgs_core.raster import compile, scene_render
+import numpy as np
+from r5dgs_core.raster import compile, scene_render, stage
 from r5dgs_core.scene import playback, scene_file
 from r5dgs_core.train import config, run
 
 scene = scene_file.read(Path(sys.argv[1]))
 for t in (0.1, 0.9):
     scene_render.render_frame(scene, playback.frame(scene, t), scene.cameras[0])
+drawn, body = stage.Stage(scene), scene.object(2)
+for x in (0.0, 0.1, 0.2, 0.3):
+    moved = np.eye(4)
+    moved[0, 3] = x
+    whole = scene_render.Instance(0, body.start, np.eye(4))
+    drawn.render([whole, scene_render.Instance(body.start, body.count, moved)], scene.cameras[0])
 run.train(Path(sys.argv[2]), Path(sys.argv[3]), config.load(None, sys.argv[4:]))
 print(compile.compiled())
 """
@@ -142,3 +149,9 @@ def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
     assert next(events)["ok"] and next(events)["event"] == "compiling"
     out, _ = finish(process)  # closes its input
     assert out == b""
+
+
+def test_importing_the_rasterizer_needs_neither_numba_nor_its_time():
+    script = "import sys, r5dgs_core.raster, r5dgs_core.raster.scene_render; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
