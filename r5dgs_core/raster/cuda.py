@@ -91,7 +91,7 @@ def rasterize_splats(
         projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
         means2d, axes, z = projected
         cov, _ = _covariances(axes, settings.dilation)
-        order, extent = reference._visible(means2d, cov, z, opacities.double(), camera, settings)
+        order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
         tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
         # Once more with gradients, only what is seen: the graph of a float64 projection is the largest thing in memory.

@@ -44,7 +44,7 @@ def rasterize_splats(
     means2d, axes, z = project(means, quats, scales, camera, settings)
     with torch.no_grad():
         cov = axes @ axes.transpose(1, 2) + settings.dilation * torch.eye(2).to(axes)
-        order, extent = _visible(means2d, cov, z, opacities, camera, settings)
+        order, extent = visible_rows(means2d, cov, z, opacities, camera, settings)
         if stats is not None:
             _fill_stats(stats, cov, order, dtype)
     if stats is not None and means2d.requires_grad:
@@ -152,8 +152,28 @@ def rotmats(quats: torch.Tensor) -> torch.Tensor:
     )
 
 
-def _visible(means2d, cov, z, opacities, camera, settings):
-    """Rows that can touch the image, near to far [V], and the half extents of all alpha_min ellipses [N, 2]."""
+def visible_rows(
+    means2d: torch.Tensor,  # [N, 2]
+    cov: torch.Tensor,  # [N, 2, 2]
+    z: torch.Tensor,  # [N]
+    opacities: torch.Tensor,  # [N]
+    camera: Camera,
+    settings: RasterSettings,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Find the Gaussians that can touch the image: beyond the near plane, with an alpha_min ellipse that reaches it.
+
+    Args:
+        means2d: Centres, px. [N, 2]
+        cov: Covariances with dilation, px^2. [N, 2, 2]
+        z: Depths in the camera frame. [N]
+        opacities: In [0, 1]. [N]
+        camera: For the size of the image.
+        settings: For near plane and alpha_min.
+
+    Returns:
+        Their rows, near to far, equal depths in the order of rows [V]; half width and height of the ellipse of every
+        Gaussian, px [N, 2].
+    """
     reach = 2 * torch.log((opacities / settings.alpha_min).clamp_min(1))
     extent = torch.sqrt(reach[:, None] * torch.diagonal(cov, dim1=1, dim2=2))
     size = means2d.new_tensor([camera.width, camera.height])
