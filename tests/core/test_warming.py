@@ -124,8 +124,8 @@ def test_a_warm_worker_says_nothing_of_it(warm_ups, cache, scene_path):
 
 def test_the_command_compiles_what_is_missing_and_then_finds_it_ready(warm_ups, cache):
     (first, first_complaints), (second, second_complaints) = warm_ups
-    notices = [[event for event in events if event["event"] == "first"] for events in (first, second)]
-    assert notices == [[{"event": "first", "text": compilation.NOTICE}], []]
+    notices = [[event for event in events if event["event"] == "notice"] for events in (first, second)]
+    assert notices == [[{"event": "notice", "text": compilation.NOTICE}], []]
     assert first_complaints == second_complaints == ""
     done, again = first[-1], second[-1]
     assert done["event"] == again["event"] == "ready" and done["compiled"] > 0 == again["compiled"]
