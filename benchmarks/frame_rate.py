@@ -1,15 +1,20 @@
 """Frames per second of a moving scene, motion included: `python benchmarks/frame_rate.py [--json FILE]`.
 
-A generated scene, a cube of Gaussians of which a third is still and the rest are bodies that turn and fly, is played
-over its observed time and as long past it. ``fps`` counts whole frames, from the time t to the picture, by the median.
-The parts are medians, too: ``ms_motion`` brings the Gaussians to time t, ``ms_colors`` evaluates their harmonics and
-the sky, ``ms_raster`` is the rest of the frame.
+A generated scene is played over its observed time and as long past it. In the ``cube`` bodies that turn and fly are
+slabs of a cube of Gaussians, of which the rest is still: they cover most of the image. In the ``room`` they are small
+balls before still walls. ``share`` of all Gaussians belong to the bodies.
+
+``fps`` counts whole frames, from the time t to the picture, by the median. The parts are medians, too: ``ms_motion``
+brings the Gaussians to time t, ``ms_colors`` evaluates their harmonics and the sky, ``ms_raster`` is the rest of the
+frame. ``fps_stage`` and ``ms_stage`` are of whole frames that a `Stage` draws, which keeps what stands still; each of
+its pictures is compared with that of all Gaussians drawn anew.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import time
 from pathlib import Path
@@ -18,16 +23,21 @@ import numpy as np
 import torch
 
 from r5dgs_core.motion import models, rotations
+from r5dgs_core.raster import RenderOutput, scene_render, stage
 from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster import scene_render
+from r5dgs_core.raster.scene_render import Instance
 from r5dgs_core.scene import playback
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
 
-COLUMNS = ("threads", "sh_degree", "sky_degree", "fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
+PLAIN = ("fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
+COLUMNS = ("kind", "share", "threads", "sh_degree", "sky_degree", *PLAIN, "fps_stage", "ms_stage")
 T_MAX = 0.75
 RADIUS_PX = 4.0  # median of three standard deviations along the longest axis
-SHARE_STILL = 1 / 3
+KINDS = ("cube", "room")
+SHARE = 2 / 3  # of the Gaussians that belong to bodies
+BALL = 0.12  # radius of a body in the room, half of whose width is 1
+TOLERANCE = 1e-6  # between pictures of the stage and of everything drawn anew
 
 
 def make_camera(size: int) -> Camera:
@@ -38,15 +48,26 @@ def make_camera(size: int) -> Camera:
     return Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]]), T_cam_world)
 
 
-def make_scene(count: int, bodies: int, sh_degree: int, sky_degree: int, camera: Camera, seed: int = 0) -> Scene:
-    """The scene: rows of the cube sorted by x, the first third still, the others one slab a body."""
+def make_scene(
+    count: int,
+    bodies: int,
+    sh_degree: int,
+    sky_degree: int,
+    camera: Camera,
+    seed: int = 0,
+    kind: str = "cube",
+    share: float = SHARE,
+) -> Scene:
+    """The scene of this kind: still Gaussians first, then body by body."""
     random = np.random.default_rng(seed)
+    still = round(count * (1 - share))
+    cuts = [0, *np.linspace(still, count, bodies + 1).round().astype(int).tolist()]
     means = random.uniform(-1, 1, (count, 3))
     means = means[np.argsort(means[:, 0])]
+    if kind == "room":
+        means = _room(random, cuts)
     scales = np.exp(0.5 * random.normal(size=(count, 1)) + 0.5 * random.normal(size=(count, 3)))
     scales *= RADIUS_PX / 3 / np.median(scales.max(1) * camera.intrinsics[0, 0] / (means[:, 2] + 3))
-    still = round(count * SHARE_STILL)
-    cuts = [0, *np.linspace(still, count, bodies + 1).round().astype(int).tolist()]
     ids = np.repeat(np.arange(bodies + 1), np.diff(cuts)).astype(np.int32)
     times = np.linspace(0, T_MAX, 46)
     groups, objects, poses = [], [], []
@@ -85,9 +106,44 @@ def make_scene(count: int, bodies: int, sh_degree: int, sky_degree: int, camera:
     )
 
 
+def _room(random: np.random.Generator, cuts: list[int]) -> np.ndarray:
+    """Centres on floor, ceiling, back and side walls up to row ``cuts[1]``, then in balls up to each further cut."""
+    means = random.uniform(-1, 1, (cuts[-1], 3))
+    walls = random.integers(5, size=cuts[1])
+    means[np.arange(cuts[1]), np.array([0, 0, 1, 1, 2])[walls]] = np.array([-1, 1, -1, 1, 1])[walls]
+    for k, (start, stop) in enumerate(zip(cuts[1:-1], cuts[2:], strict=True)):
+        directions = rotations.normalize(random.normal(size=(stop - start, 3)))
+        angle = 2 * math.pi * k / (len(cuts) - 2)
+        means[start:stop] = BALL * np.cbrt(random.uniform(size=(stop - start, 1))) * directions
+        means[start:stop] += 0.55 * np.array([math.cos(angle), math.sin(angle), -0.5])
+    return means
+
+
+def instances_at(scene: Scene, t: float) -> list[Instance]:
+    """The groups at a time as the add-on sends them: ranges of Gaussians, each with a matrix."""
+    quats, displacements = playback.group_poses(scene, t)
+    turns = rotations.quats_to_rotmats(quats)
+    found = []
+    for start, stop, g in playback.runs(scene.motion_ids):
+        matrix, pivot = np.eye(4), scene.groups[g].pivot
+        matrix[:3, :3], matrix[:3, 3] = turns[g], pivot + displacements[g] - turns[g] @ pivot
+        found.append(Instance(start, stop - start, matrix))
+    return found
+
+
+def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camera: Camera) -> None:
+    """Raise AssertionError where the picture of a stage is not that of all Gaussians drawn anew."""
+    anew = scene_render.render_frame(scene, scene_render.pose_instances(scene, instances), camera)
+    for name in ("color", "alpha"):
+        difference = (getattr(staged, name) - getattr(anew, name)).abs().max().item()
+        if not difference <= TOLERANCE:
+            raise AssertionError(f"{name}: expected the stage's within {TOLERANCE:g}, found {difference:g} beside it")
+
+
 def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
     """Medians over frames spread over twice the observed time, in milliseconds, and frames per second."""
-    parts: dict[str, list[float]] = {"ms_frame": [], "ms_motion": [], "ms_colors": []}
+    parts: dict[str, list[float]] = {"ms_frame": [], "ms_motion": [], "ms_colors": [], "ms_stage": []}
+    theatre = stage.Stage(scene)
     for t in [0.1 * T_MAX, *np.linspace(0, 2 * T_MAX, frames)]:  # the first one warms up and is not counted
         start = time.perf_counter()
         frame = playback.frame(scene, float(t))
@@ -98,11 +154,16 @@ def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
         scene_render.colors(posed, camera)
         scene_render.sky(scene, camera)
         colored = time.perf_counter()
-        for name, seconds in zip(parts, (drawn - start, moved - start, colored - drawn), strict=True):
+        instances = instances_at(scene, float(t))
+        staged = theatre.render(instances, camera)
+        played = time.perf_counter()
+        for name, seconds in zip(parts, (drawn - start, moved - start, colored - drawn, played - colored), strict=True):
             parts[name].append(1e3 * seconds)
+        compare(staged, scene, instances, camera)
     found = {name: statistics.median(values[1:]) for name, values in parts.items()}
     found["ms_raster"] = found["ms_frame"] - found["ms_motion"] - found["ms_colors"]
-    return {"fps": round(1e3 / found["ms_frame"], 1), **{name: round(value, 3) for name, value in found.items()}}
+    rates = {"fps": round(1e3 / found["ms_frame"], 1), "fps_stage": round(1e3 / found["ms_stage"], 1)}
+    return {**rates, **{name: round(value, 3) for name, value in found.items()}}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -111,21 +172,31 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=40_000, help="Gaussians")
     parser.add_argument("--size", type=int, default=400, help="width and height in px")
     parser.add_argument("--bodies", type=int, default=6)
+    parser.add_argument("--kind", choices=KINDS, default="cube", help="bodies are slabs of a cube, or balls in a room")
+    parser.add_argument("--share", type=float, default=SHARE, help="of the Gaussians, on bodies (2/3)")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--degrees", nargs="+", default=["0,0", "0,2", "3,2"], help="of colours and sky: SH,SKY")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--json", type=Path, help="write the rows here, too")
     options = parser.parse_args(arguments)
+    if not 0 <= options.share <= 1:
+        parser.error(f"--share: expected 0 to 1, got {options.share:g}")
+    if options.bodies < 1:
+        parser.error(f"--bodies: expected 1 or more, got {options.bodies}")
     camera, rows = make_camera(options.size), []
     print(" ".join(f"{column:>10}" for column in COLUMNS))
     for degrees in options.degrees:
         sh_degree, sky_degree = map(int, degrees.split(","))
-        scene = make_scene(options.count, options.bodies, sh_degree, sky_degree, camera)
+        scene = make_scene(
+            options.count, options.bodies, sh_degree, sky_degree, camera, kind=options.kind, share=options.share
+        )
         for threads in options.threads:
             compilation.set_threads(threads)
             torch.set_num_threads(threads)
             rows.append(
                 {
+                    "kind": options.kind,
+                    "share": round(options.share, 3),
                     "threads": threads,
                     "sh_degree": sh_degree,
                     "sky_degree": sky_degree,
