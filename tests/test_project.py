@@ -9,6 +9,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -85,6 +86,19 @@ def test_the_commands_of_the_readme_exist():
     commands = set(re.findall(r"^ {4}(?:.*&& )?r5dgs (\w+)", text, re.MULTILINE))
     known = set(next(a for a in cli.parser()._actions if a.dest == "command").choices)
     assert {"demo", "train", "bake", "evaluate"} <= commands <= known
+
+
+def test_the_python_of_the_readme_runs():
+    torch = pytest.importorskip("torch")
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert blocks
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["picture"].image.shape == (300, 400, 5) and names["picture"].alpha.max() > 0.1
+    for name in ("means", "quats", "scales", "channels"):
+        gradient = names[name].grad
+        assert torch.isfinite(gradient).all() and gradient.abs().max() > 0
 
 
 def test_links_between_documents_lead_somewhere():
