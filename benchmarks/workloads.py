@@ -294,7 +294,7 @@ def describe(workload: Workload) -> dict[str, float]:
         alpha = np.minimum(opacity[i] * np.exp(-0.5 * square), settings.alpha_max)
         touched = (alpha >= settings.alpha_min) & ~finished[part]
         after = passed[part] * (1 - alpha)
-        stops = touched & (after < settings.transmittance_min)
+        stops = touched & (after < settings.finished_at)
         finished[part] |= stops
         passed[part] = np.where(touched & ~stops, after, passed[part])
         pairs += int((touched & ~stops).sum())

@@ -143,7 +143,7 @@ def pack_limits(settings: RasterSettings) -> np.ndarray:
             math.log2(settings.alpha_min),
             math.log2(settings.alpha_max),
             settings.alpha_max,
-            settings.transmittance_min,
+            settings.finished_at,
             settings.id_alpha_min,
         ]
     )

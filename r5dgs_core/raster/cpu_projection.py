@@ -70,10 +70,29 @@ def _linearise(u, v, inverse_z, view):
 
 
 @helper
-def _rotate_row(view, row, k):
-    """Row ``row`` of W R, with k the nine entries of R."""
-    a, b, c = entry(view, ROTATION + 3 * row), entry(view, ROTATION + 3 * row + 1), entry(view, ROTATION + 3 * row + 2)
-    return a * k[0] + b * k[3] + c * k[6], a * k[1] + b * k[4] + c * k[7], a * k[2] + b * k[5] + c * k[8]
+def _rotation(view):
+    """W, row by row."""
+    r = ROTATION
+    return (
+        entry(view, r), entry(view, r + 1), entry(view, r + 2), entry(view, r + 3), entry(view, r + 4),
+        entry(view, r + 5), entry(view, r + 6), entry(view, r + 7), entry(view, r + 8),
+    )  # fmt: skip
+
+
+@helper
+def _product(a, b):
+    """a b of matrices given row by row."""
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
+        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
+        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
+        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )
 
 
 @helper
@@ -87,17 +106,17 @@ def _rotate(view, w, x, y, z):
         two * (xy + wz), one - two * (xx + zz), two * (yz - wx),
         two * (xz - wy), two * (yz + wx), one - two * (xx + yy),
     )  # fmt: skip
-    return _rotate_row(view, 0, local) + _rotate_row(view, 1, local) + _rotate_row(view, 2, local)
+    return _product(_rotation(view), local)
 
 
 @helper
-def _camera_row(view, row, a, b, c):
-    """Coordinate ``row`` of world points (a, b, c) in the camera frame."""
+def _to_camera(view, a, b, c):
+    """World points (a, b, c) in the camera frame."""
+    k = _rotation(view)
     return (
-        entry(view, TRANSLATION + row)
-        + entry(view, ROTATION + 3 * row) * a
-        + entry(view, ROTATION + 3 * row + 1) * b
-        + entry(view, ROTATION + 3 * row + 2) * c
+        entry(view, TRANSLATION) + k[0] * a + k[1] * b + k[2] * c,
+        entry(view, TRANSLATION + 1) + k[3] * a + k[4] * b + k[5] * c,
+        entry(view, TRANSLATION + 2) + k[6] * a + k[7] * b + k[8] * c,
     )
 
 
@@ -178,13 +197,13 @@ def project(worker, workers, view, means, quats, scales, opacities, geometry, de
         i = block * DOUBLES
         opacity = column(opacities, i, last, 1, 0)
         a, b, c = column(means, i, last, 3, 0), column(means, i, last, 3, 1), column(means, i, last, 3, 2)
-        z = _camera_row(view, 2, a, b, c)
+        x, y, z = _to_camera(view, a, b, c)
         seen = (opacity >= alpha_min) & (z > near)
         if not any_of(seen):
             set_column(radii, i, 1, 0, zero)
             store_doubles(depths, i, one)
             continue
-        x, y, z = _camera_row(view, 0, a, b, c), _camera_row(view, 1, a, b, c), select(seen, z, one)
+        z = select(seen, z, one)
         inverse_z = one / z
         u, v = x / z, y / z
         mean_x = entry(view, FX) * u + entry(view, SKEW) * v + entry(view, CX)
@@ -285,7 +304,7 @@ def project_backward(
         set_column(d_opacities, i, 1, 0, column(sums, 0, end, width, 0) / opacity)
 
         a, b, c = column(means, i, last, 3, 0), column(means, i, last, 3, 1), column(means, i, last, 3, 2)
-        x, y, z = _camera_row(view, 0, a, b, c), _camera_row(view, 1, a, b, c), _camera_row(view, 2, a, b, c)
+        x, y, z = _to_camera(view, a, b, c)
         z = select(z > entry(view, NEAR), z, one)
         w, qx, qy, qz, inverse_length = _unit(quats, i, last)
         r = _rotate(view, w, qx, qy, qz)
@@ -308,14 +327,16 @@ def project_backward(
         set_column(grad_norm, i, 1, 0, sqrt(d_x2d * d_x2d + d_y2d * d_y2d))
 
         # C = P P^T, P = J M, M = W R diag(s). dL/dP = L^T S L P with S the sums of squares; L P comes from the minors
-        # of P, because L^T S L expanded cancels for needles. d_m are the columns of dL/dM.
+        # of P, because L^T S L expanded cancels for needles. d_m is dL/dM, row by row.
         d_a, d_b = _to_axes(p, (suu, suv, svv), l11, l22, shift, one / yy, dilation)
-        d_m0 = j00 * d_a[0], j00 * d_a[1], j00 * d_a[2]
-        d_m1 = j01 * d_a[0] + j11 * d_b[0], j01 * d_a[1] + j11 * d_b[1], j01 * d_a[2] + j11 * d_b[2]
-        d_m2 = j02 * d_a[0] + j12 * d_b[0], j02 * d_a[1] + j12 * d_b[1], j02 * d_a[2] + j12 * d_b[2]
-        set_column(d_scales, i, 3, 0, d_m0[0] * r[0] + d_m1[0] * r[3] + d_m2[0] * r[6])
-        set_column(d_scales, i, 3, 1, d_m0[1] * r[1] + d_m1[1] * r[4] + d_m2[1] * r[7])
-        set_column(d_scales, i, 3, 2, d_m0[2] * r[2] + d_m1[2] * r[5] + d_m2[2] * r[8])
+        d_m = (
+            j00 * d_a[0], j00 * d_a[1], j00 * d_a[2],
+            j01 * d_a[0] + j11 * d_b[0], j01 * d_a[1] + j11 * d_b[1], j01 * d_a[2] + j11 * d_b[2],
+            j02 * d_a[0] + j12 * d_b[0], j02 * d_a[1] + j12 * d_b[1], j02 * d_a[2] + j12 * d_b[2],
+        )  # fmt: skip
+        set_column(d_scales, i, 3, 0, d_m[0] * r[0] + d_m[3] * r[3] + d_m[6] * r[6])
+        set_column(d_scales, i, 3, 1, d_m[1] * r[1] + d_m[4] * r[4] + d_m[7] * r[7])
+        set_column(d_scales, i, 3, 2, d_m[2] * r[2] + d_m[5] * r[5] + d_m[8] * r[8])
         a0, a1, a2 = d_a[0] * s[0], d_a[1] * s[1], d_a[2] * s[2]
         b0, b1, b2 = d_b[0] * s[0], d_b[1] * s[1], d_b[2] * s[2]
         d_j00 = a0 * r[0] + a1 * r[1] + a2 * r[2]
@@ -331,18 +352,16 @@ def project_backward(
         d_x = select(inside_u, d_x - j00 * d_j02 * inverse_z, d_x)
         d_y = select(inside_v, d_y - (j01 * d_j02 + j11 * d_j12) * inverse_z, d_y)
         d_z = d_z - (d_x * u + d_y * v)
-        for k in range(3):
-            d_mean = (
-                entry(view, ROTATION + k) * d_x
-                + entry(view, ROTATION + 3 + k) * d_y
-                + entry(view, ROTATION + 6 + k) * d_z
-            )
-            set_column(d_means, i, 3, k, d_mean)
+        t = _rotation(view)
+        set_column(d_means, i, 3, 0, t[0] * d_x + t[3] * d_y + t[6] * d_z)
+        set_column(d_means, i, 3, 1, t[1] * d_x + t[4] * d_y + t[7] * d_z)
+        set_column(d_means, i, 3, 2, t[2] * d_x + t[5] * d_y + t[8] * d_z)
 
         # R = W^T (W R); then through the normalisation of the quaternion.
-        r00, r01, r02 = _turn_back(view, 0, d_m0, d_m1, d_m2, s)
-        r10, r11, r12 = _turn_back(view, 1, d_m0, d_m1, d_m2, s)
-        r20, r21, r22 = _turn_back(view, 2, d_m0, d_m1, d_m2, s)
+        turned = _product((t[0], t[3], t[6], t[1], t[4], t[7], t[2], t[5], t[8]), d_m)
+        r00, r01, r02 = turned[0] * s[0], turned[1] * s[1], turned[2] * s[2]
+        r10, r11, r12 = turned[3] * s[0], turned[4] * s[1], turned[5] * s[2]
+        r20, r21, r22 = turned[6] * s[0], turned[7] * s[1], turned[8] * s[2]
         d_w = two * (qx * (r21 - r12) + qy * (r02 - r20) + qz * (r10 - r01))
         d_qx = two * (qy * (r01 + r10) + qz * (r02 + r20) + w * (r21 - r12) - two * qx * (r11 + r22))
         d_qy = two * (qx * (r01 + r10) + qz * (r12 + r21) + w * (r02 - r20) - two * qy * (r00 + r22))
@@ -372,14 +391,3 @@ def _to_axes(p, sums, l11, l22, shift, inverse_yy, dilation):
         l22 * (suv * w2 + svv * z2) - shift * d_a[2],
     )
     return d_a, d_b
-
-
-@helper
-def _turn_back(view, row, d_m0, d_m1, d_m2, s):
-    """Row ``row`` of W^T dL/dM diag(s)."""
-    a, b, c = entry(view, ROTATION + row), entry(view, ROTATION + 3 + row), entry(view, ROTATION + 6 + row)
-    return (
-        (a * d_m0[0] + b * d_m1[0] + c * d_m2[0]) * s[0],
-        (a * d_m0[1] + b * d_m1[1] + c * d_m2[1]) * s[1],
-        (a * d_m0[2] + b * d_m1[2] + c * d_m2[2]) * s[2],
-    )

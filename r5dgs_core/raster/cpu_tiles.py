@@ -81,8 +81,8 @@ def sort_part(worker, workers, bits, depths, radii, bounds, order, counts):
     part = order[before : before + count]
     for k in range(np.uint64(count)):
         part[k] = np.int32(items[k] & np.uint64(0xFFFFFFFF))
-    begin = 0
-    for k in range(1, count + 1):
+    begin = np.int64(0)
+    for k in range(np.int64(1), count + 1):
         if k == count or items[k] >> np.uint64(32) != items[begin] >> np.uint64(32):
             if k - begin > 1:
                 _sort_run(part, begin, k, depths)

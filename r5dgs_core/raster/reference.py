@@ -207,7 +207,7 @@ def _blend(means2d, axes, opacities, values, labels, box, settings):
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0)
 
     with torch.no_grad():  # a pixel stops at the first Gaussian that would bring T below the minimum
-        keep = torch.cumprod(1 - alpha, 1) >= settings.transmittance_min
+        keep = torch.cumprod(1 - alpha, 1) >= settings.finished_at
     alpha = torch.where(keep, alpha, 0)
     # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
     log_factors = torch.log1p(-alpha)

@@ -20,7 +20,8 @@ class RasterSettings:
             half field of view before the projection is linearised there: 1.3 times the field of view for 0.3.
         alpha_min: Contributions below this are dropped.
         alpha_max: Contributions are capped here; the gradient is zero where the cap holds.
-        transmittance_min: A pixel is finished before the contribution that would bring its transmittance below this.
+        transmittance_min: A pixel is finished before the contribution that would bring its transmittance down to this,
+            two layers at the default cap for example; see `finished_at`.
         id_alpha_min: Pixels with less alpha than this belong to no object (id -1).
     """
 
@@ -31,6 +32,15 @@ class RasterSettings:
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
     id_alpha_min: float = 0.5
+
+    @property
+    def finished_at(self) -> float:
+        """What transmittance must not fall below: ``transmittance_min`` with a margin for rounding.
+
+        Two capped layers leave (1 - 0.99)^2 = 1e-4 of the light, a rounding below it in float32 and a rounding above in
+        float64; 3DGS and gsplat compute in float32 and stop there, so everyone has to.
+        """
+        return self.transmittance_min * (1 + 1e-6)
 
     def __post_init__(self):
         if not self.near_plane > 0 or not self.dilation > 0 or not self.frustum_slack >= 0:

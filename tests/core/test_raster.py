@@ -115,7 +115,7 @@ def test_reference_is_the_loop_of_3dgs():
                 alpha = min(alpha, settings.alpha_max)
                 if alpha < settings.alpha_min:
                     continue
-                if passed[y, x] * (1 - alpha) < settings.transmittance_min:
+                if passed[y, x] * (1 - alpha) < settings.finished_at:
                     stopped += 1
                     break
                 image[y, x] += passed[y, x] * alpha * channels[i].numpy()
