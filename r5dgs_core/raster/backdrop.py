@@ -7,6 +7,8 @@ whatever order of depth the parts lie; what is saved is all work on still Gaussi
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import torch
 
@@ -19,9 +21,17 @@ _NOTHING = np.empty((0, 0), np.float32)
 
 
 class Backdrop:
-    """Gaussians that stand still, drawn once for one camera by the backend `cpu`.
+    """Gaussians that stand still, drawn once for one camera by the backend `cpu`, without gradients.
 
-    The inputs are those of `rasterize_splats`, without gradients; labels are given for both parts or for neither.
+    Args:
+        means, quats, scales, opacities, channels, camera, background: As for `rasterize_splats`; copied.
+        labels: As there; for both parts or for neither. [N]
+        ranks: Place of each Gaussian among all, rising, which decides at equal depths; before all that moves where
+            None. [N]
+        settings: As there.
+
+    Raises:
+        ValueError, BackendError: As `rasterize_splats` does.
     """
 
     def __init__(
@@ -35,29 +45,33 @@ class Backdrop:
         background: torch.Tensor | None = None,  # [D] or [H, W, D]
         *,
         labels: torch.Tensor | None = None,  # [N]
+        ranks: np.ndarray | None = None,  # [N]
         settings: RasterSettings | None = None,
     ):
         splatting.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
         splatting.choose_backend("cpu", means)
         settings = settings or RasterSettings()
+        self._lock = threading.Lock()
         self._camera = camera
         self._view, self._limits = cpu.pack_view(camera, settings), cpu.pack_limits(settings)
-        self._background = cpu.pack_background(background, channels.shape[1])
-        *shapes, still_channels = (_array(t) for t in (means, quats, scales, opacities, channels))
+        self._background = cpu.pack_background(background, channels.shape[1]).copy()
         # Rows of the tables: first what is still, padded, then what moves.
-        self._count, self._room = cpu_projection.padded_rows(len(means)), 0
-        self._geometry = cpu.aligned((self._count, cpu_projection.GEOMETRY), np.float64)
-        self._depths, self._boxes = np.empty(self._count), np.empty(self._count)
-        self._radii = np.empty(self._count, np.float32)
-        self._channels = np.zeros((self._count, channels.shape[1]), np.float32)
-        self._channels[: len(means)] = still_channels
+        n, rows = len(means), cpu_projection.padded_rows(len(means))
+        self._count = self._end = rows
+        self._geometry = cpu.aligned((rows, cpu_projection.GEOMETRY), np.float64)
+        self._depths, self._boxes, self._radii = np.empty(rows), np.empty(rows), np.empty(rows, np.float32)
+        self._channels = np.zeros((rows, channels.shape[1]), np.float32)
+        self._channels[:n] = cpu.to_array(channels)
+        self._ranks = np.zeros(rows, np.int64)
+        self._ranks[:n] = np.arange(n) - n if ranks is None else ranks
         self._labels = None
         if labels is not None:
-            self._labels = np.full(self._count, -1, np.int64)
-            self._labels[: len(means)] = _array(labels)
+            self._labels = np.full(rows, -1, np.int64)
+            self._labels[:n] = cpu.to_numbers(labels)
+        shapes = [cpu.to_array(t) for t in (means, quats, scales, opacities)]
         cpu.project(self._view, shapes, self._geometry, self._depths, self._boxes, self._radii)
-        self._starts, self._rows = self._assign(0)
-        self._names, self._votes = cpu.pack_labels(self._labels)
+        self._starts, self._rows = self._assign(0, rows)
+        self._names, self._votes = cpu.pack_labels(_tensor(self._labels))
         size = (camera.height, camera.width)
         self._image = np.empty((*size, channels.shape[1]), np.float32)
         self._alpha, self._depth = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -73,55 +87,75 @@ class Backdrop:
         opacities: torch.Tensor,  # [M]
         channels: torch.Tensor,  # [M, D]
         labels: torch.Tensor | None = None,  # [M]
+        ranks: np.ndarray | None = None,  # [M]
     ) -> SplatImage:
-        """What `rasterize_splats` gives for the still Gaussians followed by these."""
+        """Draw what moves into what stands still; from several threads one call waits for the other.
+
+        Args:
+            means, quats, scales, opacities, channels: As for `rasterize_splats`.
+            labels: As there; only, and always, where the backdrop has labels. [M]
+            ranks: Place of each Gaussian among all, rising; after all that stands still where None. [M]
+
+        Returns:
+            What `rasterize_splats` gives for all Gaussians in the order of their ranks, without gradients.
+
+        Raises:
+            ValueError, BackendError: As `rasterize_splats` does; the backdrop stays as it was.
+        """
         splatting.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
         splatting.choose_backend("cpu", means)
-        if channels.shape[1] != self._channels.shape[1]:
-            raise ValueError(
-                f"channels: expected {self._channels.shape[1]} as in the backdrop, got {channels.shape[1]}"
-            )
+        expected = self._channels.shape[1]
+        if channels.shape[1] != expected:
+            raise ValueError(f"channels: expected {expected} as in the backdrop, got {channels.shape[1]}")
         if (labels is None) != (self._labels is None):
             raise ValueError("labels: expected for the backdrop and for what moves, or for neither")
-        *shapes, moving_channels = (_array(t) for t in (means, quats, scales, opacities, channels))
-        begin, rows = self._count, cpu_projection.padded_rows(len(means))
-        self._make_room(rows)
-        parts = (table[begin : begin + rows] for table in (self._geometry, self._depths, self._boxes, self._radii))
-        cpu.project(self._view, shapes, *parts)
-        self._channels[begin : begin + len(means)] = moving_channels
-        if self._labels is not None and labels is not None:
-            new = _array(labels)
-            if not np.array_equal(self._labels[begin : begin + len(new)], new):
-                self._labels[begin : begin + len(new)] = new
-                self._names, self._votes = cpu.pack_labels(self._labels)
-        moving_starts, moving_rows = self._assign(begin, begin + rows)
-        touched = np.flatnonzero(np.diff(moving_starts))
-        starts, merged = self._merge(touched, moving_starts, moving_rows)
-        results = tuple(array.copy() for array in (self._image, self._alpha, self._depth, self._ids))
-        self._blend(touched, starts, merged, results)
+        numbers = None if labels is None else cpu.to_numbers(labels)
+        shapes = [cpu.to_array(t) for t in (means, quats, scales, opacities)]
+        with self._lock:
+            self._place(shapes, cpu.to_array(channels), numbers, np.arange(len(means)) if ranks is None else ranks)
+            moving_starts, moving_rows = self._assign(self._count, self._end)
+            touched = np.flatnonzero(np.diff(moving_starts))
+            starts, merged = self._merge(touched, moving_starts, moving_rows)
+            results = tuple(array.copy() for array in (self._image, self._alpha, self._depth, self._ids))
+            self._blend(touched, starts, merged, results)
         image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
-        return SplatImage(image, alpha, depth, None if self._labels is None else ids)
+        return SplatImage(image, alpha, depth, None if labels is None else ids)
 
-    def _make_room(self, rows: int) -> None:
-        """Let the tables have at least that many rows for what moves."""
-        if rows <= self._room:
-            return
+    def _place(self, shapes, channels, numbers, ranks) -> None:
+        """Put what moves behind what is still in the tables."""
+        begin, n = self._count, len(channels)
+        self._end = begin + cpu_projection.padded_rows(n)
+        if self._end > len(self._geometry):
+            self._make_room()
+        part = slice(begin, self._end)
+        cpu.project(
+            self._view, shapes, self._geometry[part], self._depths[part], self._boxes[part], self._radii[part]
+        )  # fmt: skip
+        self._channels[begin : begin + n] = channels
+        self._ranks[begin : begin + n] = ranks
+        if self._labels is not None and not np.array_equal(self._labels[begin : begin + n], numbers):
+            self._labels[begin : begin + n] = numbers
+            self._names, self._votes = cpu.pack_labels(_tensor(self._labels))
+
+    def _make_room(self) -> None:
+        """Let the tables have rows up to the end."""
 
         def longer(table, fill):
-            result = np.full((self._count + rows, *table.shape[1:]), fill, table.dtype)
+            result = np.full((self._end, *table.shape[1:]), fill, table.dtype)
             result[: self._count] = table[: self._count]
             return result
 
-        geometry = cpu.aligned((self._count + rows, cpu_projection.GEOMETRY), np.float64)
+        geometry = cpu.aligned((self._end, cpu_projection.GEOMETRY), np.float64)
         geometry[: self._count] = self._geometry[: self._count]
-        self._geometry, self._room = geometry, rows
+        self._geometry = geometry
         self._depths, self._boxes = longer(self._depths, 1.0), longer(self._boxes, 0.0)
         self._radii, self._channels = longer(self._radii, 0), longer(self._channels, 0)
+        self._ranks = longer(self._ranks, 0)
         if self._labels is not None:
             self._labels = longer(self._labels, -1)
-            self._names, self._votes = cpu.pack_labels(self._labels)
+            self._names, self._votes = cpu.pack_labels(_tensor(self._labels))
 
-    def _assign(self, begin: int, end: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def _assign(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of some rows: where those of each tile begin, and the rows."""
         order = cpu_tiles.sort_by_depth(self._depths[begin:end], self._radii[begin:end]) + np.int32(begin)
         starts, rows, _, _ = cpu_tiles.assign_tiles(
@@ -131,16 +165,14 @@ class Backdrop:
 
     def _merge(self, tiles, moving_starts, moving_rows):
         """Pairs of some tiles, still and moving ones: where those of each tile begin, and the rows."""
-        spans, rows = [], []
-        for all_starts, all_rows in ((self._starts, self._rows), (moving_starts, moving_rows)):
-            spans.append(np.stack([all_starts[tiles], all_starts[tiles + 1]], 1))
-            rows.append(all_rows)
+        still = np.stack([self._starts[tiles], self._starts[tiles + 1]], 1)
+        moving = np.stack([moving_starts[tiles], moving_starts[tiles + 1]], 1)
         starts = np.zeros(len(tiles) + 1, np.int64)
-        np.cumsum(sum(span[:, 1] - span[:, 0] for span in spans), out=starts[1:])
+        np.cumsum(still[:, 1] - still[:, 0] + moving[:, 1] - moving[:, 0], out=starts[1:])
         merged = np.empty(starts[-1], np.int32)
         run(
             cpu_tiles.merge_pairs, len(tiles) // 8,
-            self._depths, spans[0], rows[0], spans[1], rows[1], starts, merged,
+            self._depths, self._ranks, still, self._rows, moving, moving_rows, starts, merged,
         )  # fmt: skip
         return starts, merged
 
@@ -154,5 +186,5 @@ class Backdrop:
         )  # fmt: skip
 
 
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
+def _tensor(numbers: np.ndarray | None) -> torch.Tensor | None:
+    return None if numbers is None else torch.from_numpy(numbers)

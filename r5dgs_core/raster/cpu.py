@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..scene.cameras import Camera
-from . import cpu_blending, cpu_projection, cpu_tiles
+from . import cpu_blending, cpu_blending_backward, cpu_projection, cpu_tiles
 from .compile import run
 from .reference import frustum_slopes
 from .settings import RasterSettings, RasterStats, SplatImage
@@ -18,15 +18,27 @@ from .settings import RasterSettings, RasterStats, SplatImage
 _WORTH_A_THREAD = 2000  # Gaussians; fewer are projected before a second thread would wake up
 _FEW_LABELS = 16  # labels below this are not looked through for gaps
 _MOST_LABEL = 1 << 24  # labels below this are whole numbers in float32
+# Distance of log2(alpha) from a cut-off within which float64 decides: several times the largest rounding of needles at
+# the usual dilation, which grows as the whitening does.
+_CLOSE_LOG2, _USUAL_DILATION = 2e-4, 0.3
 _EMPTY = np.empty((0, 0), np.float32)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a call draws by, beside its tensors."""
+
+    camera: Camera
+    view: np.ndarray
+    limits: np.ndarray
+    names_votes: tuple[np.ndarray, np.ndarray]
+    stats: RasterStats | None
 
 
 @dataclass(frozen=True)
 class _Pass:
     """What the backward pass needs of the forward pass, all numpy and never handed out."""
 
-    view: np.ndarray
-    limits: np.ndarray
     geometry: np.ndarray
     depths: np.ndarray
     tile_starts: np.ndarray
@@ -37,7 +49,6 @@ class _Pass:
     slot_starts: np.ndarray
     transmittance: np.ndarray
     last_pairs: np.ndarray
-    background: np.ndarray
 
 
 def rasterize_splats(
@@ -53,14 +64,29 @@ def rasterize_splats(
     stats: RasterStats | None,
 ) -> SplatImage:
     """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
-    image, alpha, depth, ids = _Rasterize.apply(
-        means, quats, scales, opacities, channels, background, camera, labels, settings, stats
-    )
+    view, limits, votes = pack_view(camera, settings), pack_limits(settings), pack_labels(labels)
+    plan = _Plan(camera, view, limits, votes, stats)
+    inputs = (means, quats, scales, opacities, channels, background)
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs):
+        image, alpha, depth, ids = _Rasterize.apply(*inputs, plan)
+    else:
+        _, *results = _forward(inputs, plan, False)
+        image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
     return SplatImage(image, alpha, depth, ids if labels is not None else None)
 
 
 def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
-    """Everything that projection needs, in the order of the constants in `cpu_projection`. [26] float64"""
+    """Everything that projection needs, in the order of the constants in `cpu_projection`. [VIEW] float64
+
+    Raises:
+        ValueError: The image has more tiles along a side than can be counted.
+    """
+    most = cpu_projection.MOST_TILES * cpu_projection.TILE
+    if max(camera.width, camera.height) > most:
+        raise ValueError(
+            f"camera: expected an image of at most {most} px along each side, got {camera.width} x {camera.height}; "
+            "remedy: draw it in parts"
+        )
     k, T = camera.intrinsics, camera.T_cam_world
     return np.array(
         [
@@ -76,52 +102,42 @@ def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, channels, background, camera, labels, settings, stats):
-        arrays = [t.detach().contiguous().numpy() for t in (means, quats, scales, opacities, channels)]
-        n, n_channels = channels.shape
-        behind = pack_background(background, n_channels)
-        view = pack_view(camera, settings)
-        radii = np.empty(cpu_projection.padded_rows(n), np.float32)
-        with_state = any(ctx.needs_input_grad)
-        state, *results = _forward(arrays, behind, camera, labels, settings, view, radii, with_state)
-        if stats is not None:
-            stats.radii = torch.from_numpy(radii[:n])
-            stats.visible = stats.radii > 0
-            stats.grad_norm = torch.zeros(n)
+    def forward(ctx, means, quats, scales, opacities, channels, background, plan):
+        inputs = (means, quats, scales, opacities, channels, background)
+        ctx.state, *results = _forward(inputs, plan, True)
         ctx.set_materialize_grads(False)
         image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
-        # Results are saved as tensors: whoever changes one in place gets torch's error instead of a wrong gradient.
-        ctx.save_for_backward(means, quats, scales, opacities, channels, image, alpha, depth)
-        ctx.state, ctx.stats = state, stats
-        ctx.background_shape = None if background is None else background.shape
+        # Saved as tensors: whoever changes one in place gets torch's error instead of a wrong gradient.
+        ctx.save_for_backward(*inputs, alpha, depth)
+        ctx.plan, ctx.image_shape = plan, image.shape
         ctx.mark_non_differentiable(ids)
         return image, alpha, depth, ids
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth, d_ids):
-        state: _Pass = ctx.state
-        arrays = [t.detach().contiguous().numpy() for t in ctx.saved_tensors]
+        inputs, results = ctx.saved_tensors[:6], ctx.saved_tensors[6:]
+        state, plan, background = ctx.state, ctx.plan, inputs[5]
         if d_image is None:
-            d_image = torch.zeros(ctx.saved_tensors[5].shape)
+            d_image = torch.zeros(ctx.image_shape)
         d_image = d_image.contiguous().numpy()
         d_alpha = _EMPTY if d_alpha is None else d_alpha.contiguous().numpy()
         d_depth = _EMPTY if d_depth is None else d_depth.contiguous().numpy()
         with_geometry = any(ctx.needs_input_grad[:4])
-        gradients, grad_norm = _backward(state, arrays, d_image, d_alpha, d_depth, with_geometry)
-        if ctx.stats is not None:
-            ctx.stats.grad_norm = torch.from_numpy(grad_norm)
+        gradients, grad_norm = _backward(state, plan, inputs, results, d_image, d_alpha, d_depth, with_geometry)
+        if plan.stats is not None:
+            plan.stats.grad_norm = torch.from_numpy(grad_norm)
         d_background = None
         if ctx.needs_input_grad[5]:
             shown = d_image * state.transmittance[..., None]
-            shape = ctx.background_shape
-            d_background = torch.from_numpy(shown if len(shape) == 3 else shown.sum((0, 1), dtype=np.float64))
-            d_background = d_background.to(torch.float32)
+            each_pixel = background.ndim == 3
+            d_background = torch.from_numpy(shown if each_pixel else shown.sum((0, 1), dtype=np.float64))
+            d_background = d_background.to(background.dtype)
         wanted = (
             torch.from_numpy(g) if needed else None
             for g, needed in zip(gradients, ctx.needs_input_grad[:5], strict=True)
         )
-        return (*wanted, d_background, None, None, None, None)
+        return (*wanted, d_background, None)
 
 
 def project(
@@ -137,7 +153,7 @@ def project(
 
 
 def pack_limits(settings: RasterSettings) -> np.ndarray:
-    """The thresholds in the order of the constants in `cpu_exact`. [5] float64"""
+    """The thresholds in the order of the constants in `cpu_exact`. [LIMITS] float64"""
     return np.array(
         [
             math.log2(settings.alpha_min),
@@ -145,6 +161,7 @@ def pack_limits(settings: RasterSettings) -> np.ndarray:
             settings.alpha_max,
             settings.finished_at,
             settings.id_alpha_min,
+            _CLOSE_LOG2 * max(1.0, math.sqrt(_USUAL_DILATION / settings.dilation)),
         ]
     )
 
@@ -156,7 +173,7 @@ def pack_background(background: torch.Tensor | None, n_channels: int) -> np.ndar
     return background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
 
 
-def pack_labels(labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def pack_labels(labels: torch.Tensor | None) -> tuple[np.ndarray, np.ndarray]:
     """The labels that occur, rising, all negative ones as -1 [L] float32, and the place of each Gaussian's in that [N].
 
     Raises:
@@ -164,14 +181,26 @@ def pack_labels(labels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """
     if labels is None:
         return np.empty(0, np.float32), np.empty(0, np.int32)
-    labels = np.ascontiguousarray(labels)
-    most = labels.max(initial=-1)
-    if most >= _MOST_LABEL:
-        raise ValueError(f"labels: expected at most {_MOST_LABEL - 1}, found {most} at index {labels.argmax()}")
-    if most < _FEW_LABELS and labels.min(initial=-1) >= -1:  # nothing to find: as many planes as numbers
-        return np.arange(-1, most + 1, dtype=np.float32), (labels + 1).astype(np.int32)
-    names, places = np.unique(np.maximum(labels, -1), return_inverse=True)
+    numbers = to_numbers(labels)
+    most = numbers.max(initial=-1)
+    if most < _FEW_LABELS and numbers.min(initial=-1) >= -1:  # nothing to find: as many planes as numbers
+        return np.arange(-1, most + 1, dtype=np.float32), (numbers + 1).astype(np.int32)
+    names, places = np.unique(np.maximum(numbers, -1), return_inverse=True)
     return names.astype(np.float32), places.astype(np.int32)
+
+
+def to_numbers(labels: torch.Tensor) -> np.ndarray:
+    """Labels of any integer type as int64. Raises ValueError where one is too large to be counted."""
+    numbers = labels.detach().numpy().astype(np.int64)
+    if len(numbers) and numbers.max() >= _MOST_LABEL:
+        at = numbers.argmax()
+        raise ValueError(f"labels: expected at most {_MOST_LABEL - 1}, found {numbers[at]} at index {at}")
+    return numbers
+
+
+def to_array(tensor: torch.Tensor) -> np.ndarray:
+    """The tensor's memory as an array, C-contiguous."""
+    return tensor.detach().contiguous().numpy()
 
 
 def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
@@ -182,54 +211,62 @@ def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
     return memory[skip : skip + size].view(dtype).reshape(shape)
 
 
-def _forward(arrays, background, camera, labels, settings, view, radii, with_state):
-    """Project, sort, assign and blend; fills ``radii`` [N]. Returns the state or None, image, alpha, depth and ids."""
-    *shapes, channels = arrays
-    height, width = camera.height, camera.width
-    geometry = aligned((len(radii), cpu_projection.GEOMETRY), np.float64)
-    depths, boxes = np.empty(len(radii)), np.empty(len(radii))
-    project(view, shapes, geometry, depths, boxes, radii)
+def _forward(inputs, plan: _Plan, with_state: bool):
+    """Project, sort, assign and blend. Returns the state or None, image, alpha, depth and ids."""
+    *shapes, channels = (to_array(t) for t in inputs[:5])
+    (n, n_channels), height, width = channels.shape, plan.camera.height, plan.camera.width
+    rows = cpu_projection.padded_rows(n)
+    geometry = aligned((rows, cpu_projection.GEOMETRY), np.float64)
+    depths, boxes, radii = np.empty(rows), np.empty(rows), np.empty(rows, np.float32)
+    project(plan.view, shapes, geometry, depths, boxes, radii)
     order = cpu_tiles.sort_by_depth(depths, radii)
     tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
         order, boxes, geometry, width, height, with_state
     )
-    names, votes = pack_labels(None if labels is None else labels.detach().numpy())
-    limits = pack_limits(settings)
-    image = np.empty((height, width, channels.shape[1]), np.float32)
+    names, votes = plan.names_votes
+    image = np.empty((height, width, n_channels), np.float32)
     alpha, depth = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    ids = np.full((height, width) if labels is not None else (0, 0), -1, np.int32)
+    ids = np.full((height, width) if len(names) else (0, 0), -1, np.int32)
     transmittance, last_pairs = (np.empty((height, width) if with_state else (0, 0), np.float32) for _ in range(2))
     tiles = np.arange(len(tile_starts) - 1)
     tile_ends, pair_blocks = np.empty(len(tiles), np.int64), np.empty(len(pair_rows), np.uint64)
     run(
         cpu_blending.blend, len(tiles) // 2,
-        tiles, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image, alpha,
-        depth, transmittance, last_pairs, ids, tile_ends, pair_blocks,
+        tiles, tile_starts, pair_rows, geometry, channels, depths, votes, names,
+        pack_background(inputs[5], n_channels), plan.limits, image, alpha, depth, transmittance, last_pairs, ids,
+        tile_ends, pair_blocks,
     )  # fmt: skip
-    state = _Pass(
-        view, limits, geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts,
-        transmittance, last_pairs, background,
-    )  # fmt: skip
-    return state if with_state else None, image, alpha, depth, ids
+    if plan.stats is not None:
+        plan.stats.radii = torch.from_numpy(radii[:n])
+        plan.stats.visible = plan.stats.radii > 0
+        plan.stats.grad_norm = torch.zeros(n)
+    state = None
+    if with_state:
+        state = _Pass(
+            geometry, depths, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, slot_starts, transmittance,
+            last_pairs,
+        )  # fmt: skip
+    return state, image, alpha, depth, ids
 
 
-def _backward(state: _Pass, arrays, d_image, d_alpha, d_depth, with_geometry):
+def _backward(state: _Pass, plan: _Plan, inputs, results, d_image, d_alpha, d_depth, with_geometry):
     """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
-    means, quats, scales, opacities, channels, _, alpha, depth = arrays
+    means, quats, scales, opacities, channels = (to_array(t) for t in inputs[:5])
+    alpha, depth = (to_array(t) for t in results)
     n, n_channels = channels.shape
     slots = aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
     run(
-        cpu_blending.blend_backward, len(state.tile_ends) // 2,
+        cpu_blending_backward.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_rows, state.pair_slots, state.pair_blocks, state.geometry,
-        channels, state.depths, state.background, state.limits, alpha, depth, state.transmittance, state.last_pairs,
-        d_image, d_alpha, d_depth, with_geometry, slots,
+        channels, state.depths, pack_background(inputs[5], n_channels), plan.limits, alpha, depth,
+        state.transmittance, state.last_pairs, d_image, d_alpha, d_depth, with_geometry, slots,
     )  # fmt: skip
     rows = cpu_projection.padded_rows(n)
     gradients = [np.zeros(rows * k, np.float32) for k in (3, 4, 3, 1, n_channels)]
     grad_norm = np.zeros(rows, np.float32)
     run(
         cpu_projection.project_backward, n // _WORTH_A_THREAD,
-        state.view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, state.slot_starts, slots,
+        plan.view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, state.slot_starts, slots,
         with_geometry, n_channels, *gradients, grad_norm,
     )  # fmt: skip
     shapes = [means.shape, quats.shape, scales.shape, opacities.shape, channels.shape]

@@ -16,12 +16,12 @@ from .lanes import LANES
 BLOCK = 4  # px, width and height of a block; LANES pixels
 BLOCKS = 8  # blocks along each side of a tile
 
-# Distances from a cut-off beyond which float32 decides: several times the largest rounding of needles in large images.
-CLOSE_LOG2 = 2e-4
+# Relative distance of transmittance from its minimum beyond which float32 decides, far above its rounding.
 CLOSE_TRANSMITTANCE = 2e-4
 
-# Entries of the limits vector.
-LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN = range(5)
+# Entries of the limits vector; CLOSE_LOG2 is the distance of log2(alpha) from a cut-off beyond which float32 decides.
+LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN, CLOSE_LOG2 = range(6)
+LIMITS = 6
 
 
 @helper

@@ -16,11 +16,14 @@ from .cpu_projection import BOX_DIGIT, BOX_MARGIN, EXTENT_X, EXTENT_Y, L11, L12,
 _BOX_BITS = np.uint64(BOX_DIGIT.bit_length() - 1)
 _DIGIT = 11  # bits per pass of the radix sort
 _WORTH_A_THREAD = 4000  # Gaussians
+_MOST_PAIRS = (1 << 31) - 1  # slots are numbered in int32
+_MOST_PAIRS_OF_A_TILE = 1 << 24  # which are numbered in float32
 
 
 def sort_by_depth(depths, radii):
     """Rows with a radius, by increasing depth (float64), rows of equal depth in their order. -> [V] int32"""
-    bits = depths.astype(np.float32).view(np.uint32)
+    with np.errstate(over="ignore"):  # depths beyond float32 sort last, and then by float64
+        bits = depths.astype(np.float32).view(np.uint32)
     parts = max(1, min(threads(), len(bits) // _WORTH_A_THREAD))
     # Every part sorts a range of depths; where the ranges end does not change the result.
     bounds = np.zeros(parts + 1, np.int64)
@@ -216,6 +219,11 @@ def assign_tiles(order, boxes, geometry, width, height, with_slots):
     np.cumsum(slot_starts, out=slot_starts)
     tile_starts = np.zeros(columns * rows + 1, np.int64)
     np.cumsum(counts.sum(0), out=tile_starts[1:])
+    if tile_starts[-1] > _MOST_PAIRS or np.diff(tile_starts).max(initial=0) > _MOST_PAIRS_OF_A_TILE:
+        raise ValueError(
+            f"means: {len(order)} Gaussians touch {tile_starts[-1]} tiles in all, more than can be counted; remedy: "
+            "draw smaller images, or fewer Gaussians that cover all of it"
+        )
     cursors = tile_starts[:-1] + np.cumsum(counts, 0) - counts
     pair_rows = np.empty(tile_starts[-1], np.int32)
     pair_slots = np.empty(tile_starts[-1] if with_slots else 0, np.int32)
@@ -224,13 +232,12 @@ def assign_tiles(order, boxes, geometry, width, height, with_slots):
 
 
 @kernel
-def merge_pairs(worker, workers, depths, spans, rows, other_spans, other_rows, merged_starts, merged_rows):
+def merge_pairs(worker, workers, depths, ranks, spans, rows, other_spans, other_rows, merged_starts, merged_rows):
     """Merge two lists of pairs, tile by tile, both near to far.
-
-    Of two rows at the same depth the lower one is nearer, as in `sort_by_depth`.
 
     Args:
         depths: Of all rows. [n]
+        ranks: Of two rows at the same depth, that with the lower rank is nearer. [n] int64
         spans, rows: First and one past the last pair of each tile, and the rows of the pairs. [K, 2], [P]
         other_spans, other_rows: The same of the other list.
         merged_starts: Where those of each tile go. [K + 1]
@@ -243,7 +250,7 @@ def merge_pairs(worker, workers, depths, spans, rows, other_spans, other_rows, m
             first = b == b_end
             if a < a_end and b < b_end:
                 row, other = rows[a], other_rows[b]
-                first = depths[row] < depths[other] or (depths[row] == depths[other] and row < other)
+                first = depths[row] < depths[other] or (depths[row] == depths[other] and ranks[row] < ranks[other])
             if first:
                 merged_rows[at] = rows[a]
                 a += 1

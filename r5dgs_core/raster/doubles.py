@@ -16,7 +16,7 @@ _DOUBLES = ir.VectorType(ir.DoubleType(), DOUBLES)
 _FLOATS = ir.VectorType(ir.FloatType(), DOUBLES)
 _INTS = ir.VectorType(ir.IntType(64), DOUBLES)
 
-doubles, double_mask = make(ir.DoubleType(), DOUBLES, f"v{DOUBLES}f64")
+doubles, _ = make(ir.DoubleType(), DOUBLES, f"v{DOUBLES}f64")
 
 
 @operation

@@ -9,6 +9,7 @@ shown or behind it, everything is drawn; from the next frame on, the instances t
 from __future__ import annotations
 
 import importlib.util
+import threading
 import time
 from collections.abc import Sequence
 
@@ -33,6 +34,7 @@ class Stage:
 
     def __init__(self, scene: Scene):
         self.ms_motion = 0.0
+        self._lock = threading.Lock()
         self._scene = scene
         self._shown: tuple | None = None  # camera, background and ranges of the last frame
         self._places: list[np.ndarray] = []  # of all instances, where they stood first
@@ -49,7 +51,19 @@ class Stage:
 
         Returns:
             Colour (not clamped at 1), alpha, depth and object ids, tensors without gradient.
+
+        Raises:
+            ValueError: As `scene_render.pose_instances`.
         """
+        with self._lock:
+            try:
+                return self._render(instances, camera, sky)
+            except ValueError:
+                self._shown = None
+                scene_render.pose_instances(self._scene, instances)  # numbers the bad instance as the caller does
+                raise
+
+    def _render(self, instances: Sequence[Instance], camera: Camera, sky: bool) -> RenderOutput:
         self.ms_motion = 0.0
         view = (camera.width, camera.height, camera.intrinsics.tobytes(), camera.T_cam_world.tobytes())
         shown = (view, sky, tuple((instance.start, instance.count) for instance in instances))
@@ -61,34 +75,38 @@ class Stage:
         if not left <= self._moving:
             self._moving |= left
             self._backdrop = None
-        moving = [instance for i, instance in enumerate(instances) if i in self._moving]
-        still = [instance for i, instance in enumerate(instances) if i not in self._moving]
-        if not self._has_backdrop(still, moving):
+        moving = [i for i in range(len(instances)) if i in self._moving]
+        still = [i for i in range(len(instances)) if i not in self._moving]
+        if not self._has_backdrop(instances, still, moving):
             return self._render_all(instances, camera, sky)
         if self._backdrop is None:
-            self._backdrop = self._make_backdrop(still, camera, sky)
-        with torch.no_grad():
-            picture = self._backdrop.draw(*self._splats(moving, camera))
+            self._backdrop = self._make_backdrop(instances, still, camera, sky)
+        means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera)
+        picture = self._backdrop.draw(
+            means, quats, scales, opacities, colors, labels=labels, ranks=_ranks(instances, moving)
+        )
         return RenderOutput(picture.image, picture.alpha, picture.depth, None, picture.ids)
 
-    def _has_backdrop(self, still: list[Instance], moving: list[Instance]) -> bool:
+    def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
         if importlib.util.find_spec("numba") is None:
             return False
-        moved, kept = (sum(instance.count for instance in part) for part in (moving, still))
+        moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
         return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)
 
-    def _make_backdrop(self, still: list[Instance], camera: Camera, sky: bool):
+    def _make_backdrop(self, instances: Sequence[Instance], still: list[int], camera: Camera, sky: bool):
         from .backdrop import Backdrop
 
         background = scene_render.tensor(scene_render.behind(self._scene, camera)) if sky else None
-        *splats, labels = self._splats(still, camera)
+        means, quats, scales, opacities, colors, labels = self._splats(instances, still, camera)
+        settings = RasterSettings(near_plane=self._scene.near_plane)
         return Backdrop(
-            *splats, camera, background, labels=labels, settings=RasterSettings(near_plane=self._scene.near_plane)
-        )
+            means, quats, scales, opacities, colors, camera, background,
+            labels=labels, ranks=_ranks(instances, still), settings=settings,
+        )  # fmt: skip
 
-    def _splats(self, instances: list[Instance], camera: Camera) -> tuple[torch.Tensor, ...]:
-        """Means, quats, scales, opacities, colours and object ids."""
-        posed = self._pose(instances)
+    def _splats(self, instances: Sequence[Instance], part: list[int], camera: Camera) -> tuple[torch.Tensor, ...]:
+        """Means, quats, scales, opacities, colours and object ids of some instances."""
+        posed = self._pose([instances[i] for i in part])
         gaussians = scene_render.PosedGaussians(posed)
         colors = scene_render.tensor(scene_render.colors(posed, camera))
         return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.object_ids
@@ -103,3 +121,9 @@ class Stage:
         posed = scene_render.pose_instances(self._scene, instances)
         self.ms_motion += 1e3 * (time.perf_counter() - start)
         return posed
+
+
+def _ranks(instances: Sequence[Instance], part: list[int]) -> np.ndarray:
+    """Place of each Gaussian of some instances among those of all. [n]"""
+    starts = np.cumsum([0, *(instance.count for instance in instances)])
+    return np.concatenate([np.arange(starts[i], starts[i + 1]) for i in part] or [np.arange(0)])

@@ -18,7 +18,7 @@ from tests.splats import camera, draw, relative, splats
 
 pytest.importorskip("numba", reason="the cpu backend needs numba")
 from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import cpu_blending, cpu_projection, cpu_tiles  # noqa: E402
+from r5dgs_core.raster import cpu, cpu_blending, cpu_blending_backward, cpu_projection, cpu_tiles  # noqa: E402
 
 # float32 against float64: rounding grows with the number of layers; the largest seen on these scenes is about 3e-6
 TOLERANCE = 2e-5
@@ -236,7 +236,7 @@ def test_every_kernel_is_compiled_once_for_all_inputs():
         draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
     kernels = [
         *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_part),
-        *(cpu_tiles.count_pairs, cpu_tiles.fill_pairs, cpu_blending.blend, cpu_blending.blend_backward),
+        *(cpu_tiles.count_pairs, cpu_tiles.fill_pairs, cpu_blending.blend, cpu_blending_backward.blend_backward),
     ]
     assert {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels} == {
         kernel.py_func.__name__: 1 for kernel in kernels
@@ -287,12 +287,50 @@ def test_gradients_do_not_depend_on_which_others_are_wanted(backend, position):
     torch.testing.assert_close(inputs[position].grad, list(expected.values())[position])
 
 
-def test_changing_a_result_in_place_is_refused_instead_of_giving_wrong_gradients():
+@pytest.mark.parametrize("name", ["means", "opacities", "background", "alpha"])
+def test_changing_in_place_what_gradients_need_is_refused(name):
+    leaves = [t.float().requires_grad_() for t in splats(50, 3)]
+    background = torch.rand(40, 48, 3)
+    result = rasterize_splats(*leaves, camera(), background)
+    changed = {"means": leaves[0], "opacities": leaves[3], "background": background, "alpha": result.alpha}[name]
+    with torch.no_grad():
+        changed.mul_(0.5)
+    with pytest.raises(RuntimeError, match="inplace"):
+        result.image.sum().backward()
+
+
+def test_the_image_may_be_changed_in_place():
+    expected = draw(splats(50, 3), camera(), "cpu")[1]["channels"]
+    leaves = [t.float().requires_grad_() for t in splats(50, 3)]
+    result = rasterize_splats(*leaves, camera())
+    generator = torch.Generator().manual_seed(7)
+    outputs = (result.image.mul_(2.0), result.alpha, result.depth * result.alpha.detach())
+    halves = (0.5, 1.0, 1.0)
+    loss = 0
+    for output, half in zip(outputs, halves, strict=True):
+        upstream = torch.randn(output.shape, generator=generator, dtype=torch.float64)
+        loss = loss + (half * output * upstream).sum()
+    loss.backward()
+    torch.testing.assert_close(leaves[4].grad, expected)
+
+
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+def test_without_gradients_nothing_is_kept_for_them(without, monkeypatch):
+    leaves, kept = [t.float().requires_grad_() for t in splats(50, 3)], []
+    original = cpu._forward
+    monkeypatch.setattr(cpu, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
+    with without():
+        still = rasterize_splats(*leaves, camera()).image
+    assert kept[0][0] is None and not still.requires_grad
+    assert torch.equal(rasterize_splats(*leaves, camera()).image, still) and kept[1][0] is not None
+
+
+def test_second_derivatives_are_refused():
     leaves = [t.float().requires_grad_() for t in splats(50, 3)]
     image = rasterize_splats(*leaves, camera()).image
-    image.clamp_(0, 0.1)
-    with pytest.raises(RuntimeError, match="inplace"):
-        image.sum().backward()
+    (gradient,) = torch.autograd.grad(image.square().sum(), leaves[3], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
@@ -396,6 +434,19 @@ def test_ids_are_the_labels_however_large_and_sparse_they_are(backend):
         expected = draw(scene, view, backend, labels=few)[0].ids
     found = draw(scene, view, backend, labels=many)[0].ids
     assert torch.equal(found.long(), torch.where(expected < 0, -1, names[expected.long()]))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64])
+def test_labels_may_be_any_kind_of_integers(dtype):
+    scene, labels = splats(200, 1, seed=15), torch.arange(200) % 5
+    expected = draw(scene, camera(), "reference", labels=labels)[0].ids
+    assert torch.equal(draw(scene, camera(), "cpu", labels=labels.to(dtype))[0].ids, expected)
+
+
+@pytest.mark.parametrize("size", [(262_113, 1), (1, 262_113)])
+def test_an_image_with_more_tiles_than_can_be_counted_is_refused(size):
+    with pytest.raises(ValueError, match=r"camera.*262112 px.*262113"):
+        rasterize_splats(*one_splat(), straight_camera(*size), backend="cpu")
 
 
 def test_a_label_that_cannot_be_counted_is_named():

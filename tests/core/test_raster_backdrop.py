@@ -1,5 +1,7 @@
 """Drawing what moves into what stands still gives the picture of both together, to the bit."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -58,6 +60,48 @@ def test_any_number_may_move_from_frame_to_frame():
     for count in (5, 0, 700, 1, 64):
         moving = single(splats(count, 3, seed=count, radius_px=10.0))
         assert_equal(backdrop.draw(*moving), rasterize_splats(*joined(still, moving), view))
+
+
+def test_ranks_decide_at_equal_depths():
+    view = camera()
+    scene = single(splats(300, 3, seed=3, radius_px=12.0))
+    scene[0] = scene[0][:100].repeat(3, 1)
+    rows = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    still, moving = rows[:180].sort().values, rows[180:].sort().values
+    backdrop = Backdrop(*[t[still] for t in scene], view, ranks=still.numpy())
+    found = backdrop.draw(*[t[moving] for t in scene], ranks=moving.numpy())
+    assert_equal(found, rasterize_splats(*scene, view))
+
+
+def test_a_backdrop_keeps_its_own_background():
+    view, still, behind = camera(), single(splats(100, 3, seed=6)), torch.rand(40, 48, 3)
+    backdrop, moving = Backdrop(*still, view, behind), single(splats(30, 3, seed=7, radius_px=20.0))
+    before = backdrop.draw(*moving)
+    behind.zero_()
+    assert_equal(backdrop.draw(*moving), before)
+
+
+def test_a_refused_call_leaves_the_backdrop_as_it_was():
+    view, still, moving = camera(), single(splats(100, 3, seed=6)), single(splats(9, 3, seed=7, radius_px=20.0))
+    labels = torch.arange(100) % 4
+    backdrop = Backdrop(*still, view, labels=labels)
+    good = torch.full((9,), 9)
+    expected = backdrop.draw(*moving, labels=good)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"labels.*at index 0"):
+            backdrop.draw(*moving, labels=torch.full((9,), 2**25))
+    assert_equal(backdrop.draw(*moving, labels=good), expected)
+
+
+def test_several_threads_may_draw_on_one_backdrop():
+    view, still = camera(150, 130, 160.0), single(splats(2000, 3, seed=1, radius_px=5.0))
+    backdrop = Backdrop(*still, view)
+    bodies = [single(splats(50 + 40 * k, 3, seed=k, radius_px=9.0)) for k in range(4)]
+    expected = [rasterize_splats(*joined(still, body), view) for body in bodies]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: backdrop.draw(*bodies[k % 4]), range(24)))
+    for k, picture in enumerate(found):
+        assert_equal(picture, expected[k % 4])
 
 
 def test_results_belong_to_the_caller():

@@ -1,5 +1,7 @@
 """A stage shows what rendering every frame from the start would show."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -38,7 +40,7 @@ def assert_shows(theatre, scene, instances, camera, sky=True):
     posed = scene_render.pose_instances(scene, instances)
     expected = scene_render.render_frame(scene, posed, camera, background="scene" if sky else None)
     for name in ("color", "alpha", "depth", "ids"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-6, rtol=1e-6)
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
 def test_playing_shows_every_frame_and_draws_what_stands_still_once(scene, made):
@@ -79,3 +81,32 @@ def test_where_almost_all_moves_everything_is_drawn(scene, made):
         matrix[0, 3] = shift
         assert_shows(theatre, scene, [Instance(0, len(scene.means), matrix)], CAMERA)
     assert not made
+
+
+def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
+    scene = scenes.make_scene(n=900, seed=3)
+    flat = dataclasses.replace(scene, means=scene.means * np.array([1, 1, 0], np.float32))
+    above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
+    instances = group_instances(flat, 1.0)
+    instances = [Instance(one.start, one.count, np.eye(4)) for one in instances]
+    theatre = stage.Stage(flat)
+    for shift in (0.0, 0.1, 0.2):
+        shown = []
+        for i, instance in enumerate(instances):
+            matrix = np.eye(4)
+            matrix[0, 3] = shift * (i in (1, 2))
+            shown.append(Instance(instance.start, instance.count, matrix))
+        shown = [shown[1], shown[0], *shown[2:]]
+        assert_shows(theatre, flat, shown, above)
+
+
+def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
+    theatre, instances = stage.Stage(scene), group_instances(scene, 0.4)
+    theatre.render(instances, CAMERA)
+    theatre.render(group_instances(scene, 0.5), CAMERA)
+    last = len(instances) - 1
+    bad = [*instances[:last], Instance(instances[last].start, instances[last].count, np.zeros((4, 4)))]
+    for _ in range(2):
+        with pytest.raises(ValueError, match=f"instance {last}: "):
+            theatre.render(bad, CAMERA)
+    assert_shows(theatre, scene, instances, CAMERA)
