@@ -111,6 +111,13 @@ def test_pixels_finish_where_those_of_the_reference_do(rasterize_cuda, monkeypat
     assert assert_agrees(rasterize_cuda, monkeypatch, scene, camera()).alpha.min() > 0.99
 
 
+def test_of_two_layers_at_the_cap_the_nearer_is_seen_as_in_the_reference(rasterize_cuda, monkeypatch):
+    scene = [t[:2].clone() for t in splats.splats(2, 2)]
+    scene[0][:], scene[2][:], scene[3][:], scene[4] = torch.zeros(3), 1e3, 1.0, torch.eye(2).double()
+    found = assert_agrees(rasterize_cuda, monkeypatch, scene, camera())
+    assert (found.image[..., 0] - 0.99).abs().max() < TOLERANCE and not found.image[..., 1].any()
+
+
 def test_gaussians_off_the_frustum_keep_their_gradients(rasterize_cuda, monkeypatch):
     scene = splats.splats(200, 3, seed=9, radius_px=60.0)
     scene[0] = (scene[0] * torch.tensor([4.0, 4.0, 1.0])).float().double()

@@ -75,13 +75,22 @@ def test_the_gradient_of_an_opacity_ends_where_the_cap_begins(steps, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_of_ten_thousand_opaque_layers_the_nearest_two_are_seen(backend):
+def test_of_ten_thousand_opaque_layers_the_nearest_is_seen_as_a_second_would_leave_the_minimum(backend):
     case, result, gradients, _ = render("ten thousand opaque layers", backend)
-    first, second = case.inputs[4][:2].double()
-    expected = 0.99 * first + 0.0099 * second + 1e-4 * case.background.double()
+    expected = 0.99 * case.inputs[4][0].double() + 0.01 * case.background.double()
     assert (result.image[0, 0] - expected).abs().max() < FORWARD
-    assert (result.alpha - 0.9999).abs().max() < 1e-6
-    assert gradients["channels"][:2].any(1).all() and not gradients["channels"][2:].any()
+    assert (result.alpha - 0.99).abs().max() < 1e-6
+    assert gradients["channels"][0].all() and not gradients["channels"][1:].any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_layer_that_would_bring_transmittance_to_the_minimum_exactly_is_not_seen(backend):
+    case, result, gradients, _ = render("half transparent layers", backend)
+    passed = torch.cumprod(1 - case.inputs[3].double(), 0)
+    assert case.settings.transmittance_min in passed.tolist()
+    seen = passed > case.settings.transmittance_min
+    assert (result.alpha - (1 - passed[seen].min())).abs().max() < 1e-6
+    assert torch.equal((gradients["channels"] != 0).any(1), seen)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
