@@ -255,11 +255,13 @@ def _backward(state: _Pass, plan: _Plan, inputs, results, d_image, d_alpha, d_de
     alpha, depth = (to_array(t) for t in results)
     n, n_channels = channels.shape
     slots = aligned((len(state.pair_rows), cpu_projection.slot_width(n_channels)), np.float32)
+    filled = np.zeros(len(slots), np.bool_)
     run(
         cpu_blending_backward.blend_backward, len(state.tile_ends) // 2,
         state.tile_starts, state.tile_ends, state.pair_rows, state.pair_slots, state.pair_blocks, state.geometry,
         channels, state.depths, pack_background(inputs[5], n_channels), plan.limits, alpha, depth,
         state.transmittance, state.last_pairs, d_image, d_alpha, d_depth, with_geometry, slots,
+        filled,
     )  # fmt: skip
     rows = cpu_projection.padded_rows(n)
     gradients = [np.zeros(rows * k, np.float32) for k in (3, 4, 3, 1, n_channels)]
@@ -267,7 +269,7 @@ def _backward(state: _Pass, plan: _Plan, inputs, results, d_image, d_alpha, d_de
     run(
         cpu_projection.project_backward, n // _WORTH_A_THREAD,
         plan.view, means.reshape(-1), quats.reshape(-1), scales.reshape(-1), opacities, state.slot_starts, slots,
-        with_geometry, n_channels, *gradients, grad_norm,
+        filled, with_geometry, n_channels, *gradients, grad_norm,
     )  # fmt: skip
     shapes = [means.shape, quats.shape, scales.shape, opacities.shape, channels.shape]
     shaped = [g[: math.prod(shape)].reshape(shape) for g, shape in zip(gradients, shapes, strict=True)]

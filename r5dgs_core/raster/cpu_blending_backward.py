@@ -35,9 +35,9 @@ from .vectors import any_of, fma, lowest_bit, select, unlikely
 @kernel
 def blend_backward(
     worker, workers, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, geometry, channels, depths, background,
-    limits, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, with_geometry, slots,
+    limits, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, with_geometry, slots, filled,
 ):  # fmt: skip
-    """Write the gradient slot of every pair of every workers-th tile: moments, the gradients of values, zeros.
+    """Write the gradient slots of the pairs of every workers-th tile: moments, the gradients of values, zeros.
 
     Goes far to near. With s_i the inner product of values and gradient, and B_i what lies behind i as if it were seen
     through nothing, dL/d(alpha_i) = T_i (s_i - B_i) and B_{i-1} = B_i + alpha_i (s_i - B_i), beginning with the inner
@@ -47,7 +47,8 @@ def blend_backward(
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
             latter two empty where there is none; with_geometry is whether more than channels want a gradient, or else
-            the moments are zero; slots [S, 16 k] the result, see `cpu_projection.MOMENTS`.
+            the moments are zero; slots [S, 16 k] the result, see `cpu_projection.MOMENTS`, and filled [S],
+            zeros before, says which of them were written: those of pairs that drew anything.
     """
     height, width, n_channels = d_image.shape
     n_values, n_slots = padded(n_channels), slots.shape[1]
@@ -68,8 +69,6 @@ def blend_backward(
     for tile in range(worker, len(tile_starts) - 1, workers):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         tile_start, tile_end = tile_starts[tile], tile_ends[tile]
-        for pair in range(tile_end, tile_starts[tile + 1]):
-            slots[pair_slots[pair]] = 0
         if tile_end == tile_start:
             continue
         _start_backward(
@@ -82,11 +81,10 @@ def blend_backward(
             load_batch(begin, end, end, x0, y0, pair_rows, geometry, channels, depths, no_votes, table, blocks)
             for k in range(end - begin - 1, -1, -1):
                 drawn = pair_blocks[begin + k]
-                slot = np.int64(pair_slots[begin + k]) * n_slots
                 if not drawn:
-                    for c in range(0, n_slots, LANES):
-                        store(flat_slots, slot + c, zero)
                     continue
+                filled[pair_slots[begin + k]] = True
+                slot = np.int64(pair_slots[begin + k]) * n_slots
                 g = k * (VALUES + n_values)
                 if more and with_geometry:
                     _inner_more(drawn, n_values, flat, g + VALUES, gradient, inners)

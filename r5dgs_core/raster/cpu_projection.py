@@ -243,19 +243,22 @@ def slot_place(value):
 
 
 @helper
-def _sum_slots(i, count, slot_starts, flat_slots, width, sums):
-    """Sum the slots of Gaussians i to i + 7 into the rows of ``sums``; returns a bit for each that has any."""
+def _sum_slots(i, count, slot_starts, flat_slots, filled, width, sums):
+    """Sum the filled slots of Gaussians i to i + 7 into the rows of ``sums``; returns a bit for each that has any."""
     present = np.uint64(0)
     for k in range(min(DOUBLES, count - i)):
         begin, end = slot_starts[i + k], slot_starts[i + k + 1]
+        while begin < end and not filled[begin]:
+            begin += 1
         if begin == end:
             continue
         present |= np.uint64(1) << np.uint64(k)
         for c in range(0, width, LANES):
             low, high = widen(load(flat_slots, begin * width + c))
             for slot in range(begin + 1, end):
-                more_low, more_high = widen(load(flat_slots, slot * width + c))
-                low, high = low + more_low, high + more_high
+                if filled[slot]:
+                    more_low, more_high = widen(load(flat_slots, slot * width + c))
+                    low, high = low + more_low, high + more_high
             store_doubles(sums, k * width + c, low)
             store_doubles(sums, k * width + c + DOUBLES, high)
     return present
@@ -263,8 +266,8 @@ def _sum_slots(i, count, slot_starts, flat_slots, width, sums):
 
 @kernel
 def project_backward(
-    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, with_geometry, n_channels, d_means,
-    d_quats, d_scales, d_opacities, d_channels, grad_norm,
+    worker, workers, view, means, quats, scales, opacities, slot_starts, slots, filled, with_geometry, n_channels,
+    d_means, d_quats, d_scales, d_opacities, d_channels, grad_norm,
 ):  # fmt: skip
     """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay zero.
 
@@ -272,7 +275,8 @@ def project_backward(
         view: See `cpu.pack_view`. [26]
         means, quats, scales, opacities: The inputs, flat.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
-        slots: Moments and gradients of the values of each pair of Gaussian and tile. [S, 16 k]
+        slots, filled: Moments and gradients of the values of each pair of Gaussian and tile, and which there are.
+            [S, 16 k], [S]
         with_geometry: Whether more than channels want a gradient.
         n_channels: D.
         d_means, d_quats, d_scales, d_opacities, d_channels: Gradients, flat, zero, with `padded_rows` rows.
@@ -286,7 +290,7 @@ def project_backward(
     dilation = entry(view, DILATION)
     for block in range(blocks * worker // workers, blocks * (worker + 1) // workers):
         i = block * DOUBLES
-        present = _sum_slots(i, count, slot_starts, flat_slots, width, sums)
+        present = _sum_slots(i, count, slot_starts, flat_slots, filled, width, sums)
         if not present:
             continue
         for k in range(DOUBLES):
