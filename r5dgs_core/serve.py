@@ -13,6 +13,7 @@ a picture sooner waits for it. Where it has to be compiled for that, lines of no
 
     <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
     <- {"event": "ready", "seconds": 7.9, "arrays": []}
+    <- {"event": "failed", "text": "LoweringError: ...", "arrays": []}     (instead, where that goes wrong)
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Warming:
     """Makes the rasterizer's kernels for pictures ready, in a thread of its own.
 
     Args:
-        tell: Called with an event, from that thread, when kernels have to be compiled and when that is over.
+        tell: Called with an event, from that thread, when kernels have to be compiled and when that is over or failed.
     """
 
     def __init__(self, tell: Callable[[dict[str, Any]], None]):
@@ -76,10 +77,14 @@ class Warming:
             from .raster import warming
         except ImportError:  # whoever asks for a picture hears of it
             return
-        with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
-            seconds = warming.warm_up(gradients=False)
-        if compilation.compiled():
-            self._tell({"event": "ready", "seconds": round(seconds, 2)})
+        try:
+            with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
+                over = {"event": "ready", "seconds": round(warming.warm_up(gradients=False), 2)}
+        except Exception as error:  # whoever asks for a picture meets it again; the traceback goes to the log
+            traceback.print_exc()
+            over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}
+        if compilation.compiled():  # who was told of a beginning is told of the end
+            self._tell(over)
 
 
 class Server:

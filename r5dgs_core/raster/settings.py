@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -15,14 +16,16 @@ class RasterSettings:
 
     Attributes:
         near_plane: Gaussians whose centre lies nearer than this depth are not drawn, world units.
-        dilation: Added to both variances of the projected Gaussian, px^2 (a low-pass of about half a pixel).
+        dilation: Added to both variances of the projected Gaussian, px^2 (a low-pass of about half a pixel); 0.01 or
+            more: rounding of a needle's exponent grows as its width shrinks, and the margin within which the kernels
+            decide in float64 is made for no thinner ones.
         frustum_slack: The slope of a centre seen from the camera is clamped to the image border plus this share of the
             half field of view before the projection is linearised there: 1.3 times the field of view for 0.3.
         alpha_min: Contributions below this are dropped.
         alpha_max: Contributions are capped here; the gradient is zero where the cap holds.
         transmittance_min: A pixel is finished before the contribution that would bring its transmittance down to this,
-            two layers at the default cap for example; see `finished_at`.
-        id_alpha_min: Pixels with less alpha than this belong to no object (id -1).
+            two layers at the default cap for example; see `finished_at`. 1e-30 or more, as pixels are float32.
+        id_alpha_min: Pixels with less alpha than this belong to no object (id -1). In [0, 1].
     """
 
     near_plane: float = 0.01
@@ -43,13 +46,23 @@ class RasterSettings:
         return self.transmittance_min * (1 + 1e-6)
 
     def __post_init__(self):
-        if not self.near_plane > 0 or not self.dilation > 0 or not self.frustum_slack >= 0:
-            raise ValueError(f"raster settings: expected near_plane, dilation > 0, frustum_slack >= 0, got {self}")
-        if not 1e-4 <= self.alpha_min < self.alpha_max <= 0.999 or not 0 < self.transmittance_min < 1:
-            raise ValueError(
-                "raster settings: expected 1e-4 <= alpha_min < alpha_max <= 0.999 and 0 < transmittance_min < 1, "
-                f"got {self}"
-            )
+        for field in fields(self):
+            if not math.isfinite(getattr(self, field.name)):
+                raise ValueError(
+                    f"raster settings: {field.name}: expected a finite number, got {getattr(self, field.name)}"
+                )
+        bounds = {
+            "near_plane": (self.near_plane > 0, "more than 0"),
+            "dilation": (self.dilation >= 0.01, "0.01 or more"),
+            "frustum_slack": (self.frustum_slack >= 0, "0 or more"),
+            "alpha_min": (1e-4 <= self.alpha_min < self.alpha_max, "1e-4 or more, and less than alpha_max"),
+            "alpha_max": (self.alpha_max <= 0.999, "at most 0.999"),
+            "transmittance_min": (1e-30 <= self.transmittance_min < 1, "1e-30 or more, and less than 1"),
+            "id_alpha_min": (0 <= self.id_alpha_min <= 1, "0 to 1"),
+        }
+        for name, (fits, expected) in bounds.items():
+            if not fits:
+                raise ValueError(f"raster settings: {name}: expected {expected}, got {getattr(self, name)}")
 
 
 @dataclass

@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 
 from r5dgs_core import serve  # noqa: E402
 from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import scene_render  # noqa: E402
+from r5dgs_core.raster import scene_render, warming  # noqa: E402
 from r5dgs_core.scene import playback, scene_file  # noqa: E402
 from tests import scenes  # noqa: E402
 
@@ -133,6 +133,27 @@ def test_a_changed_file_is_read_again(path, tmp_path):
 def test_the_rasterizer_is_made_ready_on_request():
     (header, _), (again, _) = talk({"command": "warm_up"}, {"command": "warm_up"})
     assert header["ok"] and again["result"] == header["result"] == {"compiled": compilation.compiled()}
+
+
+@pytest.mark.parametrize("compiled", [3, 0])
+def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkeypatch, capsys, compiled):
+    def fail(gradients):
+        if compiled:
+            compilation._watch.tell(compilation.NOTICE)
+        raise OSError("no space left")
+
+    monkeypatch.setattr(warming, "warm_up", fail)
+    monkeypatch.setattr(compilation, "compiled", lambda: compiled)
+    events = []
+    warm = serve.Warming(events.append)
+    warm.start()
+    warm.wait()
+    assert not warm.busy and "no space left" in capsys.readouterr().err
+    announced = [
+        {"event": "compiling", "text": compilation.NOTICE},
+        {"event": "failed", "text": "OSError: no space left"},
+    ]
+    assert events == (announced if compiled else [])
 
 
 def test_words_find_objects(path):
