@@ -223,10 +223,10 @@ def _heaviest(weights, labels, transmittance, settings):
     ids = torch.full((len(weights),), -1, dtype=torch.int32, device=weights.device)
     if labels is None or not len(labels):
         return ids
-    planes = labels.long().clamp_min(-1) + 1
-    votes = weights.new_zeros((len(weights), int(planes.max()) + 1)).index_add_(1, planes, weights)
+    names, planes = torch.unique(labels.long().clamp_min(-1), return_inverse=True)  # rising, and argmax takes the first
+    votes = weights.new_zeros((len(weights), len(names))).index_add_(1, planes, weights)
     enough = 1 - transmittance >= settings.id_alpha_min
-    return torch.where(enough, (votes.argmax(1) - 1).to(torch.int32), ids)
+    return torch.where(enough, names[votes.argmax(1)].to(torch.int32), ids)
 
 
 def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype) -> None:

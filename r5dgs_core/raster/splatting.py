@@ -42,8 +42,9 @@ def rasterize_splats(
         opacities: In [0, 1]. [N]
         channels: Values to blend; D >= 1. [N, D]
         camera: The view.
-        background: Shows through by 1 - alpha; zeros where None. [D] or [H, W, D]
-        labels: Integers; ``ids`` of the result is the label with the largest weight, negative ones vote for -1. [N]
+        background: Shows through by 1 - alpha; zeros where None. Of any float dtype. [D] or [H, W, D]
+        labels: Integers; ``ids`` of the result is the label with the largest weight, negative ones vote for -1; at most
+            2^31 - 1, with backend "cpu" 2^24 - 1. [N]
         settings: Thresholds; those of 3DGS where None.
         backend: "cpu" (numba, float32), "cuda" (gsplat, float32 tensors on a GPU), "reference" (plain torch, any float
             dtype and device), or "auto": the fastest one that can take these tensors.
@@ -53,8 +54,9 @@ def rasterize_splats(
         Image, alpha and depth, on the device and in the dtype of ``means``.
 
     Raises:
-        ValueError: A shape does not fit, or a value of an input or of the camera is not finite or out of its range; the
-            message names the input and the first index.
+        TypeError: What should be a tensor is none.
+        ValueError: A shape, dtype or device does not fit, or a value of an input or of the camera is not finite or out
+            of its range; the message names the input and the first index.
         BackendError: The backend is not there.
 
     Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
@@ -62,6 +64,8 @@ def rasterize_splats(
     settings = settings or RasterSettings()
     check_splats(means, quats, scales, opacities, channels, camera, background, labels)
     chosen = choose_backend(backend, means)
+    if background is not None:
+        background = background.to(means.dtype)
     if chosen == "reference":
         from . import reference as implementation
     elif chosen == "cpu":
@@ -92,38 +96,49 @@ def rasterize(
             has them, ``object_ids`` [N]. What has ``scales`` and ``opacities`` needs no logarithms and logits.
         camera: The view.
         features: Further values to blend, e.g. identity encodings. [N, F]
-        background: Colour behind the Gaussians; black where None. [3] or [H, W, 3]
+        background: Colour behind the Gaussians; black where None. Of any float dtype. [3] or [H, W, 3]
         colors: Final colours, where the caller knows them better than `seen_colors`; ``sh`` is then not read. [N, 3]
         ids: Whether to find the object of each pixel where ``object_ids`` exist.
         settings: As in `rasterize_splats`, like ``backend`` and ``stats``.
 
     Returns:
         Colour, alpha, depth, features and ids.
+
+    Raises:
+        TypeError, ValueError, BackendError: As `rasterize_splats`; what is named is what was given here.
     """
     means = gaussians.means
+    _check_tensor("means", means)
+    _check_camera(camera)
+    if colors is not None:
+        _check_companion("colors", colors, means, (len(means), 3))
+    if features is not None:
+        _check_companion("features", features, means, (len(means), "F"))
+    if background is not None:
+        _check_background(background, means, camera, 3)
     object_ids = getattr(gaussians, "object_ids", None) if ids else None
-    channels = seen_colors(gaussians, camera, fused=backend in ("auto", "cpu")) if colors is None else colors
-    n_features = 0 if features is None else features.shape[-1]
-    if features is not None and n_features:
-        if features.ndim != 2 or len(features) != len(means):
-            raise ValueError(f"features: expected shape ({len(means)}, F), got {tuple(features.shape)}")
-        channels = torch.cat([channels, features.to(channels.dtype)], 1)
-        if background is not None:
-            zeros = background.new_zeros((*background.shape[:-1], n_features))
-            background = torch.cat([background, zeros], -1)
-    splats = rasterize_splats(
-        means,
-        gaussians.quats,
-        gaussians.scales if hasattr(gaussians, "scales") else torch.exp(gaussians.log_scales),
-        gaussians.opacities if hasattr(gaussians, "opacities") else torch.sigmoid(gaussians.opacity_logits),
-        channels,
-        camera,
-        background,
-        labels=None if object_ids is None else torch.as_tensor(object_ids, device=means.device),
-        settings=settings,
-        backend=backend,
-        stats=stats,
-    )
+    try:
+        channels = seen_colors(gaussians, camera, fused=backend in ("auto", "cpu")) if colors is None else colors
+        if features is not None and features.shape[1]:
+            channels = torch.cat([channels.to(means.dtype), features.to(means.dtype)], 1)
+            if background is not None:
+                zeros = background.new_zeros((*background.shape[:-1], features.shape[1]))
+                background = torch.cat([background, zeros], -1)
+        splats = rasterize_splats(
+            means,
+            gaussians.quats,
+            gaussians.scales if hasattr(gaussians, "scales") else torch.exp(gaussians.log_scales),
+            gaussians.opacities if hasattr(gaussians, "opacities") else torch.sigmoid(gaussians.opacity_logits),
+            channels.to(means.dtype),
+            camera,
+            background,
+            labels=None if object_ids is None else torch.as_tensor(object_ids, device=means.device),
+            settings=settings,
+            backend=backend,
+            stats=stats,
+        )
+    except ValueError as error:
+        raise (_raw_culprit(gaussians, colors, features) or error) from None
     return RenderOutput(
         color=splats.image[..., :3],
         alpha=splats.alpha,
@@ -148,9 +163,8 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
     """Name of the backend that draws tensors like ``means`` when ``backend`` is asked for. Raises BackendError."""
     if backend not in BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
-    numba_is_there = importlib.util.find_spec("numba") is not None
     if backend == "auto":
-        if means.device.type == "cpu" and means.dtype == torch.float32 and numba_is_there:
+        if means.device.type == "cpu" and means.dtype == torch.float32 and numba_is_there():
             return "cpu"
         if means.device.type == "cpu" and means.dtype == torch.float32:
             log.warning("rasterizer: numba is not installed, using the slow reference; remedy: pip install numba")
@@ -169,7 +183,7 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
         if reason is not None:
             raise errors.BackendError(f"rasterizer 'cuda': {reason}")
     if backend == "cpu":
-        if not numba_is_there:
+        if not numba_is_there():
             raise errors.BackendError("rasterizer 'cpu': numba is not installed; remedy: pip install numba")
         if means.device.type != "cpu" or means.dtype != torch.float32:
             raise errors.BackendError(
@@ -179,15 +193,22 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
     return backend
 
 
+def numba_is_there() -> bool:
+    """Whether kernels can be compiled here; numba itself is not imported for the answer."""
+    return importlib.util.find_spec("numba") is not None
+
+
 @functools.cache
 def _warn_once(message: str) -> None:
     log.warning(message)
 
 
 def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
-    """Raise ValueError naming the first input whose shape, dtype or content cannot be drawn."""
-    n = len(means)
+    """Raise ValueError or TypeError naming the first input whose kind, shape, dtype or content cannot be drawn."""
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
+    for name, tensor in inputs.items():
+        _check_tensor(name, tensor)
+    n = len(means) if means.ndim else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
     for name, tensor in inputs.items():
         expected = shapes.get(name, (n, channels.shape[-1] if channels.ndim == 2 and channels.shape[-1] else "D >= 1"))
@@ -197,24 +218,99 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
             raise ValueError(f"{name}: expected {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}")
     _check_camera(camera)
     if background is not None:
-        depth = channels.shape[-1]
-        if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
-            raise ValueError(
-                f"background: expected shape ({depth},) or ({camera.height}, {camera.width}, {depth}), "
-                f"got {tuple(background.shape)}"
-            )
-        inputs["background"] = background
-    if labels is not None and (tuple(labels.shape) != (n,) or labels.is_floating_point()):
-        raise ValueError(f"labels: expected {n} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
+        _check_background(background, means, camera, channels.shape[-1])
+        inputs["background"] = background.to(means.dtype)
+    if labels is not None:
+        _check_labels(labels, means)
     for name, tensor in inputs.items():
         _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
 
+
+_ROUNDING = 1e-9  # of the entries of a camera that are 0 or 1 and not read
 
 # Smallest and largest value of the inputs that have them, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "scales": (0.0, math.inf, "pass exp(log_scales)"),
     "opacities": (0.0, 1.0, "pass sigmoid(opacity_logits)"),
 }
+
+
+def _check_tensor(name: str, value: Any) -> None:
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; remedy: torch.as_tensor({name})")
+
+
+def _check_device(name: str, tensor: torch.Tensor, means: torch.Tensor) -> None:
+    if tensor.device != means.device:
+        raise ValueError(f"{name}: expected a tensor on {means.device}, as the means are, got one on {tensor.device}")
+
+
+def _check_companion(name: str, tensor: Any, means: torch.Tensor, shape: tuple[int, int | str]) -> None:
+    """Raise where this is no tensor beside the means, of shape [N, a number of channels]."""
+    _check_tensor(name, tensor)
+    if tensor.ndim != 2 or any(isinstance(b, int) and a != b for a, b in zip(tensor.shape, shape, strict=True)):
+        raise ValueError(f"{name}: expected shape ({shape[0]}, {shape[1]}), got {tuple(tensor.shape)}")
+    _check_device(name, tensor, means)
+
+
+def _check_background(background: Any, means: torch.Tensor, camera: Camera, depth: int) -> None:
+    """Raise where this cannot lie behind an image of so many channels."""
+    _check_tensor("background", background)
+    if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
+        raise ValueError(
+            f"background: expected shape ({depth},) or ({camera.height}, {camera.width}, {depth}), "
+            f"got {tuple(background.shape)}"
+        )
+    if not background.is_floating_point():
+        raise ValueError(
+            f"background: expected floating-point values, got {background.dtype}; remedy: background.float(), "
+            "divided by 255 where they are 8 bit colours"
+        )
+    _check_device("background", background, means)
+
+
+_MOST_LABEL = (1 << 31) - 1  # what ids of type int32 hold
+_NARROW = (torch.uint8, torch.int8, torch.int16, torch.int32)  # whose values are labels, all of them
+
+
+def _check_labels(labels: Any, means: torch.Tensor) -> None:
+    """Raise where these are no integers, one for each Gaussian."""
+    _check_tensor("labels", labels)
+    whole = not (labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool)
+    if tuple(labels.shape) != (len(means),) or not whole:
+        raise ValueError(f"labels: expected {len(means)} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
+    _check_device("labels", labels, means)
+    if labels.dtype not in _NARROW and len(labels) and labels.long().max() > _MOST_LABEL:
+        at = int(labels.long().argmax())
+        raise ValueError(f"labels: expected at most {_MOST_LABEL}, found {labels[at].item()} at index {at}")
+
+
+def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | None:
+    """What in the inputs of `rasterize` explains that it failed: an error that names it as the caller knows it."""
+    n = len(gaussians.means)
+    given = {name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")}
+    derived = {"log_scales": ("scales", (n, 3)), "opacity_logits": ("opacities", (n,))}
+    for name, (result, shape) in derived.items():
+        if hasattr(gaussians, result):
+            del given[name]
+        elif given[name] is not None and tuple(given[name].shape) != shape:
+            return ValueError(f"{name}: expected shape {shape}, got {tuple(given[name].shape)}")
+    if colors is not None:
+        given["sh"] = None
+    for name, values in {**given, "colors": colors, "features": features}.items():
+        if values is None:
+            continue
+        values = values.detach()
+        if name == "log_scales":
+            bad, wanted = ~torch.isfinite(torch.exp(values)), "values with a finite exponential"
+        elif name == "opacity_logits":
+            bad, wanted = torch.isnan(values), "numbers"
+        else:
+            bad, wanted = ~torch.isfinite(values), "finite values"
+        if bad.any():
+            at = tuple(torch.nonzero(bad)[0].tolist())
+            return ValueError(f"{name}: expected {wanted}, found {values[at].item()} at index {at}")
+    return None
 
 
 def _check_camera(camera: Camera) -> None:
@@ -230,6 +326,11 @@ def _check_camera(camera: Camera) -> None:
         if len(bad):
             at = tuple(bad[0].tolist())
             raise ValueError(f"{place}: {name}: expected finite values, found {matrix[at]} at index {at}")
+        last = np.eye(len(matrix))[-1]
+        if not np.allclose(matrix[-1], last, rtol=0, atol=_ROUNDING):
+            raise ValueError(f"{place}: {name}: expected {last.tolist()} as the last row, found {matrix[-1].tolist()}")
+    if abs(camera.intrinsics[1, 0]) > _ROUNDING:
+        raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")
     for at in ((0, 0), (1, 1)):
         if not camera.intrinsics[at] > 0:
             raise ValueError(
