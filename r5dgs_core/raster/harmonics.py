@@ -6,7 +6,6 @@ tensors, and machines without numba, through plain torch. Harmonics of degree 0 
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import numpy as np
@@ -88,7 +87,9 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
     if spherical_harmonics.degree_of(len(sh)) == 0:
         color = np.clip(spherical_harmonics.dc_to_rgb(sh[0]), 0, 1)
         return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
-    if not _numba_is_there():
+    from . import splatting  # late, as it imports this module
+
+    if not splatting.numba_is_there():
         return np.clip(spherical_harmonics.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)
     from . import compile as compilation
     from . import cpu_sky
@@ -108,24 +109,23 @@ class _Poses:
         count = max(len(eyes), len(maps))
         if not {len(eyes), len(maps)} <= {1, count}:
             raise ValueError(f"view_maps: expected one for each of {len(eyes)} eyes, got {len(maps)}")
-        # Copies, so that the kernels see one kind of array: contiguous, and never read-only.
+        # Copies, so that the kernels see one kind of array, contiguous and never read-only, and that nothing that
+        # happens to the caller's before the backward pass changes what it computes.
         self.eyes = np.broadcast_to(eyes, (count, 3)).copy()
         self.maps = np.broadcast_to(maps, (count, 3, 3)).copy()
         self.ids = _NO_POSES
         if pose_ids is not None:
-            host = pose_ids.cpu() if isinstance(pose_ids, torch.Tensor) else pose_ids
-            self.ids = np.require(host, np.int64, ["C", "W"])
+            host = pose_ids.detach().cpu().numpy() if isinstance(pose_ids, torch.Tensor) else pose_ids
+            self.ids = np.array(host, np.int64)
             if self.ids.shape != (n,) or (n and not 0 <= self.ids.min() <= self.ids.max() < count):
                 raise ValueError(f"pose_ids: expected {n} rows of {count} poses, got {self.ids!r}")
 
 
 def _fits_kernels(*tensors: torch.Tensor | None) -> bool:
     given = [tensor for tensor in tensors if tensor is not None]
-    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and _numba_is_there()
+    from . import splatting  # late, as it imports this module
 
-
-def _numba_is_there() -> bool:
-    return importlib.util.find_spec("numba") is not None
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and splatting.numba_is_there()
 
 
 def _plain_colors(

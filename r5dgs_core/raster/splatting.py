@@ -288,7 +288,9 @@ def _check_labels(labels: Any, means: torch.Tensor) -> None:
 def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | None:
     """What in the inputs of `rasterize` explains that it failed: an error that names it as the caller knows it."""
     n = len(gaussians.means)
-    given = {name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")}
+    given: dict[str, Any] = {
+        name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")
+    }
     derived = {"log_scales": ("scales", (n, 3)), "opacity_logits": ("opacities", (n,))}
     for name, (result, shape) in derived.items():
         if hasattr(gaussians, result):
@@ -298,7 +300,7 @@ def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | Non
     if colors is not None:
         given["sh"] = None
     for name, values in {**given, "colors": colors, "features": features}.items():
-        if values is None:
+        if not isinstance(values, torch.Tensor):
             continue
         values = values.detach()
         if name == "log_scales":

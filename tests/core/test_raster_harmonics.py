@@ -187,6 +187,24 @@ def test_a_coefficient_that_is_not_a_number_is_an_error_and_not_a_black_dot():
         rasterize(broken, scenes.orbit_camera(0.0))
 
 
+@pytest.mark.parametrize("kind", ["array", "tensor"])
+def test_what_the_caller_does_to_its_poses_after_a_call_does_not_reach_the_gradients(kind):
+    tensors, where = draw(40, 4)
+    where = {name: np.ascontiguousarray(value) for name, value in where.items()}
+    expected = differentiate(lambda **t: harmonics.seen_colors(**t, **where), tensors)[1]
+    if kind == "tensor":
+        where["pose_ids"] = torch.from_numpy(where["pose_ids"])
+
+    def shade_and_forget(**named):
+        colors = harmonics.seen_colors(**named, **where)
+        for value in where.values():
+            value[:] = 0
+        return colors
+
+    found = differentiate(shade_and_forget, tensors)[1]
+    assert all(torch.equal(found[name], gradient) for name, gradient in expected.items())
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -232,7 +250,7 @@ def test_the_sky_is_the_harmonics_along_each_ray(count, monkeypatch):
         assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.float32
         assert count == 1 or ((image == 0).any() and (image == 1).any())
         with monkeypatch.context() as without_numba:
-            without_numba.setattr(harmonics, "_numba_is_there", lambda: False)
+            without_numba.setattr(splatting, "numba_is_there", lambda: False)
             np.testing.assert_allclose(image, harmonics.sky(sh, camera), atol=1e-6)
 
 
@@ -243,5 +261,5 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
     posed = scene_render.pose_frame(scene, playback.frame(scene, 1.1))
     fused = scene_render.colors(posed, camera)
-    monkeypatch.setattr(harmonics, "_numba_is_there", lambda: False)
+    monkeypatch.setattr(splatting, "numba_is_there", lambda: False)
     np.testing.assert_allclose(scene_render.colors(posed, camera), fused, atol=2e-6)

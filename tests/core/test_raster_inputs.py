@@ -46,7 +46,7 @@ def test_a_background_of_another_float_dtype_is_converted_and_gets_its_gradient(
 @pytest.mark.parametrize(("background", "kind", "message"), [
     ([0.0, 0.0, 0.0], TypeError, "expected a tensor, got list"),
     (np.zeros(3), TypeError, "expected a tensor, got ndarray"),
-    (torch.tensor([255, 255, 255], dtype=torch.uint8), ValueError, "expected floating-point values, got torch.uint8; remedy"),
+    (torch.full((3,), 255, dtype=torch.uint8), ValueError, "expected floating-point values, got torch.uint8; rem"),
     (torch.zeros(3, device="meta"), ValueError, "expected a tensor on cpu, as the means are, got one on meta"),
     (torch.zeros(4), ValueError, r"expected shape \(3,\) or \(40, 48, 3\), got \(4,\)"),
     (torch.zeros(48, 40, 3), ValueError, r"expected shape \(3,\) or \(40, 48, 3\), got \(48, 40, 3\)"),
