@@ -90,7 +90,7 @@ def rasterize_splats(
     with torch.no_grad():
         projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
         means2d, axes, z = projected
-        cov, _ = _covariances(axes, settings.dilation)
+        cov, _ = reference.covariances(axes, settings.dilation)
         order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
         tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
@@ -99,7 +99,7 @@ def rasterize_splats(
         means2d, axes, z = reference.project(*seen, camera, settings)
     else:
         means2d, axes, z = (t[order] for t in projected)
-    cov, determinant = _covariances(axes, settings.dilation)
+    cov, determinant = reference.covariances(axes, settings.dilation)
     if stats is not None:
         _fill_stats(stats, means2d, cov, order, means)
 
@@ -227,13 +227,6 @@ def _warn_once(message: str) -> None:
     log.warning(message)
 
 
-def _covariances(axes: torch.Tensor, dilation: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Covariances [V, 2, 2] of axes in px [V, 2, 3], and their determinants [V] as sums of squares."""
-    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
-    determinant = area + dilation * (axes.square().sum((1, 2)) + dilation)
-    return axes @ axes.transpose(1, 2) + dilation * torch.eye(2).to(axes), determinant
-
-
 def _tile_lists(
     means2d: torch.Tensor,  # [V, 2]
     extent: torch.Tensor,  # [V, 2]
@@ -320,10 +313,9 @@ def _fill_stats(
         return means.new_zeros(len(means)).index_copy_(0, order, rows.to(means.dtype))
 
     with torch.no_grad():
-        a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-        longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
-        stats.visible = spread(torch.ones_like(a)) > 0
-        stats.radii = spread(3 * torch.sqrt(longest))
+        longest = reference.radii(cov)
+        stats.visible = spread(torch.ones_like(longest)) > 0
+        stats.radii = spread(longest)
         stats.grad_norm = torch.zeros_like(stats.radii)
     if means2d.requires_grad:
 

@@ -43,7 +43,7 @@ def rasterize_splats(
     means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
     means2d, axes, z = project(means, quats, scales, camera, settings)
     with torch.no_grad():
-        cov = axes @ axes.transpose(1, 2) + settings.dilation * torch.eye(2).to(axes)
+        cov, _ = covariances(axes, settings.dilation)
         order, extent = visible_rows(means2d, cov, z, opacities, camera, settings)
         if stats is not None:
             _fill_stats(stats, cov, order, dtype)
@@ -152,6 +152,19 @@ def rotmats(quats: torch.Tensor) -> torch.Tensor:
     )
 
 
+def covariances(axes: torch.Tensor, dilation: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Covariances C [N, 2, 2] of axes in px [N, 2, 3], and their determinants [N] as sums of squares."""
+    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
+    determinant = area + dilation * (axes.square().sum((1, 2)) + dilation)
+    return axes @ axes.transpose(1, 2) + dilation * torch.eye(2).to(axes), determinant
+
+
+def radii(cov: torch.Tensor) -> torch.Tensor:
+    """Three standard deviations along the long axis of each covariance. [N, 2, 2] -> [N]"""
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    return 3 * torch.sqrt(0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b))
+
+
 def visible_rows(
     means2d: torch.Tensor,  # [N, 2]
     cov: torch.Tensor,  # [N, 2, 2]
@@ -197,8 +210,7 @@ def _blend(means2d, axes, opacities, values, labels, box, settings):
     shape = (len(y), len(x))
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
     dx, dy = (pixels - means2d).unbind(-1)
-    area = torch.linalg.cross(axes[:, 0], axes[:, 1]).square().sum(1)
-    determinant = area + settings.dilation * (axes.square().sum((1, 2)) + settings.dilation)
+    _, determinant = covariances(axes, settings.dilation)
     square = settings.dilation * (dx.square() + dy.square())
     for k in range(3):
         square = square + (dx * axes[:, 1, k] - dy * axes[:, 0, k]).square()
@@ -231,12 +243,10 @@ def _heaviest(weights, labels, transmittance, settings):
 
 def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype) -> None:
     """Write visibility and radii, and no gradient yet."""
-    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    longest = 0.5 * (a + c) + torch.sqrt((0.5 * (a - c)) ** 2 + b * b)
     visible = torch.zeros(len(cov), dtype=torch.bool, device=cov.device)
     visible[order] = True
     stats.visible = visible
-    stats.radii = torch.where(visible, 3 * torch.sqrt(longest), 0).to(dtype)
+    stats.radii = torch.where(visible, radii(cov), 0).to(dtype)
     stats.grad_norm = torch.zeros_like(stats.radii)
 
 
