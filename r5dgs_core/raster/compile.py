@@ -16,10 +16,13 @@ import gc
 import hashlib
 import logging
 import os
+import re
+import shutil
 import stat
 import sys
 import tempfile
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +39,10 @@ NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True}
+
+_SOURCES = ("raster/*.py", "model/spherical_harmonics.py", "train/losses.py", "train/posing.py")
+_OURS = re.compile("r5dgs-[0-9a-f]{12}")
+_KEPT_S = 28 * 24 * 3600.0
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -57,7 +64,10 @@ def kernel(function) -> Any:
 
 
 def helper(function) -> Any:
-    """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own."""
+    """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own.
+
+    Never call one from Python: it has no wrapper that unpacks Python's objects, and the interpreter would crash.
+    """
     return numba.njit(**_OPTIONS, **_INNER)(function)
 
 
@@ -182,21 +192,26 @@ if hasattr(os, "register_at_fork"):
 def _cache_folder(chosen: str) -> str | None:
     """Folder for machine code, apart for each state of the kernels; None where no place can be written.
 
-    Numba looks only at the file of the compiled function, not at those of the functions it calls, hence the digest.
+    Numba looks only at the file of the compiled function, not at those of the functions it calls and of the constants
+    that it freezes, hence the digest.
     """
     digest = hashlib.sha256()
-    sources = Path(__file__).parent
-    for source in sorted(sources.glob("*.py")):
+    for source in sources():
         digest.update(source.read_bytes())
     tried = []
     for base in _bases(chosen):
         folder = base / f"r5dgs-{digest.hexdigest()[:12]}"
+        is_new = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             tried.append(f"{base} ({error.strerror})")
             continue
+        with contextlib.suppress(OSError):
+            os.utime(folder)  # it is in use
+        if is_new:
+            _remove_old(base)
         return str(folder)
     log.warning(
         "rasterizer: no place to keep compiled code, so every process compiles again; tried %s; "
@@ -204,6 +219,22 @@ def _cache_folder(chosen: str) -> str | None:
         ", ".join(tried) or "none",
     )
     return None
+
+
+def sources() -> list[Path]:
+    """Files that machine code is made of: kernels, helpers, and modules whose constants they freeze."""
+    core = Path(__file__).parents[1]
+    return sorted(path for pattern in _SOURCES for path in core.glob(pattern))
+
+
+def _remove_old(base: Path) -> None:
+    """Remove machine code of other versions that no process has used for weeks; what cannot be removed stays."""
+    for folder in base.glob("r5dgs-*"):
+        with contextlib.suppress(OSError):
+            status = folder.lstat()
+            unused_s = time.time() - status.st_mtime
+            if _OURS.fullmatch(folder.name) and stat.S_ISDIR(status.st_mode) and unused_s > _KEPT_S:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def _bases(chosen: str) -> Iterator[Path]:

@@ -1,8 +1,10 @@
 """Where compiled kernels are kept."""
 
+import ast
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ pytest.importorskip("numba")
 
 from r5dgs_core.raster import compile as compilation  # noqa: E402
 
+CORE = Path(__file__).resolve().parents[2] / "r5dgs_core"
 TOY = """
 from r5dgs_core.raster.compile import kernel
 
@@ -128,6 +131,93 @@ def test_without_a_place_the_notice_says_so_in_every_process(tmp_path):
     complaints = [run_toy(tmp_path, script).stderr.splitlines() for _ in range(2)]
     assert complaints[0] == complaints[1] and complaints[0][1:] == [compilation.NOTICE_UNKEPT]
     assert "no place to keep compiled code" in complaints[0][0]
+
+
+def modules_with_kernels():
+    """Modules of the core that define a kernel or a helper, with their syntax trees."""
+    for path in sorted(CORE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        decorators = [
+            decorator.attr if isinstance(decorator, ast.Attribute) else getattr(decorator, "id", "")
+            for node in ast.walk(tree)
+            if isinstance(node, ast.FunctionDef)
+            for decorator in node.decorator_list
+        ]
+        if {"kernel", "helper", "operation"} & set(decorators):
+            yield path, tree
+
+
+def imported_from_the_core(path, tree):
+    """Files of the core that a module imports values from at its top, unless only its annotations name them."""
+    annotations = {
+        name.id
+        for node in ast.walk(tree)
+        for part in (getattr(node, "annotation", None), getattr(node, "returns", None))
+        if isinstance(part, ast.AST)
+        for name in ast.walk(part)
+        if isinstance(name, ast.Name)
+    }
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and node.level:
+            folder = path.parents[node.level - 1].joinpath(*(node.module or "").split("."))
+            for alias in node.names:
+                if (alias.asname or alias.name) in annotations:
+                    continue
+                inside = (folder / alias.name).with_suffix(".py")
+                yield inside if inside.exists() else folder.with_suffix(".py")
+
+
+def test_the_cache_is_apart_for_each_state_of_all_that_kernels_are_made_of():
+    sources = set(compilation.sources())
+    found = dict(modules_with_kernels())
+    assert len(found) > 8 and CORE / "train" / "losses.py" in found
+    assert set(found) <= sources
+    for path, tree in found.items():
+        feeding = set(imported_from_the_core(path, tree))
+        assert feeding <= sources, f"{path.name} imports {feeding - sources}, which compile._SOURCES lacks"
+    assert CORE / "model" / "spherical_harmonics.py" in sources
+
+
+def test_another_state_of_a_source_has_another_folder(tmp_path, monkeypatch):
+    source = tmp_path / "constants.py"
+    monkeypatch.setattr(compilation, "sources", lambda: [source])
+    folders = []
+    for text in ("C0 = 1", "C0 = 2", "C0 = 1"):
+        source.write_text(text)
+        compilation._cache_folder.cache_clear()
+        folders.append(compilation._cache_folder(str(tmp_path)))
+    assert folders[0] == folders[2] != folders[1]
+
+
+def test_a_new_folder_takes_the_place_of_old_ones_that_nobody_uses(tmp_path):
+    week = 7 * 24 * 3600
+    ages = {
+        **{"r5dgs-0123456789ab": 5, "r5dgs-ffffffffffff": 3, "r5dgs-mine": 5, "r5dgs-0123456789abc": 5},
+        **{"elsewhere-0123456789ab": 5, "r5dgs-aaaaaaaaaaaa": 5, "r5dgs-bbbbbbbbbbbb": 5},
+    }
+    for name, weeks in ages.items():
+        if name == "r5dgs-aaaaaaaaaaaa":
+            (tmp_path / name).write_text("a file")
+        else:
+            (tmp_path / name).mkdir()
+            (tmp_path / name / "code.nbc").write_text("")
+        os.utime(tmp_path / name, 2 * (time.time() - weeks * week,))
+    used = tmp_path / "r5dgs-bbbbbbbbbbbb"
+    os.utime(used)
+    folder = Path(compilation._cache_folder(str(tmp_path)))
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {*ages, folder.name} - {"r5dgs-0123456789ab"}
+
+
+def test_a_folder_that_is_used_stays_young_and_removes_nothing(tmp_path):
+    folder = Path(compilation._cache_folder(str(tmp_path)))
+    old = tmp_path / "r5dgs-0123456789ab"
+    old.mkdir()
+    for path in (old, folder):
+        os.utime(path, (0, 0))
+    compilation._cache_folder.cache_clear()
+    assert compilation._cache_folder(str(tmp_path)) == str(folder)
+    assert old.exists() and time.time() - folder.stat().st_mtime < 3600
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
