@@ -40,7 +40,8 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     for name, stage in stages:
         if progress is not None:
             progress(name)
-        stage()
+        with torch.inference_mode(False), torch.enable_grad():  # whatever the caller is in the middle of
+            stage()
     return time.perf_counter() - start
 
 
@@ -69,8 +70,7 @@ def _backdrop() -> None:
 
 
 def _splat_gradients() -> None:
-    with torch.enable_grad():
-        _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
+    _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
 
 
 def _colors() -> None:
@@ -78,8 +78,7 @@ def _colors() -> None:
 
 
 def _color_gradients() -> None:
-    with torch.enable_grad():
-        _shade(torch.ones(1, 3, requires_grad=True)).sum().backward()
+    _shade(torch.ones(1, 3, requires_grad=True)).sum().backward()
 
 
 def _sky() -> None:

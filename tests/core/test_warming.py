@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
 from r5dgs_core.raster import compile as compilation  # noqa: E402
+from r5dgs_core.raster import warming  # noqa: E402
 from r5dgs_core.scene import scene_file  # noqa: E402
 from tests import datasets as tiny_datasets  # noqa: E402
 from tests import scenes  # noqa: E402
@@ -149,6 +150,14 @@ def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
     assert next(events)["ok"] and next(events)["event"] == "compiling"
     out, _ = finish(process)  # closes its input
     assert out == b""
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
+def test_kernels_of_gradients_are_made_ready_inside_inference_too(mode):
+    stages = []
+    with mode():
+        warming.warm_up(progress=stages.append)
+    assert stages[-1] == "gradients of colors"
 
 
 def test_importing_the_rasterizer_needs_neither_numba_nor_its_time():
