@@ -30,7 +30,8 @@ def entry(typingctx, array, index):
     """A vector that holds one element of a float64 array everywhere, at flat index ``index``; nothing is checked."""
 
     def emit(context, builder, sig, args):
-        scalar = builder.load(address(context, builder, sig.args[0], *args, ir.DoubleType()))
+        array, index = args
+        scalar = builder.load(address(context, builder, sig.args[0], array, index, ir.DoubleType()))
         return repeat(builder, _DOUBLES, scalar)
 
     return doubles(array, types.intp), emit

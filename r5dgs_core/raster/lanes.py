@@ -27,7 +27,8 @@ def load(typingctx, array, index):
     """Lanes from a float32 array, from flat index ``index`` on; nothing is checked."""
 
     def emit(context, builder, sig, args):
-        return builder.load(address(context, builder, sig.args[0], *args, _FLOATS), align=4)
+        array, index = args
+        return builder.load(address(context, builder, sig.args[0], array, index, _FLOATS), align=4)
 
     return lanes(array, types.intp), emit
 
@@ -117,9 +118,10 @@ def load_rows(typingctx, array, index, stride):
     """Lanes from four rows of four floats, as `store_rows` writes them."""
 
     def emit(context, builder, sig, args):
-        rows = _load_parts(context, builder, sig.args[0], *args, ROWS)
-        pairs = [shuffle(builder, rows[i], rows[i + 1], range(2 * ROWS)) for i in (0, 2)]
-        return shuffle(builder, *pairs, range(LANES))
+        array, at, stride = args
+        rows = _load_parts(context, builder, sig.args[0], array, at, stride, ROWS)
+        upper, lower = (shuffle(builder, rows[i], rows[i + 1], range(2 * ROWS)) for i in (0, 2))
+        return shuffle(builder, upper, lower, range(LANES))
 
     return lanes(array, types.intp, types.intp), emit
 
@@ -129,8 +131,8 @@ def load_rows_of_three(typingctx, array, index, stride):
     """Three vectors from an array that holds three values per pixel, as `store_rows_of_three` writes them."""
 
     def emit(context, builder, sig, args):
-        low = _load_parts(context, builder, sig.args[0], *args, 8)
         array, at, stride = args
+        low = _load_parts(context, builder, sig.args[0], array, at, stride, 8)
         after = builder.add(at, ir.Constant(at.type, 8))
         high = _load_parts(context, builder, sig.args[0], array, after, stride, ROWS)
         widened = [shuffle(builder, part, part, [0, 1, 2, 3, 0, 0, 0, 0]) for part in high]
@@ -139,8 +141,8 @@ def load_rows_of_three(typingctx, array, index, stride):
         for channel in range(3):
             taken = [3 * x + channel for x in range(ROWS)]
             both = [*taken, *(LANES + i for i in taken)] * 2
-            pairs = [shuffle(builder, rows[i], rows[i + 1], both) for i in (0, 2)]
-            result.append(shuffle(builder, *pairs, [*range(8), *range(LANES, LANES + 8)]))
+            upper, lower = (shuffle(builder, rows[i], rows[i + 1], both) for i in (0, 2))
+            result.append(shuffle(builder, upper, lower, [*range(8), *range(LANES, LANES + 8)]))
         return context.make_tuple(builder, sig.return_type, result)
 
     return types.UniTuple(lanes, 3)(array, types.intp, types.intp), emit

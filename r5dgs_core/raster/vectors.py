@@ -169,7 +169,8 @@ def prefetch(typingctx, array, index):
     """Ask for the cache line of one element of an array, at flat index ``index``, before it is needed."""
 
     def emit(context, builder, sig, args):
-        where = address(context, builder, sig.args[0], *args, ir.IntType(8))
+        array, index = args
+        where = address(context, builder, sig.args[0], array, index, ir.IntType(8))
         reading, soon, data = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
         call(builder, "llvm.prefetch.p0", ir.VoidType(), [where, reading, soon, data])
         return context.get_dummy_value()
