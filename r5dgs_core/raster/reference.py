@@ -235,10 +235,11 @@ def _heaviest(weights, labels, transmittance, settings):
     ids = torch.full((len(weights),), -1, dtype=torch.int32, device=weights.device)
     if labels is None or not len(labels):
         return ids
-    names, planes = torch.unique(labels.long().clamp_min(-1), return_inverse=True)  # rising, and argmax takes the first
+    names, planes = torch.unique(labels.long().clamp_min(-1), return_inverse=True)  # rising, and max takes the first
     votes = weights.new_zeros((len(weights), len(names))).index_add_(1, planes, weights)
-    enough = 1 - transmittance >= settings.id_alpha_min
-    return torch.where(enough, names[votes.argmax(1)].to(torch.int32), ids)
+    most, winners = votes.max(1)
+    enough = (1 - transmittance >= settings.id_alpha_min) & (most > 0)
+    return torch.where(enough, names[winners].to(torch.int32), ids)
 
 
 def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import rasterize, rasterize_splats
+from r5dgs_core.raster import RasterSettings, rasterize, rasterize_splats
 from tests.splats import camera, splats
 
 BACKENDS = ("cpu", "reference")
@@ -92,6 +92,15 @@ def test_ids_of_the_reference_are_the_labels_as_large_as_int32():
     ids, expected = (rasterize_splats(*inputs, camera(), labels=x, backend="reference").ids for x in (large, small))
     assert len(expected.unique()) > 4 and expected.max() > 0
     assert torch.equal(ids.long(), torch.where(expected > 0, expected.long() + 2**31 - 5, expected.long()))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_where_nothing_is_seen_there_is_no_id_even_if_any_alpha_were_enough(backend):
+    labels, settings = torch.arange(10) + 3, RasterSettings(id_alpha_min=0.0)
+    result = rasterize_splats(*scene(), camera(), labels=labels, settings=settings, backend=backend)
+    seen = result.alpha > 0
+    assert seen.any() and not seen.all()
+    assert (result.ids[~seen] == -1).all() and (result.ids[seen] >= 3).all()
 
 
 # Gaussians
