@@ -8,7 +8,6 @@ shown or behind it, everything is drawn; from the next frame on, the instances t
 
 from __future__ import annotations
 
-import importlib.util
 import threading
 import time
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ import torch
 
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import scene_render
+from . import scene_render, splatting
 from .scene_render import Instance
 from .settings import RasterSettings, RenderOutput
 
@@ -88,7 +87,7 @@ class Stage:
         return RenderOutput(picture.image, picture.alpha, picture.depth, None, picture.ids)
 
     def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
-        if importlib.util.find_spec("numba") is None:
+        if not splatting.numba_is_there():
             return False
         moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
         return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)

@@ -29,7 +29,8 @@ def warm_up(progress: Callable[[str], object] | None = None) -> float:
     for name, stage in (("poses", _poses), ("loss", _loss)):
         if progress is not None:
             progress(name)
-        stage()
+        with torch.inference_mode(False), torch.enable_grad():
+            stage()
     return time.perf_counter() - start
 
 

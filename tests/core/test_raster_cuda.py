@@ -53,6 +53,7 @@ def rasterize_cuda(request, monkeypatch):
 
     def rasterize(*inputs, labels=None, **options):
         inputs = [t.to(device) if isinstance(t, torch.Tensor) else t for t in inputs]
+        labels = None if labels is None else labels.to(device)
         result = rasterize_splats(*inputs, labels=labels, backend="cuda", **options)
         parts = (result.image, result.alpha, result.depth, result.ids)
         assert all(part is None or part.device.type == device.type for part in parts)
