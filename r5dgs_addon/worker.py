@@ -196,9 +196,12 @@ class Worker:
             self._answers.put(None)
 
     def _hear(self, event: dict[str, Any]) -> None:
-        self.notice = COMPILING if event["event"] == "compiling" else ""
-        if self.notice:
-            log.warning("R5DGS worker: %s", self.notice)
+        notice = COMPILING if event["event"] == "compiling" else ""
+        if notice:
+            log.warning("R5DGS worker: %s", notice)
+        if event["event"] == "failed":
+            log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))
+        self.notice = notice  # last: who sees it finds it told already
 
     def _read_stderr(self) -> None:
         stream = self._process.stderr
