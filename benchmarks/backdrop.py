@@ -63,6 +63,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--json", type=Path, help="write the rows here, too")
     options = parser.parse_args(arguments)
+    if options.json and not options.json.parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
+    for name in options.workloads.split(","):
+        try:
+            workloads.check(name)
+        except ValueError as error:
+            parser.error(str(error))
     rows = []
     print(" ".join(f"{column:>12}" for column in COLUMNS))
     with torch.no_grad():

@@ -85,6 +85,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--verbose", action="store_true", help="show what the processes print, notices included")
     parser.add_argument("--alone", metavar="SH,SKY", help="measure in this process and print its times as JSON")
     options = parser.parse_args(arguments)
+    if options.json and not options.json.parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
     if options.alone:
         sh_degree, sky_degree = map(int, options.alone.split(","))
         print(json.dumps(first_frame(options.count, options.size, sh_degree, sky_degree)))

@@ -174,11 +174,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--bodies", type=int, default=6)
     parser.add_argument("--kind", choices=KINDS, default="cube", help="bodies are slabs of a cube, or balls in a room")
     parser.add_argument("--share", type=float, default=SHARE, help="of the Gaussians, on bodies (2/3)")
-    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
+    parser.add_argument("--threads", default="1,2")
     parser.add_argument("--degrees", nargs="+", default=["0,0", "0,2", "3,2"], help="of colours and sky: SH,SKY")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--json", type=Path, help="write the rows here, too")
     options = parser.parse_args(arguments)
+    if options.json and not options.json.parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
     if not 0 <= options.share <= 1:
         parser.error(f"--share: expected 0 to 1, got {options.share:g}")
     if options.bodies < 1:
@@ -190,7 +192,7 @@ def main(arguments: list[str] | None = None) -> None:
         scene = make_scene(
             options.count, options.bodies, sh_degree, sky_degree, camera, kind=options.kind, share=options.share
         )
-        for threads in options.threads:
+        for threads in map(int, options.threads.split(",")):
             compilation.set_threads(threads)
             torch.set_num_threads(threads)
             rows.append(

@@ -75,6 +75,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure, print rows and ratios, write the rows."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    if options.json and not options.json.parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
     options.threads = [count for part in options.threads for count in part]
     options.backends = [name for part in options.backends for name in part]
     if min(options.threads) < 1 or options.repeats < 1:

@@ -112,6 +112,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="write the rows here")
     parser.add_argument("--plot", type=Path, help="write the picture here")
     options = parser.parse_args(arguments)
+    if options.json and not options.json.parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
     groups = [group for part in options.groups for group in part]
     if not set(groups) <= set(GROUPS):
         parser.error(f"--groups: expected of {', '.join(GROUPS)}, got {', '.join(sorted(set(groups) - set(GROUPS)))}")

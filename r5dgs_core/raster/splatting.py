@@ -62,6 +62,8 @@ def rasterize_splats(
     Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
     """
     settings = settings or RasterSettings()
+    if not isinstance(settings, RasterSettings):
+        raise TypeError(f"settings: expected RasterSettings, got {type(settings).__name__}")
     check_splats(means, quats, scales, opacities, channels, camera, background, labels)
     chosen = choose_backend(backend, means)
     if background is not None:
@@ -208,14 +210,20 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
     for name, tensor in inputs.items():
         _check_tensor(name, tensor)
+        if not tensor.is_floating_point():
+            raise ValueError(f"{name}: expected floating-point values, got {tensor.dtype}; remedy: {name}.float()")
     n = len(means) if means.ndim else 0
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
     for name, tensor in inputs.items():
         expected = shapes.get(name, (n, channels.shape[-1] if channels.ndim == 2 and channels.shape[-1] else "D >= 1"))
         if tuple(tensor.shape) != expected:
-            raise ValueError(f"{name}: expected shape {expected}, got {tuple(tensor.shape)}")
-        if tensor.dtype != means.dtype or tensor.device != means.device or not tensor.is_floating_point():
-            raise ValueError(f"{name}: expected {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}")
+            wanted = str(expected).replace("'", "")
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(tensor.shape)}")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"{name}: expected {means.dtype} on {means.device}, as the means are, got {tensor.dtype} on "
+                f"{tensor.device}; remedy: {name}.to(means), or the means in the kind of the others"
+            )
     _check_camera(camera)
     if background is not None:
         _check_background(background, means, camera, channels.shape[-1])
@@ -226,6 +234,7 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
         _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
 
 
+_RIGID_TOLERANCE = 1e-3  # largest entry of R R^T - 1
 _ROUNDING = 1e-9  # of the entries of a camera that are 0 or 1 and not read
 
 # Smallest and largest value of the inputs that have them, and the remedy.
@@ -280,8 +289,13 @@ def _check_labels(labels: Any, means: torch.Tensor) -> None:
     if tuple(labels.shape) != (len(means),) or not whole:
         raise ValueError(f"labels: expected {len(means)} integers, got {labels.dtype} of shape {tuple(labels.shape)}")
     _check_device("labels", labels, means)
-    if labels.dtype not in _NARROW and len(labels) and labels.long().max() > _MOST_LABEL:
-        at = int(labels.long().argmax())
+    if labels.dtype in _NARROW or not len(labels):
+        return
+    numbers = labels.long()
+    if labels.dtype == torch.uint64:  # those from 2^63 on turn negative
+        numbers = torch.where(numbers < 0, torch.iinfo(torch.int64).max, numbers)
+    if numbers.max() > _MOST_LABEL:
+        at = int(numbers.argmax())
         raise ValueError(f"labels: expected at most {_MOST_LABEL}, found {labels[at].item()} at index {at}")
 
 
@@ -317,11 +331,17 @@ def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | Non
 
 def _check_camera(camera: Camera) -> None:
     """Raise ValueError naming the entry of the camera that no image can be drawn with."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
     place = f"camera {camera.name!r}" if camera.name else "camera"
+    if not all(isinstance(side, int | np.integer) for side in (camera.width, camera.height)):
+        raise TypeError(f"{place}: expected whole numbers of pixels, got {camera.width!r} x {camera.height!r}")
     if camera.width < 1 or camera.height < 1:
         raise ValueError(f"{place}: expected a width and height of 1 or more, got {camera.width} x {camera.height}")
     for name, shape in (("intrinsics", (3, 3)), ("T_cam_world", (4, 4))):
-        matrix = np.asarray(getattr(camera, name))
+        matrix = getattr(camera, name)
+        if not isinstance(matrix, np.ndarray):
+            raise TypeError(f"{place}: {name}: expected an array, got {type(matrix).__name__}; cameras get no gradient")
         if matrix.shape != shape:
             raise ValueError(f"{place}: {name}: expected shape {shape}, got {matrix.shape}")
         bad = np.argwhere(~np.isfinite(matrix))
@@ -331,6 +351,13 @@ def _check_camera(camera: Camera) -> None:
         last = np.eye(len(matrix))[-1]
         if not np.allclose(matrix[-1], last, rtol=0, atol=_ROUNDING):
             raise ValueError(f"{place}: {name}: expected {last.tolist()} as the last row, found {matrix[-1].tolist()}")
+    rotation = camera.T_cam_world[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"{place}: T_cam_world: expected a rotation in its first three rows and columns, found one that is off by "
+            f"{off:.2g} or mirrors; remedy: take scale and mirroring out of it"
+        )
     if abs(camera.intrinsics[1, 0]) > _ROUNDING:
         raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")
     for at in ((0, 0), (1, 1)):

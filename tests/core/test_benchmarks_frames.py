@@ -89,7 +89,7 @@ def test_a_picture_of_a_stage_that_differs_is_noticed(load):
 def test_a_row_of_frames_splits_its_time(load, tmp_path, capsys):
     frame_rate, target = load("frame_rate"), tmp_path / "rows.json"
     options = ["--count", "200", "--size", "32", "--frames", "3", "--degrees", "0,0", "1,2", "--json", str(target)]
-    frame_rate.main([*options, "--threads", "1", "2"])
+    frame_rate.main([*options, "--threads", "1,2"])
     rows = json.loads(target.read_text())
     assert [(r["threads"], r["sh_degree"], r["sky_degree"]) for r in rows] == [
         (1, 0, 0),

@@ -191,3 +191,50 @@ def test_entries_of_a_camera_that_are_not_read_must_be_what_they_are_taken_for(n
     exact = 1.0 if index in ((2, 2), (3, 3)) else 0.0
     found = rasterize_splats(*scene(), changed(exact + 1e-12)).image  # as inverting a matrix leaves
     assert torch.equal(found, rasterize_splats(*scene(), camera()).image)
+
+
+@pytest.mark.parametrize(
+    "rotation", [np.zeros((3, 3)), 2 * np.eye(3), np.diag([-1.0, 1.0, 1.0]), np.eye(3) + 0.01 * np.eye(3)[::-1]]
+)
+def test_a_pose_that_is_no_rotation_is_refused(rotation):
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    view = dataclasses.replace(camera(), T_cam_world=pose)
+    with pytest.raises(ValueError, match=r"T_cam_world: expected a rotation"):
+        rasterize_splats(*[t.float() for t in splats(5, 3)], view)
+
+
+def test_labels_beyond_signed_numbers_are_refused():
+    labels = torch.tensor([1, 2**64 - 1, 3], dtype=torch.uint64)
+    with pytest.raises(ValueError, match=r"labels.*at index 1"):
+        rasterize_splats(*[t.float() for t in splats(3, 3)], camera(), labels=labels)
+
+
+def test_whole_numbers_and_mixed_kinds_are_told_apart():
+    whole = [t.long() for t in splats(3, 3)]
+    with pytest.raises(ValueError, match=r"means: expected floating-point values.*means\.float\(\)"):
+        rasterize_splats(*whole, camera())
+    mixed = [splats(3, 3)[0], *(t.float() for t in splats(3, 3)[1:])]
+    with pytest.raises(ValueError, match=r"quats: expected torch.float64 on cpu, as the means are.*remedy"):
+        rasterize_splats(*mixed, camera())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 64.0}, "whole numbers of pixels"),
+        ({"T_cam_world": np.eye(4).tolist()}, "T_cam_world: expected an array, got list"),
+        ({"intrinsics": torch.eye(3)}, "intrinsics: expected an array, got Tensor"),
+    ],
+)
+def test_cameras_of_the_wrong_kinds_are_refused(change, message):
+    with pytest.raises(TypeError, match=message):
+        rasterize_splats(*[t.float() for t in splats(3, 3)], dataclasses.replace(camera(), **change))
+
+
+def test_what_is_no_camera_and_what_are_no_settings_is_said():
+    scene = [t.float() for t in splats(3, 3)]
+    with pytest.raises(TypeError, match="camera: expected a Camera, got NoneType"):
+        rasterize_splats(*scene, None)
+    with pytest.raises(TypeError, match="settings: expected RasterSettings, got dict"):
+        rasterize_splats(*scene, camera(), settings={"alpha_min": 0.1})
