@@ -76,7 +76,7 @@ def rasterize_splats(
 
 
 def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
-    """Everything that projection needs, in the order of the constants in `cpu_projection`. [VIEW] float64
+    """Everything that projection needs, in the order of the constants in `cpu_projection`. [26] float64
 
     Raises:
         ValueError: The image has more tiles along a side than can be counted.
@@ -153,7 +153,7 @@ def project(
 
 
 def pack_limits(settings: RasterSettings) -> np.ndarray:
-    """The thresholds in the order of the constants in `cpu_exact`. [LIMITS] float64"""
+    """The thresholds in the order of the constants in `cpu_exact`. [6] float64"""
     return np.array(
         [
             math.log2(settings.alpha_min),

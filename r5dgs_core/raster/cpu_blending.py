@@ -53,7 +53,6 @@ from .lanes import (
     store,
     store_rows,
     store_rows_of_three,
-    store_whole_rows,
 )
 from .vectors import any_of, bits_of, fma, larger, lowest_bit, select, unlikely
 
@@ -259,7 +258,7 @@ def _finish_tile(
                 store_rows(flat_end, pixel, width, passes)
                 store_rows(flat_last, pixel, width, load(last, at))
             if planes:
-                store_whole_rows(flat_ids, pixel, width, load(pixels, at_id))
+                store_rows(flat_ids, pixel, width, load(pixels, at_id))
             red, green, blue = load(pixels, 0), load(pixels, LANES), load(pixels, 2 * LANES)
             if not one_background:
                 behind = load_rows_of_three(flat_background, 3 * pixel, 3 * width)

@@ -21,7 +21,6 @@ CLOSE_TRANSMITTANCE = 2e-4
 
 # Entries of the limits vector; CLOSE_LOG2 is the distance of log2(alpha) from a cut-off beyond which float32 decides.
 LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN, CLOSE_LOG2 = range(6)
-LIMITS = 6
 
 
 @helper

@@ -38,7 +38,6 @@ GEOMETRY = 8
 # Entries of the view vector, see `cpu.pack_view`.
 FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATION, ALPHA_MIN = range(14)
 ROTATION, TRANSLATION = 14, 23
-VIEW = 26
 
 # Tiles of the image: side in px, and the most along one side, so that four numbers of tiles fit into one float64.
 TILE = 32  # larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque

@@ -61,26 +61,15 @@ ROWS = 4
 
 @operation
 def store_rows(typingctx, array, index, stride, value):
-    """Write four rows of four lanes to a float32 array, the first at a flat index, each a stride after the last."""
+    """Write four rows of four lanes to an array, the first at a flat index, each a stride after the last.
+
+    The array holds float32, or int32 where the lanes are whole numbers.
+    """
 
     def emit(context, builder, sig, args):
         array, at, stride, value = args
-        for row in range(ROWS):
-            part = shuffle(builder, value, value, range(row * ROWS, (row + 1) * ROWS))
-            _store_part(context, builder, sig.args[0], array, at, part)
-            at = builder.add(at, stride)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, lanes), emit
-
-
-@operation
-def store_whole_rows(typingctx, array, index, stride, value):
-    """Like `store_rows` for an array of int32; the lanes are whole numbers."""
-
-    def emit(context, builder, sig, args):
-        array, at, stride, value = args
-        value = builder.fptosi(value, _INTS)
+        if sig.args[0].dtype == types.int32:
+            value = builder.fptosi(value, _INTS)
         for row in range(ROWS):
             part = shuffle(builder, value, value, range(row * ROWS, (row + 1) * ROWS))
             _store_part(context, builder, sig.args[0], array, at, part)
