@@ -1,6 +1,5 @@
 """The benchmarks of the rasterizer: what their rows hold, how peers take part, and what they draw."""
 
-import importlib
 import json
 import math
 import os
@@ -17,10 +16,9 @@ pytest.importorskip("numba")
 from r5dgs_core.raster import rasterize_splats  # noqa: E402
 from r5dgs_core.scene import scene_file  # noqa: E402
 from r5dgs_core.scene.cameras import Camera  # noqa: E402
-from tests import scenes  # noqa: E402
+from tests import benchmark_modules, scenes  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-FOLDER = ROOT / "benchmarks"
 COLUMNS = ["workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb"]
 REPORT_COLUMNS = {"task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto"}
 
@@ -53,14 +51,9 @@ def forward_backward(state, upstream):
 
 @pytest.fixture
 def load(monkeypatch):
-    """Imports a benchmark by name, as running it as a script would, and forgets it afterwards."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-    names = [path.stem for path in FOLDER.glob("*.py")]
-    hidden = {name: sys.modules.pop(name) for name in names if name in sys.modules}
-    yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
-    sys.modules.update(hidden)
+    """Imports a benchmark by name, see `benchmark_modules.importing`."""
+    with benchmark_modules.importing(monkeypatch) as load:
+        yield load
 
 
 def check_times(rows):
@@ -73,7 +66,7 @@ def check_times(rows):
 
 def test_the_command_line_writes_a_row_for_each_pass(tmp_path):
     target = tmp_path / "rows.json"
-    command = [sys.executable, FOLDER / "raster.py", "--workloads", "W0,train", "--threads", "1"]
+    command = [sys.executable, benchmark_modules.FOLDER / "raster.py", "--workloads", "W0,train", "--threads", "1"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run(
         [*command, "--repeats", "1", "--json", target], check=True, capture_output=True, cwd=tmp_path, env=environment

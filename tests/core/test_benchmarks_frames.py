@@ -1,10 +1,7 @@
 """The benchmarks of whole frames, of harmonics and of backdrops: what is played, and what the rows hold."""
 
 import dataclasses
-import importlib
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,28 +9,16 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("numba")
 
-from r5dgs_core.raster import compile as compilation  # noqa: E402
 from r5dgs_core.raster import scene_render  # noqa: E402
 from r5dgs_core.scene import playback, validation  # noqa: E402
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
+from tests import benchmark_modules  # noqa: E402
 
 
 @pytest.fixture
 def load(monkeypatch):
-    """Imports a benchmark by name, as running it as a script would; threads are reset afterwards."""
-    import torch
-
-    before = compilation.threads(), torch.get_num_threads()
-    monkeypatch.syspath_prepend(str(FOLDER))
-    names = [path.stem for path in FOLDER.glob("*.py")]
-    hidden = {name: sys.modules.pop(name) for name in names if name in sys.modules}
-    yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
-    sys.modules.update(hidden)
-    compilation.set_threads(before[0])
-    torch.set_num_threads(before[1])
+    """Imports a benchmark by name, see `benchmark_modules.importing`."""
+    with benchmark_modules.importing(monkeypatch) as load:
+        yield load
 
 
 def test_the_scene_that_is_played_is_valid_and_its_bodies_move(load):
