@@ -21,7 +21,7 @@ from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, needs, representation
+from . import checkpoint, groups, needs, representation
 from .normalization import Normalization
 
 MIN_BIND_FACTOR = 0.1
@@ -172,7 +172,7 @@ def _voters(opacities: np.ndarray) -> np.ndarray:
 
 def _motion_group(
     index: int,
-    group: representation.GroupTrack,
+    group: groups.GroupTrack,
     times: np.ndarray,
     poses: np.ndarray,
     pivot: np.ndarray,

@@ -12,7 +12,7 @@ from r5dgs_core.motion import rotations
 from r5dgs_core.raster import scene_render
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import playback, scene_file, validation
-from r5dgs_core.train import bake, checkpoint, normalization, representation, run
+from r5dgs_core.train import bake, checkpoint, normalization, run, tracks_representation
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -74,7 +74,7 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
 
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
     state = checkpoint.load(trained.folder)
-    tracks = representation.tracks_of(state.tensors)
+    tracks = tracks_representation.tracks_of(state.tensors)
     norm = normalization.Normalization(np.array(state.origin), state.scale)
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
