@@ -11,13 +11,17 @@ import difflib
 import math
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
 from ..errors import ConfigError
 
-REPRESENTATIONS = ("tracks",)
+REPRESENTATIONS = ("tracks", "field")
+VARIANTS = ("5dgs", "r5dgs", "r5dgs_extra")
+FIELD_SIZES = ("complex", "light", "small")
+MOVERS = ("all", "labelled")
+IDENTITY_TRAINING = ("after", "joint", "detached", "off")
 BACKGROUNDS = ("auto", "learned", "white", "black")
 
 
@@ -28,7 +32,7 @@ class TrainSection:
     Attributes:
         iterations: Optimisation steps; one view each.
         seed: Seed of all random draws.
-        representation: ``tracks`` (one SE(3) track per object).
+        representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field and TRD, the paper's).
         background: ``learned`` sky, ``white`` or ``black``; ``auto`` is white where images carry alpha, else learned.
         sh_degree: Degree of the view-dependent colour, 0 to 3.
         threads: Threads of torch; the small arrays of this trainer gain nothing from more than one.
@@ -87,8 +91,11 @@ class RatesSection:
         translations: Displacements of the tracks.
         rotvecs: Rotations of the tracks, rad.
         slope: How shadows follow their casters.
+        field: Weights of the deformation field.
+        trd: Weights of the TRD network.
         background: Harmonics of the sky.
         decay: Factor by which rates have fallen at the end of the run.
+        decay_networks: The same for the networks of ``field``.
         decay_floor_appearance: Appearance falls no lower than this factor.
         decay_from: Share of the run before the rates begin to fall.
     """
@@ -104,10 +111,52 @@ class RatesSection:
     translations: float = 3e-3
     rotvecs: float = 6e-3
     slope: float = 1e-2
+    field: float = 8e-4
+    trd: float = 8e-4
     background: float = 2e-3
     decay: float = 0.02
+    decay_networks: float = 0.02
     decay_floor_appearance: float = 0.1
     decay_from: float = 0.1
+
+
+@dataclass(frozen=True)
+class FieldSection:
+    """The representation ``field``: a deformation field for the observed time, the TRD for what follows.
+
+    Attributes:
+        variant: ``5dgs`` (every Gaussian by its own dynamics), ``r5dgs`` (the same training, played rigidly) or
+            ``r5dgs_extra`` (trained with the rigidity and majority losses too).
+        size: Networks: ``complex`` (8 x 256 and 10 x 256, the paper's), ``light`` (6 x 128 and 8 x 128) or ``small``
+            (4 x 128 and 5 x 64, for processors).
+        horizon: Scene time up to which the deformation field reaches; later observed frames supervise the
+            extrapolation. 0 takes 14/15 of the last observed time, as 0.70 of 0.75.
+        step: Scene time that the TRD bridges in a training step; 0 takes two observed intervals.
+        trd_share: Share of the steps within the horizon that go through the TRD; 1 is TRACE's scheme.
+        movers: Gaussians that the networks move: ``all``, or ``labelled``: those that the masks put on an object
+            or in its shadow; the others stand still exactly.
+        place_steps: Steps that fit the field to the triangulated places of the objects before the first image.
+        tracks_steps: Length of a run of ``tracks`` that the field starts from; 0 starts from scratch.
+        distill_steps: Steps that fit field and TRD to the motion of those tracks.
+        trd_steps: Steps that fit the TRD to the motion of the field, without images, at every ``trd_every``.
+        trd_every: Steps between two such fits, as a share of the run; 0 for none.
+        twist: Weight of the cross-Gaussian twist loss in these fits: one twist must carry its neighbours too.
+        chunk: Gaussians that pass the networks at once; bounds memory.
+    """
+
+    variant: str = "r5dgs"
+    size: str = "small"
+    horizon: float = 0.0
+    step: float = 0.0
+    trd_share: float = 0.5
+    movers: str = "labelled"
+    place_steps: int = 300
+    tracks_steps: int = 0
+    distill_steps: int = 600
+    trd_steps: int = 200
+    trd_every: float = 0.2
+    twist: float = 1.0
+    chunk: int = 65536
 
 
 @dataclass(frozen=True)
@@ -117,10 +166,14 @@ class LossSection:
     Attributes:
         ssim: Share of 1 - SSIM in the photometric loss; the rest is L1.
         roughness: Weight of the mean squared second difference of the tracks.
+        rigid: Weight of the change of distance to the representative of the object (variant ``r5dgs_extra``).
+        rigid_start: Share of the run after which it counts.
     """
 
     ssim: float = 0.2
     roughness: float = 0.02
+    rigid: float = 0.5
+    rigid_start: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -170,30 +223,48 @@ class DensifySection:
 
 @dataclass(frozen=True)
 class IdentitySection:
-    """Identity encodings (Gaussian Grouping), trained on frozen geometry after the run.
+    """Identity encodings (Gaussian Grouping).
 
     Attributes:
-        iterations: Steps; 0 leaves encodings and classifier out.
+        training: ``after`` the run on frozen geometry, ``joint`` with it from the first step (the paper), ``detached``
+            with it, without gradient to the geometry; ``off`` leaves encodings and classifier out.
+        iterations: Steps of ``after``; 0 is ``off``.
         rate: Learning rate of the encodings.
         classifier_rate: Learning rate of the classifier.
+        weight: Weight of the pixel cross-entropy (divided by ln C) beside the photometric loss.
+        every: Steps between two pixel losses of ``detached``.
+        spatial: Weight of the divergence between neighbours' classes (L_3d); 0 for none.
+        majority: Weight of the distance from the neighbours' mean class (L_major); 0 for none.
+        regularise_every: Steps between two evaluations of these two (tau_reg).
+        neighbours: Neighbours that are compared.
+        samples: Gaussians that are compared with theirs each time.
     """
 
+    training: str = "after"
     iterations: int = 400
     rate: float = 1e-2
     classifier_rate: float = 5e-3
+    weight: float = 1.0
+    every: int = 4
+    spatial: float = 0.0
+    majority: float = 0.0
+    regularise_every: int = 2
+    neighbours: int = 5
+    samples: int = 1000
 
 
 @dataclass(frozen=True)
 class Config:
     """All sections of a run's configuration."""
 
-    train: TrainSection = field(default_factory=TrainSection)
-    init: InitSection = field(default_factory=InitSection)
-    rates: RatesSection = field(default_factory=RatesSection)
-    losses: LossSection = field(default_factory=LossSection)
-    curriculum: CurriculumSection = field(default_factory=CurriculumSection)
-    densify: DensifySection = field(default_factory=DensifySection)
-    identity: IdentitySection = field(default_factory=IdentitySection)
+    train: TrainSection = dataclasses.field(default_factory=TrainSection)
+    init: InitSection = dataclasses.field(default_factory=InitSection)
+    rates: RatesSection = dataclasses.field(default_factory=RatesSection)
+    losses: LossSection = dataclasses.field(default_factory=LossSection)
+    field: FieldSection = dataclasses.field(default_factory=FieldSection)
+    curriculum: CurriculumSection = dataclasses.field(default_factory=CurriculumSection)
+    densify: DensifySection = dataclasses.field(default_factory=DensifySection)
+    identity: IdentitySection = dataclasses.field(default_factory=IdentitySection)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, ready for JSON."""
@@ -302,6 +373,19 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("train.iterations", *_AT_LEAST_1),
     ("train.seed", lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
     ("train.representation", lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
+    ("field.variant", lambda value: value in VARIANTS, " or ".join(VARIANTS)),
+    ("field.size", lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),
+    ("field.movers", lambda value: value in MOVERS, " or ".join(MOVERS)),
+    ("field.trd_share", *_SHARE),
+    ("field.trd_every", *_SHARE),
+    ("field.chunk", *_AT_LEAST_1),
+    ("losses.rigid_start", *_SHARE),
+    ("identity.training", lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),
+    ("identity.every", *_AT_LEAST_1),
+    ("identity.regularise_every", *_AT_LEAST_1),
+    ("identity.neighbours", *_AT_LEAST_1),
+    ("identity.samples", *_AT_LEAST_1),
+    ("rates.decay_networks", lambda value: 0 < value <= 1, "more than 0, at most 1"),
     ("train.background", lambda value: value in BACKGROUNDS, " or ".join(BACKGROUNDS)),
     ("train.sh_degree", lambda value: value <= 3, "0 to 3"),
     ("train.threads", *_AT_LEAST_1),
