@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -23,6 +23,11 @@ FIELD_SIZES = ("complex", "light", "small")
 MOVERS = ("all", "labelled")
 IDENTITY_TRAINING = ("after", "joint", "detached", "off")
 BACKGROUNDS = ("auto", "learned", "white", "black")
+NEEDS = ("auto", "on", "off")
+# What `--preset` changes; a configuration file and `--set` win over it.
+PRESETS: dict[str, dict[str, Any]] = {
+    "fast": {"train.iterations": 2000, "identity.iterations": 200},
+}
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class TrainSection:
         threads: Threads of torch; the small arrays of this trainer gain nothing from more than one.
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between log lines.
+        probe_every: Steps between looks at held-out views (split ``val``); 0 never looks.
+        probe_views: Held-out views that are looked at.
         shading: Learn how colours change as objects turn in fixed light.
         shadows: Learn shadow Gaussians that follow their caster on the plane that supports the objects.
     """
@@ -50,6 +57,8 @@ class TrainSection:
     threads: int = 1
     checkpoint_every: int = 500
     log_every: int = 50
+    probe_every: int = 500
+    probe_views: int = 5
     shading: bool = True
     shadows: bool = True
 
@@ -254,6 +263,29 @@ class IdentitySection:
 
 
 @dataclass(frozen=True)
+class NeedsSection:
+    """Your word on what a scene needs, by the names of the table of `needs.decide`: "auto" measures, "on", "off".
+
+    Attributes:
+        tracks: Motion of the objects.
+        rotation: Rotation of the objects; without it they only slide.
+        shading: Colours that change as objects turn.
+        shadows: Shadow Gaussians.
+        view_dependent_colour: Harmonics of the colour, to ``train.sh_degree`` (at least 1 where this is on).
+        sky_gradient: Harmonics of the sky; without them it has one colour.
+        classifier: Identity encodings and their classifier.
+    """
+
+    tracks: str = "auto"
+    rotation: str = "auto"
+    shading: str = "auto"
+    shadows: str = "auto"
+    view_dependent_colour: str = "auto"
+    sky_gradient: str = "auto"
+    classifier: str = "auto"
+
+
+@dataclass(frozen=True)
 class Config:
     """All sections of a run's configuration."""
 
@@ -265,6 +297,7 @@ class Config:
     curriculum: CurriculumSection = dataclasses.field(default_factory=CurriculumSection)
     densify: DensifySection = dataclasses.field(default_factory=DensifySection)
     identity: IdentitySection = dataclasses.field(default_factory=IdentitySection)
+    needs: NeedsSection = dataclasses.field(default_factory=NeedsSection)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, ready for JSON."""
@@ -301,12 +334,19 @@ def from_dict(values: dict[str, Any]) -> Config:
     return config
 
 
-def load(path: Path | None, overrides: list[str] | tuple[str, ...] = ()) -> Config:
+def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = None) -> Config:
     """Read a TOML file (or none) and apply ``section.key=value`` overrides, values written as in TOML.
 
+    Args:
+        path: The file, or None.
+        overrides: These win over the file.
+        preset: Name of one of `PRESETS`; the file and the overrides win over it.
+
     Raises:
-        ConfigError: The file is missing or not TOML, or a key or value cannot be used.
+        ConfigError: The file is missing or not TOML, the preset is unknown, or a key or value cannot be used.
     """
+    if preset is not None and preset not in PRESETS:
+        raise ConfigError(f"--preset {preset}: unknown preset{_suggest(preset, PRESETS)}")
     values: dict[str, Any] = {}
     if path is not None:
         try:
@@ -317,7 +357,20 @@ def load(path: Path | None, overrides: list[str] | tuple[str, ...] = ()) -> Conf
             raise ConfigError(f"{path}: cannot be read: {error}") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    if preset is not None:
+        values = _merge_under(values, PRESETS[preset])
     return from_dict(_merge(values, dict(_parse_override(text) for text in overrides)))
+
+
+def _merge_under(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Add the changes whose keys have no value yet; what is no section stays for `from_dict` to refuse."""
+    missing = {}
+    for name, value in changes.items():
+        section, _, key = name.partition(".")
+        keys = values.get(section, {})
+        if isinstance(keys, dict) and key not in keys:
+            missing[name] = value
+    return _merge(values, missing)
 
 
 def _parse_override(text: str) -> tuple[str, Any]:
@@ -362,8 +415,15 @@ def _validate(config: Config) -> None:
         value = getattr(getattr(config, section), key)
         if not good(value):
             raise ConfigError(f"{name}: expected {expected}, got {value!r}")
+    for need, name in _CONTRADICTED.items():
+        section, key = name.split(".")
+        if getattr(config.needs, need) == "on" and not getattr(getattr(config, section), key):
+            found = getattr(getattr(config, section), key)
+            raise ConfigError(f"needs.{need} is on, but {name} is {found!r}; leave one of them out")
 
 
+# What may not be switched off where the need is said to be there.
+_CONTRADICTED = {"shading": "train.shading", "shadows": "train.shadows", "classifier": "identity.iterations"}
 _AT_LEAST_1: tuple[Callable[[Any], bool], str] = (lambda value: value >= 1, "at least 1")
 _SHARE: tuple[Callable[[Any], bool], str] = (lambda value: 0 <= value <= 1, "0 to 1")
 _POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more than 0")
@@ -391,6 +451,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("train.threads", *_AT_LEAST_1),
     ("train.checkpoint_every", *_AT_LEAST_1),
     ("train.log_every", *_AT_LEAST_1),
+    ("train.probe_views", *_AT_LEAST_1),
     ("init.object_points", *_AT_LEAST_1),
     ("init.background_points", *_AT_LEAST_1),
     ("init.sweep_depths", lambda value: value >= 2, "at least 2"),
@@ -406,4 +467,5 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("densify.share", *_SHARE),
     ("densify.prune_opacity", lambda value: value < 1, "less than 1"),
     ("densify.prune_width", *_POSITIVE),
+    *((f"needs.{name}", lambda value: value in NEEDS, " or ".join(NEEDS)) for name in get_type_hints(NeedsSection)),
 )
