@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ def run_train(
     *,
     config_path: Path | None,
     overrides: list[str],
+    preset: str | None = None,
     resume: bool,
     overwrite: bool,
     progress_kind: str,
@@ -32,12 +34,12 @@ def run_train(
     from .progress import make
     from .train import run
 
-    settings = run.settings(out, config_path, overrides, resume=resume)
+    settings = run.settings(out, config_path, overrides, preset=preset, resume=resume)
     with make(progress_kind) as progress:
         run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
 
 
-def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
+def run_bake(run_folder: Path, out: Path, data: Path | None, overrides: Sequence[str] = ()) -> None:
     """Turn a run into a scene file (see `train.bake.run_bake`)."""
     from .train import bake
 
@@ -45,7 +47,7 @@ def run_bake(run_folder: Path, out: Path, data: Path | None) -> None:
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
     if out.suffix.lower() != ".r5dgs":
         raise errors.SceneFileError(f"{out}: expected a name that ends in .r5dgs, which is what Blender looks for")
-    scene = bake.run_bake(run_folder, out, data)
+    scene = bake.run_bake(run_folder, out, data, overrides)
     count = sum(o.id > 0 for o in scene.objects)
     objects = "1 object" if count == 1 else f"{count} objects"
     print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
@@ -98,6 +100,9 @@ def run_evaluate(
         default = target.with_suffix(".evaluation.json")
     if trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+    for mode in modes:
+        if mode not in playback.modes(scene):
+            raise errors.ConfigError(f"--mode {mode}: {target} has data for {', '.join(playback.modes(scene))} only")
     with make(progress_kind) as progress:
         result = evaluate.evaluate(
             scene,
@@ -177,10 +182,12 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add_training(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--preset", metavar="NAME", help="named settings; --config and --set win over them")
         p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
         p.add_argument(
             "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key; may be repeated"
         )
+        p.add_argument("--max-gaussians", metavar="N", help="cap from the first step on; densify.max_gaussians")
         add_progress(p)
         again = p.add_mutually_exclusive_group()
         again.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
@@ -202,6 +209,9 @@ def parser() -> argparse.ArgumentParser:
     bake.add_argument("run", type=Path, help="run folder")
     bake.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
     bake.add_argument("--data", type=Path, metavar="DIR", help="data set, where it has moved")
+    bake.add_argument(
+        "--set", action="append", default=[], metavar="needs.NAME=on|off", help="override a need; may be repeated"
+    )
 
     evaluate = commands.add_parser("evaluate", help="measure a run or scene on held-out views")
     evaluate.add_argument("target", type=Path, help="run folder or .r5dgs file")
@@ -241,9 +251,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _dispatch(args: argparse.Namespace) -> None:
     if args.command in ("demo", "train"):
+        cap = [] if args.max_gaussians is None else [f"densify.max_gaussians={args.max_gaussians}"]
         options = {
             "config_path": args.config,
-            "overrides": args.set,
+            "overrides": [*args.set, *cap],
+            "preset": args.preset,
             "resume": args.resume,
             "overwrite": args.overwrite,
             "progress_kind": args.progress,
@@ -255,7 +267,7 @@ def _dispatch(args: argparse.Namespace) -> None:
 
             run_demo(args.out, **options)
     elif args.command == "bake":
-        run_bake(args.run, args.out, args.data)
+        run_bake(args.run, args.out, args.data, args.set)
     elif args.command == "evaluate":
         run_evaluate(
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress

@@ -160,6 +160,28 @@ def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray
     return rotations.normalize(values) if unit else values
 
 
+def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Slopes at knots of the parabola through each knot and its neighbours; at the ends, through the nearest three.
+
+    Args:
+        times: Increasing. [S]
+        values: Values at these times. [..., S, C]
+
+    Returns:
+        Slopes per unit of time; the secant for S = 2, zero for S = 1. [..., S, C]
+    """
+    if len(times) < 2:
+        return np.zeros_like(values)
+    h = np.diff(times)[:, None]
+    secants = np.diff(values, axis=-2) / h
+    if len(times) == 2:
+        return np.repeat(secants, 2, axis=-2)
+    inner = (h[1:] * secants[..., :-1, :] + h[:-1] * secants[..., 1:, :]) / (h[:-1] + h[1:])
+    first = 2 * secants[..., :1, :] - inner[..., :1, :]
+    last = 2 * secants[..., -1:, :] - inner[..., -1:, :]
+    return np.concatenate([first, inner, last], axis=-2)
+
+
 def hermite(
     left: np.ndarray, right: np.ndarray, left_slope: np.ndarray, right_slope: np.ndarray, h: np.ndarray, u: np.ndarray
 ) -> np.ndarray:

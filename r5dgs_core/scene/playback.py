@@ -3,19 +3,23 @@
 Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
 (the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours.
 Blender's Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce
-playback at sub-frames. Before the first knot the pose is held; past t_max it is the motion model's.
+playback at sub-frames. Before the first knot the pose is held; past t_max it is the motion model's, or what another
+mode says (`modes`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..motion import keyframes, models, rotations
+from ..motion.keyframes import slopes
+from . import residuals
 from .scene import Scene
 
-MODES = ("rigid",)
+MODES = ("rigid", "standard", "rigid_paper")
 
 
 @dataclass(frozen=True)
@@ -62,28 +66,6 @@ def knots(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     quats = rotations.make_continuous(quats[::-1])[::-1]
     quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
     return np.moveaxis(quats, 0, 1), np.asarray(scene.track_poses[..., 4:], np.float64)
-
-
-def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Slopes at knots of the parabola through each knot and its neighbours; at the ends, through the nearest three.
-
-    Args:
-        times: Increasing. [S]
-        values: Values at these times. [..., S, C]
-
-    Returns:
-        Slopes per unit of time; the secant for S = 2, zero for S = 1. [..., S, C]
-    """
-    if len(times) < 2:
-        return np.zeros_like(values)
-    h = np.diff(times)[:, None]
-    secants = np.diff(values, axis=-2) / h
-    if len(times) == 2:
-        return np.repeat(secants, 2, axis=-2)
-    inner = (h[1:] * secants[..., :-1, :] + h[:-1] * secants[..., 1:, :]) / (h[:-1] + h[1:])
-    first = 2 * secants[..., :1, :] - inner[..., :1, :]
-    last = 2 * secants[..., -1:, :] - inner[..., -1:, :]
-    return np.concatenate([first, inner, last], axis=-2)
 
 
 def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -149,21 +131,42 @@ def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
     return [(int(a), int(b), int(ids[a])) for a, b in zip(starts, stops, strict=True)]
 
 
+def modes(scene: Scene) -> tuple[str, ...]:
+    """The modes that a scene holds data for: `rigid` always, the others where it carries dynamics of its Gaussians."""
+    present = (True, scene.dynamics is not None, scene.dynamics is not None and scene.canonical_means is not None)
+    return tuple(mode for mode, there in zip(MODES, present, strict=True) if there)
+
+
 def frame(scene: Scene, t: float, mode: str = "rigid") -> Frame:
     """The scene's Gaussians at time t.
 
     Args:
         scene: The scene.
         t: Scene time.
-        mode: "rigid": every Gaussian moves with its motion group.
+        mode: How Gaussians move past t_max. "rigid": with their motion group; "standard": each by its own dynamics;
+            "rigid_paper": Eq. 6 and 7 to the letter. Up to t_max all are the same.
 
     Returns:
-        The frame. Gaussians of groups that did not move are equal to the bind state to the bit.
+        The frame. Gaussians that did not move are equal to the bind state to the bit.
+
+    Raises:
+        ValueError: There is no such mode, or the scene holds no data for it (`modes`).
     """
     if mode not in MODES:
         raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
-    group_quats, group_displacements = group_poses(scene, t)
-    return pose(scene, group_quats, group_displacements, t)
+    if mode not in modes(scene):
+        raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
+    if mode == "rigid" or t <= scene.t_max:
+        group_quats, group_displacements = group_poses(scene, t)
+        return pose(residuals.deformed(scene, t), group_quats, group_displacements, t)
+    move = residuals.standard if mode == "standard" else residuals.literal
+    means, quats, turns = move(scene, t - scene.t_max)
+    bind = pose(scene, rotations.identity(len(scene.groups)), np.zeros((len(scene.groups), 3)), t)
+    shading = bind.shading_factor
+    if shading is not None and scene.shading is not None and scene.light_direction is not None:
+        change = rotations.rotate(rotations.conjugate(turns), scene.light_direction) - scene.light_direction
+        shading = np.maximum(1 + (scene.shading * change).sum(-1), 0).astype(np.float32)
+    return dataclasses.replace(bind, means=means, quats=quats, shading_factor=shading)
 
 
 def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:

@@ -1,7 +1,8 @@
 """What a `.r5dgs` file holds: Gaussians in their bind state at t_max, objects, motion groups and their tracks.
 
-Notation: N Gaussians, M objects, G motion groups, S knots, K SH bases. A motion group g moves its members rigidly,
-x(t) = p_g + R_g(t) (x(t_max) - p_g) + d_g(t), with pivot p_g, R_g(t_max) = I and d_g(t_max) = 0.
+Notation: N Gaussians, M objects, G motion groups, S knots, K SH bases, R Gaussians with residuals. A motion group g
+moves its members rigidly, x(t) = p_g + R_g(t) (x(t_max) - p_g) + d_g(t), with pivot p_g, R_g(t_max) = I and
+d_g(t_max) = 0. A residual changes a Gaussian in the bind state before its group moves it, and is zero at t_max.
 """
 
 from __future__ import annotations
@@ -102,6 +103,14 @@ class Scene:
         classifier_weight: Linear classifier of identities; row k is the k-th object with id >= 0 of ``objects``.
             [M + 1, 16] float32 or None
         classifier_bias: Its bias, in the same order. [M + 1] float32 or None
+        residual_rows: Gaussians whose observed motion their group does not explain, increasing. [R] int32 or None
+        residual_offsets: What is added to their centres at the knots, bind frame. [R, S, 3] float32 or None
+        residual_quats: Rotations that go before those of the bind state at the knots, unit wxyz. [R, S, 4] float32
+            or None
+        residual_log_scales: What is added to their log scales at the knots. [R, S, 3] float32 or None
+        dynamics: Motion of each Gaussian on its own past t_max, for mode "standard": velocity of its centre, angular
+            velocity and the rates of both, about its centre at t_max. [N, 12] float32 or None
+        canonical_means: Centres in the canonical state, for mode "rigid_paper", world. [N, 3] float32 or None
         shading: How the colour changes as the group turns: factor 1 + (R^T l - l) . g. [N, 3] float32 or None
         light_direction: l above, unit, world. [3]
         embeddings: One row per object of ``objects``, unit. [M, D] or None
@@ -132,6 +141,12 @@ class Scene:
     identities: np.ndarray | None = None
     classifier_weight: np.ndarray | None = None
     classifier_bias: np.ndarray | None = None
+    residual_rows: np.ndarray | None = None
+    residual_offsets: np.ndarray | None = None
+    residual_quats: np.ndarray | None = None
+    residual_log_scales: np.ndarray | None = None
+    dynamics: np.ndarray | None = None
+    canonical_means: np.ndarray | None = None
     shading: np.ndarray | None = None
     light_direction: np.ndarray | None = None
     embeddings: np.ndarray | None = None

@@ -1,7 +1,8 @@
 """Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/scene_format.md).
 
 Members hold what `Scene` holds, under the same names. Some are stored with fewer bits and restored to float32 on
-reading: quats, log_scales and opacity_logits as int16 fixed point, sh and shading as float16.
+reading: quats, log_scales and opacity_logits as int16 fixed point, sh, shading and residuals as float16 (rotations of
+residuals as int16).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from . import files, scene_json, validation
+from . import files, playback, scene_json, validation
 from .scene import Scene
 
 FORMAT = "r5dgs scene"
@@ -25,8 +26,8 @@ FORMAT_VERSION = 1
 JSON_MEMBER = "scene.json"
 
 # Fixed point: stored int16 i stands for i / scale.
-FIXED_POINT = {"quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
-_HALF = ("sh", "shading")
+FIXED_POINT = {"quats": 32767.0, "residual_quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
+_HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
 _MEMORY_DTYPES: dict[str, type] = {
     "means": np.float32,
     "quats": np.float32,
@@ -41,6 +42,12 @@ _MEMORY_DTYPES: dict[str, type] = {
     "identities": np.float16,
     "classifier_weight": np.float32,
     "classifier_bias": np.float32,
+    "residual_rows": np.int32,
+    "residual_offsets": np.float32,
+    "residual_quats": np.float32,
+    "residual_log_scales": np.float32,
+    "dynamics": np.float32,
+    "canonical_means": np.float32,
     "shading": np.float32,
     "embeddings": np.float32,
     "vocabulary_embeddings": np.float32,
@@ -49,6 +56,12 @@ _OPTIONAL = (
     "identities",
     "classifier_weight",
     "classifier_bias",
+    "residual_rows",
+    "residual_offsets",
+    "residual_quats",
+    "residual_log_scales",
+    "dynamics",
+    "canonical_means",
     "shading",
     "embeddings",
     "vocabulary_embeddings",
@@ -135,6 +148,8 @@ def info(scene: Scene) -> dict[str, Any]:
         "extent": scene.extent,
         "identities": scene.identities is not None,
         "shading": scene.shading is not None,
+        "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),
+        "modes": list(playback.modes(scene)),
         "vocabulary": len(scene.vocabulary),
     }
 
@@ -176,7 +191,7 @@ def _encode(name: str, array: np.ndarray) -> np.ndarray:
 def _decode(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype == np.int16:
         values = array.astype(np.float64) / FIXED_POINT[name]
-        if name == "quats":
+        if name in ("quats", "residual_quats"):
             norms = np.linalg.norm(values, axis=-1, keepdims=True)
             values = np.divide(values, norms, out=values, where=np.abs(norms - 1) < 1e-3)
         return values.astype(np.float32)

@@ -27,6 +27,7 @@ def check(scene: Scene, place: str) -> None:
         _fail(place, "sh", f"({count}, K, 3) with K one of {SH_BASES}", scene.sh.shape)
     if scene.background_sh.ndim != 2 or scene.background_sh.shape[0] not in SH_BASES:
         _fail(place, "background_sh", f"(K, 3) with K one of {SH_BASES}", scene.background_sh.shape)
+    strays = 0 if scene.residual_rows is None else len(scene.residual_rows)
     expected = {
         "means": ((count, 3), np.float32),
         "quats": ((count, 4), np.float32),
@@ -41,6 +42,12 @@ def check(scene: Scene, place: str) -> None:
         "identities": ((count, IDENTITY_DIM), None),
         "classifier_weight": ((classes, IDENTITY_DIM), np.float32),
         "classifier_bias": ((classes,), np.float32),
+        "residual_rows": ((strays,), np.int32),
+        "residual_offsets": ((strays, knots, 3), np.float32),
+        "residual_quats": ((strays, knots, 4), np.float32),
+        "residual_log_scales": ((strays, knots, 3), np.float32),
+        "dynamics": ((count, 12), np.float32),
+        "canonical_means": ((count, 3), np.float32),
         "shading": ((count, 3), np.float32),
         "light_direction": ((3,), None),
         "embeddings": ((len(scene.objects), None), None),
@@ -66,6 +73,7 @@ def check(scene: Scene, place: str) -> None:
     stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
     if len(stray):
         _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
+    _check_residuals(scene, place)
     _check_units(scene, place)
     _check_times(scene, place)
     _check_objects(scene, place)
@@ -89,8 +97,26 @@ def _fail(place: str, member: str, expected: str, found: object) -> None:
     raise errors.SceneFileError(f"{place}: {member}: expected {expected}, found {found}")
 
 
+def _check_residuals(scene: Scene, place: str) -> None:
+    rows = scene.residual_rows
+    parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
+    if any((part is None) != (rows is None) for part in parts):
+        _fail(place, "residual_rows", "all four members residual_*, or none of them", "some of them")
+    if scene.canonical_means is not None and scene.dynamics is None:
+        _fail(place, "dynamics", "an array beside 'canonical_means'", "none")
+    if rows is None or scene.residual_offsets is None or scene.residual_log_scales is None:
+        return
+    if len(rows) and (rows[0] < 0 or rows[-1] >= len(scene.means) or (np.diff(rows) <= 0).any()):
+        _fail(place, "residual_rows", f"increasing rows below {len(scene.means)}", "others")
+    for name in ("residual_offsets", "residual_log_scales"):
+        if (getattr(scene, name)[:, -1] != 0).any():
+            _fail(place, name, "zero at t_max (residuals are relative to the bind state)", "something else")
+
+
 def _check_units(scene: Scene, place: str) -> None:
-    for name, array in (("quats", scene.quats), ("track_poses", scene.track_poses[..., :4].reshape(-1, 4))):
+    turns = np.zeros((0, 4)) if scene.residual_quats is None else scene.residual_quats.reshape(-1, 4)
+    poses = scene.track_poses[..., :4].reshape(-1, 4)
+    for name, array in (("quats", scene.quats), ("track_poses", poses), ("residual_quats", turns)):
         norms = np.linalg.norm(array.astype(np.float64), axis=-1)
         off = np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE)
         if len(off):

@@ -1,0 +1,140 @@
+"""Motion of single Gaussians in a scene: residuals before t_max, modes after it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.motion import rotations, se3
+from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.scene.scene import Scene
+from tests.scenes import T_MAX, TIMES, make_scene
+
+
+@pytest.fixture
+def bending() -> Scene:
+    """A scene in which every third Gaussian has a residual."""
+    scene, rng = make_scene(90), np.random.default_rng(1)
+    rows = np.arange(0, 90, 3, dtype=np.int32)
+    fade = (T_MAX - TIMES)[None, :, None]
+    turns = rotations.rotvecs_to_quats(rng.normal(size=(len(rows), 1, 3)) * fade)
+    return dataclasses.replace(
+        scene,
+        residual_rows=rows,
+        residual_offsets=(rng.normal(size=(len(rows), 1, 3)) * fade).astype(np.float32),
+        residual_quats=turns.astype(np.float32),
+        residual_log_scales=(rng.normal(size=(len(rows), 1, 3)) * fade).astype(np.float32),
+    )
+
+
+def twisting(scene: Scene) -> Scene:
+    """The scene with dynamics in which each body moves by one twist."""
+    rng = np.random.default_rng(2)
+    dynamics = np.zeros((len(scene.means), 12), np.float32)
+    for group in scene.groups:
+        rows = np.flatnonzero(scene.motion_ids == group.id)
+        if group.role != "body":
+            continue
+        v, w, a, e = rng.normal(size=(4, 3))
+        v, a = se3.recentre(w, v, e, a, scene.means[rows].astype(float))
+        tile = np.ones((len(rows), 1))
+        dynamics[rows] = np.concatenate([v, tile * w, a, tile * e], -1)
+    return dataclasses.replace(scene, dynamics=dynamics, canonical_means=scene.means.copy())
+
+
+@pytest.mark.parametrize("k", [0, 3, 7])
+def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
+    frame, i = playback.frame(bending, float(TIMES[k])), 11
+    row = int(bending.residual_rows[i])
+    group = bending.groups[int(bending.motion_ids[row])]
+    q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
+    bent = bending.means[row] + bending.residual_offsets[i, k]
+    np.testing.assert_allclose(frame.means[row], group.pivot + rotations.rotate(q, bent - group.pivot) + d, atol=1e-5)
+    turned = rotations.multiply(bending.residual_quats[i, k].astype(float), bending.quats[row].astype(float))
+    assert rotations.angle_between(rotations.multiply(q, turned), frame.quats[row].astype(float)) < 1e-4
+    np.testing.assert_allclose(frame.log_scales[row], bending.log_scales[row] + bending.residual_log_scales[i, k])
+
+
+def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
+    times = np.linspace(0.0, T_MAX, 201)
+    paths = np.stack([playback.frame(bending, t).means for t in times])
+    steps = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
+    assert steps.max() < 0.2
+    np.testing.assert_array_equal(playback.frame(bending, T_MAX).means, bending.means)
+    np.testing.assert_array_equal(playback.frame(bending, -1.0).means, playback.frame(bending, 0.0).means)
+
+
+def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
+    flipped = bending.residual_quats.copy()
+    flipped[:, ::2] *= -1
+    other = dataclasses.replace(bending, residual_quats=flipped)
+    for t in (0.02, 0.13, 0.5):
+        a, b = playback.frame(bending, t).quats, playback.frame(other, t).quats
+        assert rotations.angle_between(a.astype(float), b.astype(float)).max() < 1e-3
+
+
+def test_equal_twists_move_a_body_rigidly_in_mode_standard():
+    scene = twisting(make_scene())
+    frame = playback.frame(scene, 1.0, "standard")
+    for start, stop, g in playback.runs(scene.motion_ids):
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-4)
+        assert scene.groups[g].role == "body" or (before == after).all()
+
+
+def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
+    scene = twisting(make_scene())
+    standard, literal = (playback.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
+    np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
+    body = scene.motion_ids == 1
+    turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
+    canonical = scene.canonical_means.astype(float)
+    canonical[body] = rotations.rotate(turn, canonical[body])
+    turned = dataclasses.replace(scene, canonical_means=canonical.astype(np.float32))
+    off = playback.frame(turned, 1.0, "rigid_paper").means.astype(float)
+    after, before = off[body], scene.means[body].astype(float)
+    pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+    assert np.abs(pairs[1] - pairs[0]).max() > 0.05
+
+
+def test_all_modes_meet_at_t_max_and_agree_before_it():
+    scene = twisting(make_scene())
+    assert playback.modes(scene) == playback.MODES
+    for mode in playback.modes(scene):
+        np.testing.assert_array_equal(playback.frame(scene, T_MAX, mode).means, scene.means)
+        np.testing.assert_array_equal(playback.frame(scene, 0.2, mode).means, playback.frame(scene, 0.2).means)
+        np.testing.assert_allclose(playback.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-5)
+
+
+def test_a_mode_without_data_is_refused():
+    with pytest.raises(ValueError, match="has rigid, not 'standard'"):
+        playback.frame(make_scene(), 1.0, "standard")
+
+
+def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
+    scene = twisting(bending)
+    exact = scene_file.read(scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True))
+    small = scene_file.read(scene_file.write(scene, tmp_path / "small.r5dgs"))
+    for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
+        np.testing.assert_array_equal(getattr(exact, name), getattr(scene, name))
+        np.testing.assert_allclose(getattr(small, name), getattr(scene, name), atol=2e-3)
+    assert scene_file.info(small)["modes"] == list(playback.MODES)
+    assert scene_file.info(small)["residuals"] == 30
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"residual_quats": None}, "all four"),
+        ({"residual_rows": np.arange(30, dtype=np.int32)[::-1].copy()}, "increasing rows"),
+        ({"residual_offsets": np.ones((30, len(TIMES), 3), np.float32)}, "zero at t_max"),
+        ({"canonical_means": np.zeros((90, 3), np.float32)}, "dynamics"),
+    ],
+)
+def test_inconsistent_residuals_are_not_written(bending, tmp_path, change, named):
+    with pytest.raises(errors.SceneFileError, match=named):
+        scene_file.write(dataclasses.replace(bending, **change), tmp_path / "bad.r5dgs")
