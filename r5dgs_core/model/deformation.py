@@ -1,0 +1,126 @@
+"""The deformation field f_def: how each Gaussian differs from its canonical state at a time of the observed interval.
+
+Notation: N Gaussians, W the width of the network. All Gaussians of a picture share one time, so the part of a layer
+that reads the time is one vector, added like a bias; the result is that of the concatenated input.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from . import encoding
+
+
+@dataclass(frozen=True)
+class FieldShape:
+    """Size of a deformation field.
+
+    Attributes:
+        depth: Hidden layers; the encodings enter again after half of them.
+        width: Their width.
+        position_bands: Octaves of the positions' encoding.
+        time_bands: Octaves of the time's.
+        time_width: Hidden width of the network that reads the time first, 0 for none.
+        time_features: What that network gives.
+    """
+
+    depth: int = 8
+    width: int = 256
+    position_bands: int = 8
+    time_bands: int = 6
+    time_width: int = 256
+    time_features: int = 30
+
+
+SHAPES = {
+    "complex": FieldShape(),
+    "light": FieldShape(depth=6, width=128, time_width=128),
+    "small": FieldShape(depth=4, width=128, position_bands=6, time_width=64),
+}
+
+
+@dataclass(frozen=True)
+class Deltas:
+    """What a field adds to the canonical state.
+
+    Attributes:
+        offsets: Added to the centres. [N, 3]
+        quats: Rotations that are applied after the canonical ones, unit wxyz. [N, 4]
+        log_scales: Added to the log scales. [N, 3]
+    """
+
+    offsets: Tensor
+    quats: Tensor
+    log_scales: Tensor
+
+
+class DeformationField(nn.Module):
+    """A perceptron from canonical centre and time to `Deltas`; untrained it is the identity.
+
+    Args:
+        shape: Its size.
+        generator: Source of the initial weights.
+
+    Source: TRACE and FreeGave (f_def), after Deformable 3D Gaussians (Yang et al. 2024); heads that start at zero are
+        ours, so that nothing jumps when the deformation sets in.
+    """
+
+    def __init__(self, shape: FieldShape, generator: torch.Generator):
+        super().__init__()
+        self.shape = shape
+        times = encoding.encoded_size(1, shape.time_bands)
+        self.time_network = None
+        if shape.time_width > 0:
+            self.time_network = nn.ModuleList(
+                [
+                    encoding.linear(times, shape.time_width, generator),
+                    encoding.linear(shape.time_width, shape.time_features, generator),
+                ]
+            )
+            times = shape.time_features
+        inputs = encoding.encoded_size(3, shape.position_bands) + times
+        self.skip = shape.depth // 2  # the layer after this one reads the inputs again
+        sizes = [inputs] + [shape.width + (inputs if k == self.skip else 0) for k in range(shape.depth - 1)]
+        self.layers = nn.ModuleList([encoding.linear(size, shape.width, generator) for size in sizes])
+        self.head = nn.Linear(shape.width, 10)
+        nn.init.zeros_(self.head.weight)
+        with torch.no_grad():
+            self.head.bias.copy_(torch.tensor([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0]))
+
+    def forward(self, means: Tensor, t: float, chunk: int = 65536) -> Deltas:
+        """Deltas of Gaussians at a time.
+
+        Args:
+            means: Canonical centres. [N, 3]
+            t: Scene time.
+            chunk: Gaussians that pass at once.
+        """
+        time = self._time_features(means, t)
+        out = encoding.in_chunks(lambda rows: self._run(rows, time), means, chunk)
+        quats = out[:, 3:7]
+        return Deltas(out[:, :3], quats / quats.norm(dim=-1, keepdim=True).clamp(min=1e-8), out[:, 7:])
+
+    def _time_features(self, means: Tensor, t: float) -> Tensor:
+        time = encoding.encode(means.new_tensor([t]), self.shape.time_bands)
+        if self.time_network is not None:
+            first, second = self.time_network
+            time = second(F.relu(first(time)))
+        return time
+
+    def _run(self, means: Tensor, time: Tensor) -> Tensor:
+        position = encoding.encode(means, self.shape.position_bands)
+        hidden = position
+        for k, layer in enumerate(self.layers):
+            reads_inputs = k == 0 or k == self.skip + 1
+            if not reads_inputs:
+                hidden = F.relu(layer(hidden))
+                continue
+            weight, p, s = layer.weight, position.shape[1], len(time)
+            bias = layer.bias + weight[:, p : p + s] @ time
+            total = F.linear(position, weight[:, :p], bias)
+            hidden = F.relu(total if k == 0 else total + F.linear(hidden, weight[:, p + s :]))
+        return self.head(hidden)

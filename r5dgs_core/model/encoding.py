@@ -1,0 +1,49 @@
+"""Positional encoding of positions and times, and the perceptrons that read it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+
+def encode(x: Tensor, bands: int) -> Tensor:
+    """The identity, then sine and cosine of 2^k x for k = 0 .. bands - 1, without a factor of pi.
+
+    Args:
+        x: Positions or times. [..., C]
+        bands: Number of octaves.
+
+    Returns:
+        x, sin x, cos x, sin 2x, cos 2x, ... [..., C (1 + 2 bands)]
+
+    Source: NeRF (Mildenhall et al. 2020), Eq. 4, in the form of Deformable 3D Gaussians.
+    """
+    parts = [x]
+    for k in range(bands):
+        parts += [torch.sin(2.0**k * x), torch.cos(2.0**k * x)]
+    return torch.cat(parts, dim=-1)
+
+
+def encoded_size(channels: int, bands: int) -> int:
+    """Length of an `encode` of ``channels`` numbers."""
+    return channels * (1 + 2 * bands)
+
+
+def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A linear layer whose weights come from ``generator``, in PyTorch's default distribution."""
+    layer = nn.Linear(inputs, outputs)
+    bound = 1 / math.sqrt(inputs)
+    with torch.no_grad():
+        for tensor in (layer.weight, layer.bias):
+            tensor.copy_((2 * torch.rand(tensor.shape, generator=generator) - 1) * bound)
+    return layer
+
+
+def in_chunks(function: Callable[[Tensor], Tensor], rows: Tensor, chunk: int) -> Tensor:
+    """``function`` of the rows, at most ``chunk`` at a time; without gradient only one chunk is in memory."""
+    if len(rows) <= chunk:
+        return function(rows)
+    return torch.cat([function(part) for part in rows.split(chunk)])
