@@ -13,6 +13,8 @@ from torch import Tensor
 # ``sh`` [N, 1, 3] is the constant colour, ``sh_rest`` [N, K - 1, 3] what depends on the view: they learn at different
 # rates. ``shading`` is the vector g of `posing.py`.
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "shading")
+# What only some runs train: identity encodings.
+OPTIONAL = ("identities",)
 
 
 class Gaussians:
@@ -20,7 +22,8 @@ class Gaussians:
 
     Args:
         params: Tensors by name: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
-            ``sh`` [N, 1, 3], ``sh_rest`` [N, K - 1, 3] and ``shading`` [N, 3].
+            ``sh`` [N, 1, 3], ``sh_rest`` [N, K - 1, 3] and ``shading`` [N, 3]; where they are trained with the
+            rest also ``identities`` [N, 16].
         motion_ids: Motion group of each Gaussian. [N] int64
 
     Raises:
@@ -29,10 +32,7 @@ class Gaussians:
 
     def __init__(self, params: Mapping[str, Tensor], motion_ids: Tensor):
         for name, tensor in params.items():
-            if name not in PARAMETERS:
-                raise ValueError(f"unknown parameter '{name}'; known are {', '.join(PARAMETERS)}")
-            if len(tensor) != len(motion_ids):
-                raise ValueError(f"'{name}' has {len(tensor)} rows, motion_ids has {len(motion_ids)}")
+            _check(name, tensor, len(motion_ids))
         self.params: dict[str, Tensor] = {name: tensor.detach().requires_grad_(True) for name, tensor in params.items()}
         self.motion_ids = motion_ids
 
@@ -44,6 +44,11 @@ class Gaussians:
         if name in params:
             return params[name]
         raise AttributeError(name)
+
+    def add(self, name: str, values: Tensor) -> None:
+        """Give every Gaussian a parameter that it had not; before an optimizer is made. [N, ...]"""
+        _check(name, values, len(self))
+        self.params[name] = values.detach().requires_grad_(True)
 
     def extend(self, optimizer: torch.optim.Optimizer | None, params: Mapping[str, Tensor], motion_ids: Tensor) -> None:
         """Append Gaussians; the optimizer's moments of the new rows start at zero."""
@@ -72,3 +77,10 @@ class Gaussians:
                 for key in ("exp_avg", "exp_avg_sq"):
                     state[key] = change_moment(name, state[key]).contiguous()
                 optimizer.state[new] = state
+
+
+def _check(name: str, values: Tensor, count: int) -> None:
+    if name not in PARAMETERS + OPTIONAL:
+        raise ValueError(f"unknown parameter '{name}'; known are {', '.join(PARAMETERS + OPTIONAL)}")
+    if len(values) != count:
+        raise ValueError(f"'{name}' has {len(values)} rows, motion_ids has {count}")

@@ -1,7 +1,8 @@
 """Which object each Gaussian belongs to: a vote of the masks, and identity encodings with their classifier.
 
-Both run on finished, frozen geometry. The vote gives one label per Gaussian; the encodings, rendered and classified per
-pixel, follow the masks' edges more closely than labels can (Gaussian Grouping).
+The vote gives one label per Gaussian; the encodings, rendered and classified per pixel, follow the masks' edges more
+closely than labels can (Gaussian Grouping). Both run on finished, frozen geometry; encodings also beside the training
+of the geometry (`JointIdentity`).
 
 Notation: N Gaussians, C classes: class 0 is the background, class k the k-th object.
 """
@@ -9,20 +10,24 @@ Notation: N Gaussians, C classes: class 0 is the background, class k the k-th ob
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..model import spherical_harmonics
+from ..model.gaussians import Gaussians
 from ..raster import rasterize_splats
 from ..scene.scene import IDENTITY_DIM
-from .config import IdentitySection
+from . import identity_losses
+from .config import Config, IdentitySection
 from .posing import Splats
 from .views import TrainView, spread
 
 VOTE_VIEWS = 80
+NEIGHBOURS_EVERY = 300  # steps after which neighbours are looked for anew, where the Gaussians are still the same
 
 
 def vote(
@@ -84,14 +89,10 @@ def train_encodings(
     """
     masked = [v for v in views if v.mask is not None]
     count = max(classes.values()) + 1
-    directions = torch.randn(max(count, IDENTITY_DIM), IDENTITY_DIM, generator=generator)
-    weight = torch.linalg.qr(directions).Q[:count].clone() if count <= IDENTITY_DIM else directions[:count]
-    weight = (2 * weight / weight.norm(dim=1, keepdim=True)).requires_grad_(True)
-    # Half of what a solid pixel of an object answers: where nothing is drawn, or less than half, it is background.
-    bias = torch.zeros(count)
-    bias[0] = 2.0
+    weight, bias = _distinct_classes(count, generator)
+    encodings = weight[labels].clone().requires_grad_(True)
+    weight.requires_grad_(True)
     bias.requires_grad_(True)
-    encodings = weight.detach()[labels].clone().requires_grad_(True)
     optimizer = torch.optim.Adam(
         [
             {"params": [encodings], "lr": section.rate},
@@ -107,8 +108,7 @@ def train_encodings(
         with torch.no_grad():
             splats = pose(view)
         image = _rasterize(splats, encodings, view)
-        logits = image.reshape(-1, IDENTITY_DIM) @ weight.T + bias
-        loss = F.cross_entropy(logits, target.reshape(-1), ignore_index=-1) / math.log(max(count, 2))
+        loss = identity_losses.pixel_cross_entropy(image, weight, bias, target)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -117,13 +117,194 @@ def train_encodings(
     return encodings.detach(), weight.detach(), bias.detach()
 
 
+def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -> JointIdentity | None:
+    """Identities that are trained with the geometry, or None: not asked for, or no mask tells objects apart.
+
+    Args:
+        views: Training views.
+        classes: Class of each object id.
+        config: The run's configuration.
+    """
+    asked = config.identity.training in ("joint", "detached")
+    if not asked or max(classes.values(), default=0) == 0 or all(view.mask is None for view in views):
+        return None
+    # A generator of its own: the other draws of a run are the same with identities and without.
+    return JointIdentity(classes, config, torch.Generator().manual_seed(config.train.seed + 1))
+
+
+class JointIdentity:
+    """Encodings and classifier that are trained with the geometry.
+
+    With ``identity.training`` "joint" (the paper) the trainer draws the encodings beside the colours, and the pixel
+    loss reaches the geometry, too. With "detached" every few steps the encodings alone are drawn, and the geometry is
+    what it would be without. The encodings are the Gaussians' parameter ``identities`` and grow and shrink with them.
+
+    Args:
+        classes: Class of each object id, 0 the background's.
+        config: The run's configuration.
+        generator: Source of all draws; nobody else's.
+
+    Attributes:
+        params: What the optimizer moves beside the encodings: ``classifier_weight`` [C, 16], ``classifier_bias`` [C].
+        rates: Learning rate of each of these and of the encodings, constant over the run.
+        with_geometry: Whether the trainer draws the encodings beside the colours.
+    """
+
+    def __init__(self, classes: dict[int, int], config: Config, generator: torch.Generator):
+        self._classes = classes
+        self._section = config.identity
+        self._generator = generator
+        self.with_geometry = config.identity.training == "joint"
+        paper = config.train.representation == "field"
+        self._majority = config.identity.majority if not paper or config.field.variant == "r5dgs_extra" else 0.0
+        self._include_self = paper
+        count = max(classes.values()) + 1
+        if self.with_geometry:
+            spread_of_rows = 1 / math.sqrt(IDENTITY_DIM)
+            draws = torch.rand(count, IDENTITY_DIM + 1, generator=generator)
+            weight, bias = (spread_of_rows * (2 * draws - 1)).split([IDENTITY_DIM, 1], dim=1)
+            bias = bias[:, 0]
+        else:
+            weight, bias = _distinct_classes(count, generator)
+        self.params: dict[str, Tensor] = {}
+        self._set_classifier(weight, bias)
+        rates = (self._section.rate, self._section.classifier_rate, self._section.classifier_rate)
+        self.rates = dict(zip(("identities", "classifier_weight", "classifier_bias"), rates, strict=True))
+        self._neighbourhood: identity_losses.Neighbourhood | None = None
+        self._found_at = 0
+        self._found_for: Tensor | None = None  # the parameter `means` then; a new one has other rows
+
+    def _set_classifier(self, weight: Tensor, bias: Tensor) -> None:
+        named = {"classifier_weight": weight, "classifier_bias": bias}
+        self.params = {n: t.detach().clone().contiguous().requires_grad_(True) for n, t in named.items()}
+
+    def begin(self, gaussians: Gaussians) -> None:
+        """Give the Gaussians their first encodings.
+
+        "joint" draws them as Gaussian Grouping does, harmonics of random colours; "detached" gives each the row of the
+        class that its motion group was made for (a group past the classes, a shadow, is background).
+        """
+        if self.with_geometry:
+            draws = torch.rand(len(gaussians), IDENTITY_DIM, generator=self._generator)
+            encodings = spherical_harmonics.rgb_to_dc(draws)
+        else:
+            weight = self.params["classifier_weight"].detach()
+            ids = gaussians.motion_ids
+            encodings = weight[torch.where(ids < len(weight), ids, 0)].clone()
+        gaussians.add("identities", encodings)
+
+    def channels(self, gaussians: Gaussians, colors: Tensor, background: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """What the trainer draws in one pass: colours and encodings [N, 3 + 16], and the background of both."""
+        if background is not None:
+            zeros = background.new_zeros((*background.shape[:-1], IDENTITY_DIM))
+            background = torch.cat([background, zeros], dim=-1)
+        return torch.cat([colors, gaussians.identities], dim=1), background
+
+    def loss(
+        self,
+        gaussians: Gaussians,
+        splats: Splats,
+        view: TrainView,
+        iteration: int,
+        features: Tensor | None = None,
+    ) -> Tensor | None:
+        """What identities add to the loss of a step, or None.
+
+        Args:
+            gaussians: The Gaussians with their encodings.
+            splats: Of the view; "detached" draws them, without gradient.
+            view: The view; without a mask it has no pixel loss, and pixels of ids without a class do not count.
+            iteration: The step.
+            features: Blended encodings out of the pass that drew the colours; of "joint". [H, W, 16]
+        """
+        section = self._section
+        terms = []
+        if view.mask is not None and section.weight > 0:
+            if not self.with_geometry and iteration % section.every == 0:
+                features = _rasterize(splats, gaussians.identities, view)
+            if features is not None:
+                target = class_map(view, self._classes)
+                weight, bias = self.params["classifier_weight"], self.params["classifier_bias"]
+                terms.append(section.weight * identity_losses.pixel_cross_entropy(features, weight, bias, target))
+        if iteration % section.regularise_every == 0 and max(section.spatial, self._majority) > 0:
+            terms.append(self._regularisation(gaussians, iteration))
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def _regularisation(self, gaussians: Gaussians, iteration: int) -> Tensor:
+        """L_3d and L_major on some Gaussians, weighted."""
+        rows = torch.randint(len(gaussians), (self._section.samples,), generator=self._generator)
+        found = self._neighbours(gaussians, iteration).nearest(rows, self._section.neighbours)
+        both = torch.cat([rows[:, None], found], dim=1)
+        # index_select sums its gradients in the same order on any number of threads; indexing does not.
+        encodings = gaussians.identities.index_select(0, both.reshape(-1))
+        answers = encodings @ self.params["classifier_weight"].T + self.params["classifier_bias"]
+        probabilities = answers.softmax(dim=1).reshape(*both.shape, -1)
+        queries, neighbours = probabilities[:, 0], probabilities[:, 1:]
+        total = queries.new_zeros(())
+        if self._section.spatial > 0:
+            divergence = identity_losses.spatial_divergence(queries, neighbours, include_self=self._include_self)
+            total = total + self._section.spatial * divergence
+        if self._majority > 0:
+            total = total + self._majority * identity_losses.majority_distance(queries, neighbours)
+        return total
+
+    def _neighbours(self, gaussians: Gaussians, iteration: int) -> identity_losses.Neighbourhood:
+        means = gaussians.means
+        stale = self._found_for is not means or iteration - self._found_at >= NEIGHBOURS_EVERY
+        if self._neighbourhood is None or stale:
+            self._neighbourhood = identity_losses.Neighbourhood(means)
+            self._found_at, self._found_for = iteration, means
+        return self._neighbourhood
+
+    @torch.no_grad()
+    def labels(self, gaussians: Gaussians) -> Tensor:
+        """Class of each Gaussian: the classifier's answer to its encoding. [N] int64"""
+        return (gaussians.identities @ self.params["classifier_weight"].T + self.params["classifier_bias"]).argmax(1)
+
+    def outcome(self, gaussians: Gaussians) -> dict[str, Tensor]:
+        """What a finished run hands to baking, by the names of the checkpoint."""
+        named = {
+            "identities": gaussians.identities,
+            "classifier.weight": self.params["classifier_weight"],
+            "classifier.bias": self.params["classifier_bias"],
+        }
+        return {name: tensor.detach().clone() for name, tensor in named.items()}
+
+    def tensors(self, gaussians: Gaussians) -> dict[str, Tensor]:
+        """Everything that the next step depends on beside the Gaussians, by name."""
+        named = {f"identity.{name}": tensor.detach() for name, tensor in self.params.items()}
+        named["identity.generator"] = self._generator.get_state()
+        if self._neighbourhood is not None and self._found_for is gaussians.means:
+            named["identity.points"] = self._neighbourhood.points
+            named["identity.found_at"] = torch.tensor(self._found_at)
+        return named
+
+    def restore(self, tensors: dict[str, Tensor], gaussians: Gaussians) -> None:
+        """Go on from `tensors`, with the Gaussians of the same state; before the optimizer is made."""
+        self._set_classifier(tensors["identity.classifier_weight"], tensors["identity.classifier_bias"])
+        self._generator.set_state(tensors["identity.generator"])
+        self._neighbourhood, self._found_for = None, None
+        if "identity.points" in tensors:
+            self._neighbourhood = identity_losses.Neighbourhood(tensors["identity.points"])
+            self._found_at, self._found_for = int(tensors["identity.found_at"]), gaussians.means
+
+
 def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:
     """Class of each pixel, -1 where the mask's id has none. [H, W] int64"""
     assert view.mask is not None
-    target = np.full(view.mask.shape, -1, np.int64)
-    for object_id, row in classes.items():
-        target[view.mask == object_id] = row
-    return torch.from_numpy(target)
+    table = np.full(max(int(view.mask.max(initial=0)), *classes) + 1, -1, np.int64)
+    table[list(classes)] = list(classes.values())
+    return torch.from_numpy(table[view.mask])
+
+
+def _distinct_classes(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A classifier, weight [C, 16] and bias [C], that names a pixel after the row that fills more than half of it."""
+    directions = torch.randn(max(count, IDENTITY_DIM), IDENTITY_DIM, generator=generator)
+    weight = torch.linalg.qr(directions).Q[:count].clone() if count <= IDENTITY_DIM else directions[:count]
+    # The bias is half of what a solid pixel of an object answers: with less than half, or nothing, it is background.
+    bias = torch.zeros(count)
+    bias[0] = 2.0
+    return 2 * weight / weight.norm(dim=1, keepdim=True), bias
 
 
 def _rasterize(splats: Splats, channels: Tensor, view: TrainView) -> Tensor:

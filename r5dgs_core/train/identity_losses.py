@@ -1,0 +1,142 @@
+"""Losses of identity encodings: pixels follow the masks, neighbours in space agree.
+
+Notation: C classes, M queried Gaussians with k neighbours each; probabilities are softmaxes of the classifier's
+answers, so that they sum to one over the classes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+LOG_FLOOR = 1e-10  # added to probabilities before the logarithm
+BLOCK_BYTES = 1 << 24  # of the answers that are held at once
+
+
+def pixel_cross_entropy(features: Tensor, weight: Tensor, bias: Tensor, target: Tensor) -> Tensor:
+    """Mean cross-entropy of the classified pixels, divided by ln C so that guessing costs 1 for any C.
+
+    Value and gradients are found in one pass over blocks of pixels: no array of all pixels and classes is held.
+
+    Args:
+        features: Blended encodings of the pixels. [..., D]
+        weight: Of the classifier. [C, D]
+        bias: Of the classifier. [C]
+        target: Class of each pixel, -1 where it does not count. [...] int64
+
+    Returns:
+        The loss, a scalar; 0 where no pixel counts. Differentiable once, in all but ``target``.
+
+    Source: Gaussian Grouping (Ye et al. 2024), section 3.2.
+    """
+    return _PixelCrossEntropy.apply(features, weight, bias, target)
+
+
+class _PixelCrossEntropy(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, features, weight, bias, target):
+        classes, dims = weight.shape
+        pixels, wanted = features.detach().reshape(-1, dims), target.reshape(-1)
+        weight, bias = weight.detach(), bias.detach()
+        counted = int((wanted >= 0).sum())
+        share = 1 / (max(counted, 1) * math.log(max(classes, 2)))
+        total = pixels.new_zeros(())
+        by_features, by_weight, by_bias = torch.empty_like(pixels), torch.zeros_like(weight), torch.zeros_like(bias)
+        block = max(1, BLOCK_BYTES // (classes * pixels.element_size()))
+        for first in range(0, len(pixels), block):
+            part, goal = pixels[first : first + block], wanted[first : first + block]
+            logs = F.log_softmax(torch.addmm(bias, part, weight.T), dim=1)
+            counts = (goal >= 0)[:, None].to(logs.dtype)
+            goal = goal.clamp(min=0)[:, None]
+            total = total - (logs.gather(1, goal) * counts).sum()
+            slopes = logs.exp_().scatter_add_(1, goal, torch.full_like(counts, -1.0)).mul_(counts * share)
+            by_features[first : first + block] = slopes @ weight
+            by_weight += slopes.T @ part
+            by_bias += slopes.sum(0)
+        ctx.save_for_backward(by_features.reshape(features.shape), by_weight, by_bias)
+        return total * share
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, upstream):
+        by_features, by_weight, by_bias = ctx.saved_tensors
+        return by_features * upstream, by_weight * upstream, by_bias * upstream, None
+
+
+def spatial_divergence(probabilities: Tensor, neighbours: Tensor, *, include_self: bool = False) -> Tensor:
+    """How much the classes of Gaussians differ from those of their neighbours: L_3d.
+
+    Args:
+        probabilities: Of the queried Gaussians. [M, C]
+        neighbours: Of the nearest other Gaussians of each, nearest first. [M, k, C]
+        include_self: Count a Gaussian as its own nearest neighbour in place of the farthest one, as Gaussian Grouping
+            does: one of its k divergences is then always 0.
+
+    Returns:
+        Mean over queries and neighbours of the Kullback-Leibler divergence of the query from the neighbour, divided by
+        C; a scalar, 0 without queries or neighbours. Gradients reach both sides.
+
+    Source: Gaussian Grouping (Ye et al. 2024), Eq. 4.
+    """
+    counted = neighbours.shape[1]
+    if include_self:
+        neighbours = neighbours[:, : counted - 1]
+    if neighbours.numel() == 0:
+        return (probabilities.sum() + neighbours.sum()) * 0
+    ratios = torch.log(probabilities + LOG_FLOOR)[:, None] - torch.log(neighbours + LOG_FLOOR)
+    divergences = (probabilities[:, None] * ratios).sum(-1)
+    return divergences.sum() / (len(probabilities) * counted * probabilities.shape[1])
+
+
+def majority_distance(probabilities: Tensor, neighbours: Tensor) -> Tensor:
+    """How far the classes of Gaussians are from the mean of their neighbours': L_major.
+
+    Args:
+        probabilities: Of the queried Gaussians. [M, C]
+        neighbours: Of the nearest other Gaussians of each. [M, k, C]
+
+    Returns:
+        Mean squared Euclidean distance, a scalar, 0 without queries or neighbours. Gradients reach both sides.
+
+    Source: R5DGS (Gridusov, Popov, Kolyubin), L_major; a Gaussian does not count among its own neighbours.
+    """
+    if neighbours.numel() == 0:
+        return (probabilities.sum() + neighbours.sum()) * 0
+    return ((probabilities - neighbours.mean(1)) ** 2).sum(-1).mean()
+
+
+class Neighbourhood:
+    """The nearest others of points that stay where they are.
+
+    Args:
+        points: The points. [N, 3]
+    """
+
+    def __init__(self, points: Tensor):
+        self.points = points.detach().cpu().clone()
+        self._tree = cKDTree(self.points.numpy())
+
+    def nearest(self, rows: Tensor, count: int) -> Tensor:
+        """Rows of the nearest other points, nearest first; fewer columns where there are fewer others.
+
+        Args:
+            rows: Whose neighbours are wanted. [M] int64
+            count: Neighbours of each, k.
+
+        Returns:
+            Their rows. [M, min(k, N - 1)] int64
+        """
+        count = min(count, len(self.points) - 1)
+        if count < 1 or len(rows) == 0:
+            return rows.new_zeros(len(rows), max(count, 0))
+        asking = rows.cpu()
+        _, found = self._tree.query(self.points[asking].numpy(), count + 1)
+        # Of points in one place the tree may name others before the one that asks, or not name it at all.
+        own = found == asking.numpy()[:, None]
+        own[~own.any(1), -1] = True
+        return torch.from_numpy(found[~own].reshape(len(rows), count).astype(np.int64)).to(rows.device)
