@@ -31,6 +31,7 @@ def run_demo(
     *,
     config_path: Path | None,
     overrides: list[str],
+    preset: str | None = None,
     resume: bool,
     overwrite: bool = False,
     progress_kind: str,
@@ -53,7 +54,7 @@ def run_demo(
 
     began = time.monotonic()
     data = bundled_data()
-    settings = run.settings(out, config_path, overrides, resume=resume)
+    settings = run.settings(out, config_path, overrides, preset=preset, resume=resume)
     go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
         trained = run.train(

@@ -15,6 +15,8 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 from . import sky
 
+BASES_BYTES = 1 << 28  # what the harmonics of the cameras' rays may take before they are made anew
+
 
 class Background:
     """Sky colour by viewing direction.
@@ -36,11 +38,12 @@ class Background:
             return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
         key = camera.T_cam_world[:3, :3].tobytes() + camera.intrinsics.tobytes() + bytes([len(coefficients)])
         if key not in self._bases:
-            if len(self._bases) > 64:
-                self._bases.clear()
             rays = cameras.pixel_rays(camera)
-            basis = spherical_harmonics.basis(rays.reshape(-1, 3), spherical_harmonics.degree_of(len(coefficients)))
-            self._bases[key] = torch.from_numpy(np.asarray(basis, np.float32))
+            values = spherical_harmonics.basis(rays.reshape(-1, 3), spherical_harmonics.degree_of(len(coefficients)))
+            basis = torch.from_numpy(np.asarray(values, np.float32))
+            if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
+                self._bases.clear()
+            self._bases[key] = basis
         shape = (camera.height, camera.width, 3)
         return (self._bases[key] @ coefficients + 0.5).clamp(0, 1).reshape(shape)
 
@@ -50,8 +53,9 @@ def fixed(color: np.ndarray) -> Background:
     return Background(torch.from_numpy(spherical_harmonics.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
 
 
-def learned(coefficients: np.ndarray) -> Background:
-    """A trained sky that starts at given coefficients, the missing ones at zero. [Kb, 3]"""
-    start = torch.zeros((sky.DEGREE + 1) ** 2, 3)
-    start[: len(coefficients)] = torch.from_numpy(np.asarray(coefficients, np.float32))
+def learned(coefficients: np.ndarray, degree: int = sky.DEGREE) -> Background:
+    """A trained sky of a degree that starts at given coefficients, the missing ones at zero. [Kb, 3]"""
+    start = torch.zeros((degree + 1) ** 2, 3)
+    given = torch.from_numpy(np.asarray(coefficients, np.float32))[: len(start)]
+    start[: len(given)] = given
     return Background(start, True)

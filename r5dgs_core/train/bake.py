@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..data import dataset as datasets
 from ..data.dataset import Dataset
-from ..errors import CheckpointError
+from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
@@ -50,21 +51,30 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     present = tensors["object_ids"].numpy()
     motion = representation.observed_motion(state.representation, tensors, present, state.observed.numpy())
     light, strength = _unit(motion.light)
+    wanted = run.config.needs
+    identities = tensors["identities"].numpy() if "identities" in tensors else None
+    labels = tensors["labels"].numpy() if "labels" in tensors else None  # an unfinished run has none yet
+    groups = motion.groups
+    if wanted.shadows == "off":
+        groups = tuple(group for group in groups if group.role != "shadow")
+        kept = g["motion_ids"] < len(groups)  # shadows are the last groups
+        g = {n: a[kept] for n, a in g.items()}
+        identities, labels = (None if a is None else a[kept] for a in (identities, labels))
     motion_ids = g["motion_ids"].astype(np.int32)
-    if "labels" in tensors:
-        labels = tensors["labels"].numpy()
-    else:  # an unfinished run has none yet
-        labels = representation.group_classes(motion.groups, present)[motion_ids]
+    if labels is None:
+        labels = representation.group_classes(groups, present)[motion_ids]
     object_ids = present[labels].astype(np.int32)
     log_scales = g["log_scales"] + np.log(norm.scale)
     means = norm.points_to_world(g["means"])
     quats = rotations.normalize(g["quats"].astype(np.float64))
     sh = np.concatenate([g["sh"], g["sh_rest"]], axis=1).astype(np.float64)
+    if wanted.view_dependent_colour == "off":
+        sh = sh[:, :1]
     shading = strength * g["shading"].astype(np.float64)
     opacities = 1 / (1 + np.exp(-g["opacity_logits"].astype(np.float64)))
     rows: list[MotionGroup] = []
     track_poses = []
-    for index, group in enumerate(motion.groups):
+    for index, group in enumerate(groups):
         members = motion_ids == index
         center = norm.points_to_world(group.center)
         path = group.displacements * norm.scale
@@ -78,17 +88,20 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
             first = int(np.argmax(group.observed))
             poses[:first] = poses[first]
         radius = _radius(means[members], opacities[members], pivot)
-        if group.role == "pinned" or (group.role == "body" and needs.is_still(poses, radius)):
+        if wanted.rotation == "off":
+            poses[:, :4] = needs.STILL_QUAT
+        if needs.is_pinned(group.role, poses, radius, wanted):
             poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
         track_poses.append(poses)
         anchor = _anchor(np.flatnonzero(members), means[members], opacities[members], pivot)
         rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
     order = np.lexsort((motion_ids, object_ids))
-    used_background = _background(tensors["background"].numpy())
+    used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
     decisions = needs.decide(
-        rows, track_poses, motion_ids, shading, light, used_background, sh.shape[1], "identities" in tensors
+        rows, track_poses, motion_ids, shading, light, used_background, sh.shape[1], identities is not None, wanted
     )
     keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
+    classified = identities is not None and needs.is_on(decisions, "classifier")
     rank = np.argsort(order)
     rows = [
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
@@ -112,9 +125,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         world_convention=dataset.world_convention,
         cameras=dataset.cameras,
         background_sh=used_background.astype(np.float32),
-        identities=tensors["identities"].numpy()[order].astype(np.float16) if "identities" in tensors else None,
-        classifier_weight=tensors["classifier.weight"].numpy() if "classifier.weight" in tensors else None,
-        classifier_bias=tensors["classifier.bias"].numpy() if "classifier.bias" in tensors else None,
+        identities=identities[order].astype(np.float16) if identities is not None and classified else None,
+        classifier_weight=tensors["classifier.weight"].numpy() if classified else None,
+        classifier_bias=tensors["classifier.bias"].numpy() if classified else None,
         shading=shading[order].astype(np.float32) if keep_shading else None,
         light_direction=light if keep_shading else None,
         provenance={
@@ -228,8 +241,15 @@ def _pivot(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np
     return np.average(means[inner], axis=0, weights=opacities[inner])
 
 
-def _background(coefficients: np.ndarray) -> np.ndarray:
-    """The sky's coefficients, only to the degree that shows: bands below half an 8-bit level are left out."""
+def _background(coefficients: np.ndarray, wanted: str) -> np.ndarray:
+    """The sky's coefficients, only to the degree that shows: bands below half an 8-bit level are left out.
+
+    Args:
+        coefficients: As trained. [Kb, 3]
+        wanted: The user's word on the gradient: "on" keeps them all, "off" the first alone, "auto" looks.
+    """
+    if wanted != "auto":
+        return coefficients if wanted == "on" else coefficients[:1]
     degree = spherical_harmonics.degree_of(len(coefficients))
     while degree > 0 and np.abs(coefficients[degree**2 :]).max() < needs.SKY_BAND:
         degree -= 1
@@ -257,11 +277,25 @@ def _objects(object_ids: np.ndarray, present: np.ndarray, dataset: Dataset) -> t
     return tuple(table)
 
 
-def run_bake(folder: Path, out: Path, dataset_root: Path | None = None) -> Scene:
-    """Bake a run folder and write the scene file; returns the scene."""
+def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, overrides: Sequence[str] = ()) -> Scene:
+    """Bake a run folder and write the scene file; returns the scene.
+
+    Args:
+        folder: The run folder.
+        out: The scene file.
+        dataset_root: The data set, where it has moved.
+        overrides: ``needs.NAME=on|off`` overrides of the run's configuration.
+
+    Raises:
+        CheckpointError, ConfigError, DatasetError, SceneFileError: As their messages say.
+    """
     from ..scene import scene_file
 
     run = checkpoint.open_run(folder)
+    for text in overrides:
+        if not text.strip().startswith("needs."):
+            raise ConfigError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
+    run = dataclasses.replace(run, config=run.config.override(overrides))
     dataset = datasets.read(run.data(dataset_root))
     if dataset.digest != run.digest:
         raise CheckpointError(

@@ -307,6 +307,10 @@ class Config:
         """A copy with some keys changed: ``replace(**{"train.iterations": 100})``."""
         return from_dict(_merge(self.to_dict(), changes))
 
+    def override(self, overrides: Sequence[str]) -> Config:
+        """A copy with ``section.key=value`` overrides applied, as of ``--set``."""
+        return self.replace(**dict(_parse_override(text) for text in overrides))
+
 
 def from_dict(values: dict[str, Any]) -> Config:
     """Build a configuration from nested dictionaries; omitted keys keep their defaults.

@@ -1,4 +1,8 @@
-"""What a scene does not need and therefore does not carry: the table of decisions, with the number behind each."""
+"""What a scene does not need and therefore does not carry: the table of decisions, with the number behind each.
+
+``needs.NAME`` of the configuration is the user's word on a row: it wins over the number, in training (`resolve`) and in
+baking (`decide`, `is_pinned`).
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,44 @@ import numpy as np
 
 from ..motion import rotations
 from ..scene.scene import MotionGroup
+from .config import Config, NeedsSection
 
 STILL_QUAT = rotations.identity()
 STILL = 0.0025  # displacement over the observed time, as a share of the group's diameter, below which it is static
 TURN = 0.002  # rotation in radians over the observed time below which a group only slides
 SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
 SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
+
+
+def resolve(config: Config) -> Config:
+    """The configuration that training obeys: what the user says is not needed is not learned, and what is, is.
+
+    Args:
+        config: As the user gave it; its ``needs`` stay in the result.
+    """
+    wanted = config.needs
+    changes: dict[str, Any] = {}
+    if wanted.shading == "off":
+        changes["train.shading"] = False
+    if wanted.shadows == "off":
+        changes["train.shadows"] = False
+    if wanted.classifier == "off":
+        changes["identity.iterations"] = 0
+    if wanted.view_dependent_colour != "auto":
+        on = wanted.view_dependent_colour == "on"
+        changes["train.sh_degree"] = max(1, config.train.sh_degree) if on else 0
+    if wanted.tracks == "off":
+        changes |= {"rates.translations": 0.0, "rates.rotvecs": 0.0}
+    if wanted.rotation == "off":
+        changes["rates.rotvecs"] = 0.0
+    return config.replace(**changes)
+
+
+def is_pinned(role: str, poses: np.ndarray, radius: float, wanted: NeedsSection) -> bool:
+    """Whether a group of a role is baked at rest: it never moves, hardly does, or the user says so. poses [S, 7]"""
+    if role == "pinned" or wanted.tracks == "off":
+        return True
+    return role == "body" and wanted.tracks == "auto" and is_still(poses, radius)
 
 
 def is_still(poses: np.ndarray, radius: float) -> bool:
@@ -46,6 +82,7 @@ def decide(
     background_sh: np.ndarray,
     bases: int,
     classified: bool,
+    wanted: NeedsSection | None = None,
 ) -> tuple[dict[str, Any], ...]:
     """The needs table of a baked scene.
 
@@ -58,32 +95,48 @@ def decide(
         background_sh: Sky coefficients that were kept. [Kb, 3]
         bases: Spherical harmonics bases of the colours.
         classified: Whether identities and their classifier were trained.
+        wanted: The user's word on each row; by default everything is measured.
 
     Returns:
-        Rows with name, value, threshold, decision ("on" or "off") and reason.
+        Rows with name, value, threshold, decision ("on" or "off") and reason, which says where the user decided. What
+        the run has not learned stays off.
     """
+    wanted = wanted or NeedsSection()
     bodies = [g for g in groups if g.role == "body"]
     largest_travel = max((_travel(track_poses[g.id], g.model.radius) for g in bodies), default=0.0)
     largest_turn = max((_turn(track_poses[g.id]) for g in bodies), default=0.0)
     moving = sum(not is_still(track_poses[g.id], g.model.radius) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
+    sky = len(background_sh)
+    moved, turned = f"{moving} of {len(bodies)} objects move or turn", "largest turn in the observed time, rad"
+    lit = bool(np.any(shading) and np.any(light))
+    followers = "Gaussians that follow a caster on its support"
+    # Name, value, threshold, whether it is needed by that, whether the run has it at all, what the value is.
     rows = [
-        ("tracks", largest_travel, STILL, moving > 0, f"{moving} of {len(bodies)} objects move or turn"),
-        ("rotation", largest_turn, TURN, largest_turn > TURN, "largest turn in the observed time, rad"),
-        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, "largest change of colour"),
-        ("shadows", shadow_members, 1, shadow_members > 0, "Gaussians that follow a caster on its support"),
-        ("view_dependent_colour", bases, 2, bases > 1, "spherical harmonics bases"),
-        ("sky_gradient", len(background_sh), 2, len(background_sh) > 1, "spherical harmonics bases of the sky"),
-        ("classifier", len(bodies), 1, classified, "objects with masks"),
+        ("tracks", largest_travel, STILL, moving > 0, len(bodies) > 0, moved),
+        ("rotation", largest_turn, TURN, largest_turn > TURN, len(bodies) > 0, turned),
+        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, lit, "largest change of colour"),
+        ("shadows", shadow_members, 1, shadow_members > 0, shadow_members > 0, followers),
+        ("view_dependent_colour", bases, 2, bases > 1, bases > 1, "spherical harmonics bases"),
+        ("sky_gradient", sky, 2, sky > 1, sky > 1, "spherical harmonics bases of the sky"),
+        ("classifier", len(bodies), 1, classified, classified, "objects with masks"),
     ]
     return tuple(
-        {
-            "name": name,
-            "value": float(value),
-            "threshold": float(threshold),
-            "decision": "on" if on else "off",
-            "reason": reason,
-        }
-        for name, value, threshold, on, reason in rows
+        _row(name, value, threshold, on, there, reason, getattr(wanted, name))
+        for name, value, threshold, on, there, reason in rows
     )
+
+
+def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:
+    if wanted != "auto":
+        on = wanted == "on" and there
+        missing = wanted == "on" and not there
+        reason = f"set {wanted} by you{', but this run has none' if missing else ''}; {reason}"
+    return {
+        "name": name,
+        "value": float(value),
+        "threshold": float(threshold),
+        "decision": "on" if on else "off",
+        "reason": reason,
+    }

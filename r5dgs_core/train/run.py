@@ -29,15 +29,19 @@ log = logging.getLogger(__name__)
 Progress = Callable[[dict[str, Any]], None]
 
 
-def settings(folder: Path, config_path: Path | None, overrides: Sequence[str], *, resume: bool) -> Config:
-    """Configuration for `train`: a file and overrides, which a run that is resumed does not take.
+def settings(
+    folder: Path, config_path: Path | None, overrides: Sequence[str], *, preset: str | None = None, resume: bool
+) -> Config:
+    """Configuration for `train`: preset, file and overrides, which a run that is resumed does not take.
 
     Raises:
         ConfigError: Something cannot be used, or is given for a run that has its own configuration.
     """
-    if resume and (config_path or overrides) and (Path(folder) / checkpoint.RUN_FILE).exists():
-        raise ConfigError("--resume goes on with the run's own configuration; leave out --config and --set")
-    return configs.load(config_path, tuple(overrides))
+    if resume and (config_path or overrides or preset) and (Path(folder) / checkpoint.RUN_FILE).exists():
+        raise ConfigError(
+            "--resume goes on with the run's own configuration; leave out --preset, --config, --set and --max-gaussians"
+        )
+    return configs.load(config_path, tuple(overrides), preset)
 
 
 def train(

@@ -38,6 +38,10 @@ class TracksRepresentation:
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._places = places
         self._config = config
+        self._moves = config.needs.tracks != "off"
+        if not self._moves:
+            with torch.no_grad():
+                tracks.params["translations"].zero_()
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -87,6 +91,8 @@ class TracksRepresentation:
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
         """Start a knot's poses from its entered neighbours: steady rotation, triangulated translation."""
         self.tracks.rebase()
+        if not self._moves:
+            return
         near, next_near = knot + towards, knot + 2 * towards
         quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
         steady = entered[0] <= next_near <= entered[1]

@@ -21,7 +21,7 @@ from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, normalization, posing, representation, sweep, views
+from . import densification, initialization, losses, needs, normalization, posing, representation, sky, sweep, views
 from .checkpoint import Checkpoint
 from .config import Config
 
@@ -47,7 +47,7 @@ class Trainer:
     def __init__(self, dataset: Dataset, config: Config):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
-        self.config = config
+        self.config = config = needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
@@ -70,7 +70,8 @@ class Trainer:
         if behind is not None:
             self.background = backgrounds.fixed(behind)
         else:
-            self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color())
+            degree = 0 if config.needs.sky_gradient == "off" else sky.DEGREE
+            self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color(), degree)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         self.iteration = 0
         self.entered = (self.first_time, self.first_time)

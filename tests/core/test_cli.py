@@ -231,7 +231,7 @@ def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made,
         kinds = list(dict.fromkeys(event["event"] for event in events))
         assert kinds == ["start", "prepare", "step", "identity", "trained", "bake", "evaluate", "sheet", "written"]
         assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
-    assert "leave out --config and --set" in complaint(capsys, *small_demo, "--out", out, "--resume")
+    assert "leave out --preset, --config, --set and" in complaint(capsys, *small_demo, "--out", out, "--resume")
     monkeypatch.setattr(demo, "NAME", "another data set")
     line = complaint(capsys, *small_demo, "--out", made[0])
     assert "add --resume to go on, or --overwrite" in line
