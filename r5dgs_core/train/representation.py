@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..errors import CheckpointError
@@ -18,6 +19,7 @@ from ..model.gaussians import Gaussians
 from ..scene.cameras import Camera
 from . import initialization, posing
 from .config import Config
+from .field import FieldRepresentation
 from .groups import GroupTrack, ObservedMotion
 from .tracks_representation import TracksRepresentation
 
@@ -36,12 +38,21 @@ class Representation(Protocol):
         """What the optimizer moves, by the names of the learning rates."""
         ...
 
-    def splats(self, gaussians: Gaussians, camera: Camera, t: float) -> posing.Splats:
-        """Activated Gaussians in the world at a time, coloured as a camera sees them; differentiable."""
+    def splats(
+        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
+    ) -> posing.Splats:
+        """Activated Gaussians in the world at a time, coloured as a camera sees them; differentiable.
+
+        Args:
+            gaussians: The canonical Gaussians.
+            camera: The camera, normalised coordinates.
+            t: Scene time.
+            draw: Source of a training step's draws; None where a picture is wanted.
+        """
         ...
 
-    def penalty(self, iteration: int) -> Tensor | None:
-        """What is added to the loss of a step, or None."""
+    def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
+        """What is added to the loss of the step whose `splats` were asked for last, or None."""
         ...
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
@@ -72,12 +83,15 @@ class Representation(Protocol):
         ...
 
 
-REPRESENTATIONS: dict[str, type[TracksRepresentation]] = {TracksRepresentation.name: TracksRepresentation}
+REPRESENTATIONS: dict[str, type[TracksRepresentation] | type[FieldRepresentation]] = {
+    TracksRepresentation.name: TracksRepresentation,
+    FieldRepresentation.name: FieldRepresentation,
+}
 
 
 def make(start: initialization.Start, config: Config) -> Representation:
     """The representation that the configuration asks for, at the start of training."""
-    return REPRESENTATIONS[config.train.representation](start.tracks, start.places, config)
+    return REPRESENTATIONS[config.train.representation](start, config)
 
 
 def observed_motion(

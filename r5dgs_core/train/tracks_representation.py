@@ -14,7 +14,7 @@ from ..model.tracks import Tracks
 from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import posing, triangulation
+from . import initialization, posing
 from .config import Config
 from .groups import GroupTrack, ObservedMotion
 
@@ -26,17 +26,16 @@ class TracksRepresentation:
     """One SE(3) track per object, with shading that turns in fixed light and shadows that follow their caster.
 
     Args:
-        tracks: Start of the tracks.
-        places: Where the masks put the objects, for the translation of knots that enter.
+        start: What training starts from: its tracks, and where the masks put the objects, for knots that enter.
         config: The run's configuration.
     """
 
     name = "tracks"
 
-    def __init__(self, tracks: Tracks, places: triangulation.Places, config: Config):
-        self.tracks = tracks
+    def __init__(self, start: initialization.Start, config: Config):
+        self.tracks = tracks = start.tracks
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
-        self._places = places
+        self._places = start.places
         self._config = config
         self._moves = config.needs.tracks != "off"
         if not self._moves:
@@ -48,7 +47,9 @@ class TracksRepresentation:
         """Tracks and light direction."""
         return {**self.tracks.params, "light": self.light}
 
-    def splats(self, gaussians: Gaussians, camera: Camera, t: float) -> posing.Splats:
+    def splats(
+        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
+    ) -> posing.Splats:
         """See `Representation.splats`."""
         poses = self.tracks.poses(t)
         centers = self.tracks.group_centers()
@@ -80,7 +81,7 @@ class TracksRepresentation:
             centers,
         )
 
-    def penalty(self, iteration: int) -> Tensor | None:
+    def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
         """Roughness of the tracks, now and then with the weight of the steps in between."""
         weight = self._config.losses.roughness
         if weight <= 0 or iteration % ROUGHNESS_EVERY:

@@ -21,7 +21,7 @@ from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, needs, normalization, posing, representation, sky, sweep, views
+from . import densification, initialization, losses, needs, normalization, posing, representation, sky, sweep, thinning, views
 from .checkpoint import Checkpoint
 from .config import Config
 
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 TARGET_BYTES = 1 << 30
 FLOATER_CAMERAS = 256  # cameras that are asked whether they see what floats before another
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
+NETWORKS = ("field", "trd")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
 
@@ -51,7 +52,8 @@ class Trainer:
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
-        start = initialization.start(self.views, config, behind is None, np.random.default_rng(config.train.seed))
+        rng = np.random.default_rng(config.train.seed)
+        start = initialization.start(self.views, config, behind is None, rng)
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
@@ -61,7 +63,9 @@ class Trainer:
         if missing and len(start.object_ids) > 1:
             named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
             log.warning("no training mask shows object %s: it is left out. Remedy: check ids in objects.json", named)
-        self.gaussians: Gaussians = start.gaussians
+        self.behind = behind
+        most = config.densify.max_gaussians
+        self.gaussians: Gaussians = thinning.thin(start.gaussians, most, rng) if most else start.gaussians
         self.motion = representation.make(start, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
@@ -107,7 +111,7 @@ class Trainer:
             for name, p in self.gaussians.params.items()
         ]
         groups += [
-            {"params": [p], "lr": getattr(rates, name), "name": name, "eps": 1e-8}
+            {"params": [p], "lr": getattr(rates, name.partition(".")[0]), "name": name, "eps": 1e-8}
             for name, p in {**self.motion.params, **self.background.params}.items()
             if p.requires_grad
         ]
@@ -131,12 +135,12 @@ class Trainer:
             group["lr"] = self._rate(group["name"])
         stats = RasterStats()
         try:
-            image = self.render(view.camera, view.t, stats)
+            image = self.render(view.camera, view.t, stats, self.generator)
         except ValueError:
             self._check_finite(0.0, view.name)
             raise
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        penalty = self.motion.penalty(self.iteration)
+        penalty = self.motion.penalty(self.gaussians, self.iteration)
         total = loss if penalty is None else loss + penalty
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
@@ -154,9 +158,11 @@ class Trainer:
         self._maintain()
         return value
 
-    def render(self, camera: Camera, t: float, stats: RasterStats | None = None) -> Tensor:
-        """Image of a camera in normalised coordinates at a time. [H, W, 3]"""
-        splats = self.splats(camera, t)
+    def render(
+        self, camera: Camera, t: float, stats: RasterStats | None = None, draw: torch.Generator | None = None
+    ) -> Tensor:
+        """Image of a camera in normalised coordinates at a time; ``draw`` as for `splats`. [H, W, 3]"""
+        splats = self.splats(camera, t, draw)
         return rasterize_splats(
             splats.means,
             splats.quats,
@@ -168,9 +174,9 @@ class Trainer:
             stats=stats,
         ).image
 
-    def splats(self, camera: Camera, t: float) -> posing.Splats:
+    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> posing.Splats:
         """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
-        return self.motion.splats(self.gaussians, camera, t)
+        return self.motion.splats(self.gaussians, camera, t, draw)
 
     def _target(self, index: int) -> Tensor:
         """The view's image in [0, 1]; kept as long as all of them fit, converted each time where they do not."""
@@ -183,13 +189,15 @@ class Trainer:
 
     def _rate(self, name: str) -> float:
         rates = self.config.rates
+        name = name.partition(".")[0]
         base = getattr(rates, name)
         if name == "shading" and not self.config.train.shading:
             return 0.0
         progress = self.iteration / self.config.train.iterations
-        if progress <= rates.decay_from or name not in GEOMETRY + APPEARANCE:
+        if progress <= rates.decay_from or name not in GEOMETRY + APPEARANCE + NETWORKS:
             return base
-        factor = rates.decay ** ((progress - rates.decay_from) / (1 - rates.decay_from))
+        decay = rates.decay_networks if name in NETWORKS else rates.decay
+        factor = decay ** ((progress - rates.decay_from) / (1 - rates.decay_from))
         return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
 
     def _curriculum(self) -> tuple[int, int]:
@@ -245,6 +253,11 @@ class Trainer:
                 self.generator,
             )
             self.gradients = densification.ScreenGradients(len(self.gaussians))
+            if len(self.gaussians) == 0:
+                raise TrainingError(
+                    f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
+                    "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
+                )
 
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
