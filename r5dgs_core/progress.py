@@ -48,8 +48,10 @@ def _rich() -> Iterator[Progress]:
         tasks: dict[str, TaskID] = {}
         waiting: list[TaskID] = []
         steps = [0]
+        last = _remembering()
 
         def show(event: Event) -> None:
+            event = last(event)
             name, position = str(event["event"]), count_of(event)
             for task in waiting:  # what had no measure is over when the next thing is told
                 bars.update(task, total=1, completed=1)
@@ -69,8 +71,10 @@ def _rich() -> Iterator[Progress]:
 
 def _plain() -> Progress:
     last: dict[str, float] = {}
+    remembered = _remembering()
 
     def show(event: Event) -> None:
+        event = remembered(event)
         now, position = time.monotonic(), count_of(event)
         if position is None:
             print(f"{event['event']}: {describe(event)}", flush=True)
@@ -79,6 +83,19 @@ def _plain() -> Progress:
             print(f"{event['event']} {position[0]}: {describe(event)}", flush=True)
 
     return show
+
+
+def _remembering() -> Callable[[Event], Event]:
+    """A function that gives steps in between the PSNR that the last look at held-out views found."""
+    known: Event = {}
+
+    def complete(event: Event) -> Event:
+        if event["event"] != "step":
+            return event
+        known.update({key: event[key] for key in ("val_psnr",) if key in event})
+        return {**known, **event}
+
+    return complete
 
 
 def count_of(event: Event) -> tuple[int, int | None] | None:
@@ -97,6 +114,8 @@ def describe(event: Event) -> str:
         parts.append(event["text"])
     if "loss" in event:
         parts.append(f"loss {event['loss']:.4f}")
+    if "val_psnr" in event:
+        parts.append(f"held-out {event['val_psnr']:.1f} dB")
     if "gaussians" in event:
         parts.append(f"{event['gaussians']} Gaussians")
     if "seconds_left" in event:

@@ -1,14 +1,16 @@
 """Run folders and checkpoints: named tensors and plain values, written whole or not at all.
 
-A run folder holds ``run.json`` (configuration, data set, versions), ``checkpoint.pt`` (the last state) and
-``log.jsonl`` (one line per logged step).
+A run folder holds ``run.json`` (configuration, data set, versions, platform), ``checkpoint.pt`` (the last state),
+``log.jsonl`` (one line per logged step) and ``learning_curves.png`` (the log as a picture).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import datetime
 import io
 import json
+import os
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,6 +31,7 @@ from .config import Config
 
 FORMAT_VERSION = 1
 RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = "run.json", "checkpoint.pt", "log.jsonl", "evaluation.json"
+CURVES_FILE = "learning_curves.png"
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class Checkpoint:
 def versions() -> dict[str, str]:
     """Versions that a result may depend on."""
     import numba
+    import OpenImageIO as oiio
 
     return {
         "r5dgs": __version__,
@@ -109,6 +113,17 @@ def versions() -> dict[str, str]:
         "torch": torch.__version__,
         "numpy": np.__version__,
         "numba": numba.__version__,
+        "openimageio": oiio.VERSION_STRING,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What a run's times, and in the last bits its numbers, depend on beside the versions."""
+    return {
+        "system": platform.platform(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
 
@@ -145,10 +160,12 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         "digest": run.digest,
         "config": config.to_dict(),
         "versions": run.versions,
+        "platform": machine(),
+        "begun": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        for name in (CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE):
+        for name in (CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
             (run.folder / name).unlink(missing_ok=True)
         remove_leftovers(run.folder)
         files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
@@ -159,7 +176,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove what a kill in the middle of writing left in a run folder."""
-    for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE):
+    for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE, CURVES_FILE):
         for path in files.leftovers(Path(folder) / name):
             path.unlink(missing_ok=True)
 

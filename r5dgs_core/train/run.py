@@ -14,10 +14,10 @@ from typing import Any, TextIO
 import torch
 
 from ..data import dataset as datasets
-from ..errors import CheckpointError, ConfigError, Interrupted
+from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, identity, representation, stopping
+from . import checkpoint, curves, identity, probing, representation, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -107,21 +107,40 @@ def train(
         warm_up()
         progress({"event": "prepare", "text": "images, objects, background"})
         trainer = Trainer(dataset, run.config)
+        probe = _probe(trainer)
     if replaces:
         run = checkpoint.create_run(folder, dataset, config)
     if state is not None:
         trainer.restore(state)
         began -= state.seconds
     _clean_up(folder, trainer.iteration)
-    _optimise(trainer, run, began, go_on, progress)
+    pictures = curves.Curves(run.folder)
+    _optimise(trainer, run, began, go_on, progress, probe, pictures)
     with stopping.at_once(f"stopped after the last step, before the labels are made; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
+        pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
     return run
 
 
-def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, go_on: str, progress: Progress) -> None:
-    """Take all steps that are left, with a line in the log now and then and a checkpoint now and then."""
+def _probe(trainer: Trainer) -> probing.Probe | None:
+    """Held-out views to look at while training runs; None where there are none or none are wanted."""
+    section = trainer.config.train
+    if section.probe_every == 0 or not trainer.dataset.val:
+        return None
+    return probing.Probe(trainer, section.probe_views)
+
+
+def _optimise(
+    trainer: Trainer,
+    run: checkpoint.Run,
+    began: float,
+    go_on: str,
+    progress: Progress,
+    probe: probing.Probe | None,
+    pictures: curves.Curves,
+) -> None:
+    """Take all steps that are left, with a line in the log and a checkpoint now and then."""
     section = trainer.config.train
     last, last_time = trainer.iteration, time.monotonic()
     path = run.folder / checkpoint.LOG_FILE
@@ -129,10 +148,10 @@ def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, go_on: str, p
     with stopping.collected() as asked, _open_log(path) as stream:
         while not trainer.done:
             trainer.step()
-            if trainer.iteration % section.log_every == 0 or trainer.done:
+            look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
+            if trainer.iteration % section.log_every == 0 or trainer.done or look:
                 now = time.monotonic()
                 rate = (now - last_time) / max(1, trainer.iteration - last)
-                last, last_time = trainer.iteration, now
                 event = {
                     "event": "step",
                     "iteration": trainer.iteration,
@@ -141,11 +160,15 @@ def _optimise(trainer: Trainer, run: checkpoint.Run, began: float, go_on: str, p
                     "seconds": now - began,
                     "seconds_left": rate * (section.iterations - trainer.iteration + after),
                 }
+                if look and probe is not None:
+                    event["val_psnr"] = probe.psnr()
                 _append(path, stream, event)
                 progress(event)
+                last, last_time = trainer.iteration, time.monotonic()
             stop = bool(asked)
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
                 _save(trainer, run, began, finished=False)
+                pictures.update()
             if stop:
                 raise Interrupted(f"stopped at step {trainer.iteration}; go on with: {go_on}")
 
@@ -242,5 +265,11 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
+    bad = [name for name, tensor in tensors.items() if tensor.is_floating_point() and not tensor.isfinite().all()]
+    if bad:
+        raise TrainingError(
+            f"step {state.iteration}: {', '.join(bad)} is not finite; the last checkpoint is kept. "
+            "Remedy: lower the learning rates (rates.*)"
+        )
     seconds = time.monotonic() - began
     checkpoint.save(run.folder, dataclasses.replace(state, tensors=tensors, finished=finished, seconds=seconds))

@@ -21,7 +21,19 @@ from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import densification, initialization, losses, needs, normalization, posing, representation, sky, sweep, thinning, views
+from . import (
+    densification,
+    initialization,
+    losses,
+    needs,
+    normalization,
+    posing,
+    representation,
+    sky,
+    sweep,
+    thinning,
+    views,
+)
 from .checkpoint import Checkpoint
 from .config import Config
 
