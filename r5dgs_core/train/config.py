@@ -23,6 +23,7 @@ FIELD_SIZES = ("complex", "light", "small")
 MOVERS = ("all", "labelled")
 IDENTITY_TRAINING = ("after", "joint", "detached", "off")
 BACKGROUNDS = ("auto", "learned", "white", "black")
+STRATEGIES = ("share", "default", "mcmc")
 NEEDS = ("auto", "on", "off")
 # What `--preset` changes; a configuration file and `--set` win over it.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -40,6 +41,7 @@ class TrainSection:
         representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field and TRD, the paper's).
         background: ``learned`` sky, ``white`` or ``black``; ``auto`` is white where images carry alpha, else learned.
         sh_degree: Degree of the view-dependent colour, 0 to 3.
+        sh_every: Steps after which one more degree of it is trained (1000 in 3DGS); 0 trains all from the start.
         threads: Threads of torch; the small arrays of this trainer gain nothing from more than one.
         checkpoint_every: Steps between checkpoints.
         log_every: Steps between log lines.
@@ -54,6 +56,7 @@ class TrainSection:
     representation: str = "tracks"
     background: str = "auto"
     sh_degree: int = 0
+    sh_every: int = 0
     threads: int = 1
     checkpoint_every: int = 500
     log_every: int = 50
@@ -202,9 +205,11 @@ class CurriculumSection:
 
 @dataclass(frozen=True)
 class DensifySection:
-    """When Gaussians are split, cloned and removed.
+    """When Gaussians are split, cloned and removed; but for cap and strategy, the thresholds of ``share``.
 
     Attributes:
+        strategy: ``share`` (the largest gradients grow, a share of all in a round), ``default`` (that of 3DGS) or
+            ``mcmc`` (3DGS as Markov Chain Monte Carlo).
         start: First step.
         stop: Last step, as a share of the run.
         every: Steps between two rounds.
@@ -218,6 +223,7 @@ class DensifySection:
             (the cameras' focus is at about 4); 0 keeps it.
     """
 
+    strategy: str = "share"
     start: int = 200
     stop: float = 0.5
     every: int = 100
@@ -228,6 +234,60 @@ class DensifySection:
     prune_opacity: float = 0.01
     prune_width: float = 0.16
     prune_near: float = 1.0
+
+
+@dataclass(frozen=True)
+class DensifyDefaultSection:
+    """Thresholds of the strategy ``default``, those of 3DGS; its runs begin with ``init.opacity`` 0.1.
+
+    Attributes:
+        start: Step after which Gaussians grow.
+        stop: Share of the run after which they do not (15000 of 30000 steps).
+        every: Steps between two rounds.
+        gradient: Mean screen gradient from which on a Gaussian grows, per half image width.
+        percent_dense: Larger ones (standard deviation as a share of the cameras' extent) are split, others cloned.
+        prune_opacity: Fainter ones are removed.
+        prune_radius: Ones with a larger radius in some view, px, are removed after the first reset.
+        prune_extent: So are those with a larger standard deviation, as a share of the cameras' extent.
+        reset_every: Steps between two resets of the opacities, while Gaussians grow; 0 for none.
+        reset_opacity: No opacity is larger after a reset.
+    """
+
+    start: int = 500
+    stop: float = 0.5
+    every: int = 100
+    gradient: float = 2e-4
+    percent_dense: float = 0.01
+    prune_opacity: float = 0.005
+    prune_radius: float = 20.0
+    prune_extent: float = 0.1
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+
+
+@dataclass(frozen=True)
+class DensifyMcmcSection:
+    """Thresholds of the strategy ``mcmc``, those of its paper.
+
+    Attributes:
+        start: Step after which Gaussians are moved and added.
+        stop: Share of the run after which they are not (25000 of 30000 steps).
+        every: Steps between two rounds.
+        grow: Share that is added in a round, up to ``densify.max_gaussians``.
+        dead_opacity: Fainter ones are moved onto live ones.
+        noise: Noise on the centres, per variance and learning rate of the centres; 0 for none.
+        opacity: Weight of the mean opacity in the loss.
+        scale: Weight of the mean standard deviation in the loss.
+    """
+
+    start: int = 500
+    stop: float = 25 / 30
+    every: int = 100
+    grow: float = 0.05
+    dead_opacity: float = 0.005
+    noise: float = 5e5
+    opacity: float = 0.01
+    scale: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -296,6 +356,8 @@ class Config:
     field: FieldSection = dataclasses.field(default_factory=FieldSection)
     curriculum: CurriculumSection = dataclasses.field(default_factory=CurriculumSection)
     densify: DensifySection = dataclasses.field(default_factory=DensifySection)
+    densify_default: DensifyDefaultSection = dataclasses.field(default_factory=DensifyDefaultSection)
+    densify_mcmc: DensifyMcmcSection = dataclasses.field(default_factory=DensifyMcmcSection)
     identity: IdentitySection = dataclasses.field(default_factory=IdentitySection)
     needs: NeedsSection = dataclasses.field(default_factory=NeedsSection)
 
@@ -466,10 +528,20 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("rates.decay_from", *_SHARE),
     ("losses.ssim", *_SHARE),
     ("curriculum.newest", *_SHARE),
+    ("densify.strategy", lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
     ("densify.stop", *_SHARE),
     ("densify.every", *_AT_LEAST_1),
     ("densify.share", *_SHARE),
     ("densify.prune_opacity", lambda value: value < 1, "less than 1"),
     ("densify.prune_width", *_POSITIVE),
+    ("densify_default.stop", *_SHARE),
+    ("densify_default.every", *_AT_LEAST_1),
+    ("densify_default.prune_opacity", lambda value: value < 1, "less than 1"),
+    ("densify_default.prune_radius", *_POSITIVE),
+    ("densify_default.prune_extent", *_POSITIVE),
+    ("densify_default.reset_opacity", *_INSIDE),
+    ("densify_mcmc.stop", *_SHARE),
+    ("densify_mcmc.every", *_AT_LEAST_1),
+    ("densify_mcmc.dead_opacity", *_INSIDE),
     *((f"needs.{name}", lambda value: value in NEEDS, " or ".join(NEEDS)) for name in get_type_hints(NeedsSection)),
 )
