@@ -11,7 +11,7 @@ from r5dgs_core.train import initialization, sweep, triangulation, views
 from tests import scenes
 
 NO_PLACES = triangulation.Places(
-    np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 1), bool), np.zeros((0, 1)), np.zeros(0)
+    np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 1), bool), np.zeros((0, 1)), np.zeros(0), np.zeros((0, 1))
 )
 
 
