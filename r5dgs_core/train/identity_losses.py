@@ -11,7 +11,7 @@ import math
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 LOG_FLOOR = 1e-10  # added to probabilities before the logarithm
@@ -119,7 +119,7 @@ class Neighbourhood:
 
     def __init__(self, points: Tensor):
         self.points = points.detach().cpu().clone()
-        self._tree = cKDTree(self.points.numpy())
+        self._tree = KDTree(self.points.numpy())
 
     def nearest(self, rows: Tensor, count: int) -> Tensor:
         """Rows of the nearest other points, nearest first; fewer columns where there are fewer others.
@@ -135,7 +135,7 @@ class Neighbourhood:
         if count < 1 or len(rows) == 0:
             return rows.new_zeros(len(rows), max(count, 0))
         asking = rows.cpu()
-        _, found = self._tree.query(self.points[asking].numpy(), count + 1)
+        found = np.asarray(self._tree.query(self.points[asking].numpy(), count + 1)[1])
         # Of points in one place the tree may name others before the one that asks, or not name it at all.
         own = found == asking.numpy()[:, None]
         own[~own.any(1), -1] = True

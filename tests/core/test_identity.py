@@ -1,14 +1,18 @@
 """Labels and identity encodings agree with the masks that they come from."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.model.gaussians import Gaussians
+from r5dgs_core.raster import rasterize_splats
 from r5dgs_core.report import evaluate, metrics
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.train import identity
+from r5dgs_core.train import config, identity, identity_losses
 from r5dgs_core.train.config import IdentitySection
 from r5dgs_core.train.posing import Splats
 from r5dgs_core.train.views import TrainView
@@ -79,6 +83,208 @@ def test_more_classes_than_dimensions_are_no_obstacle():
         [view], lambda _: splats, many, torch.tensor([0, 19, 18]), section, torch.Generator().manual_seed(0)
     )
     assert weight.shape == (20, scene.IDENTITY_DIM) and torch.isfinite(weight).all()
+
+
+def wall(n=300, seed=0):
+    """A wall of small blobs in three stripes before the camera of `row_of_blobs`, masks 0, 5 and 3; groups so."""
+    draws = torch.Generator().manual_seed(seed)
+    view, _ = row_of_blobs()
+    means = torch.rand(n, 3, generator=draws) * torch.tensor([3.0, 1.2, 0.1]) + torch.tensor([-1.5, -0.6, 3.0])
+    stripe = ((means[:, 0] + 1.5) / means[:, 2] * 3).long().clamp(0, 2)
+    params = {
+        "means": means,
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        "log_scales": torch.full((n, 3), -2.6),
+        "opacity_logits": torch.ones(n),
+    }
+    return view, Gaussians(params, torch.tensor([0, 2, 1])[stripe])
+
+
+def posed(gaussians):
+    opacities, colors = torch.sigmoid(gaussians.opacity_logits), torch.rand(len(gaussians), 3)
+    return Splats(gaussians.means * 1, gaussians.quats * 1, gaussians.log_scales.exp(), opacities, colors)
+
+
+def make_joint(view, gaussians, training, **changes):
+    settings = {"identity.training": training, "identity.rate": 0.05, "identity.classifier_rate": 0.02}
+    identities = identity.joint([view], CLASSES, config.Config().replace(**settings, **changes))
+    assert identities is not None
+    identities.begin(gaussians)
+    return identities
+
+
+def adam(identities, gaussians):
+    named = {"identities": gaussians.identities, **identities.params}
+    return torch.optim.Adam([{"params": [p], "lr": identities.rates[n], "name": n} for n, p in named.items()])
+
+
+def optimise(identities, gaussians, view, steps, first=0, optimizer=None):
+    """Steps of the identities alone; returns the loss of each step, None where there was none, and the optimizer."""
+    optimizer = optimizer or adam(identities, gaussians)
+    values = []
+    for iteration in range(first, first + steps):
+        splats = posed(gaussians)
+        features = blended(identities, gaussians, splats, view) if identities.with_geometry else None
+        loss = identities.loss(gaussians, splats, view, iteration, features)
+        values.append(None if loss is None else float(loss.detach()))
+        if loss is not None:
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            optimizer.step()
+    return values, optimizer
+
+
+def blended(identities, gaussians, splats, view):
+    """Encodings in the picture, out of the pass that draws the colours."""
+    channels, background = identities.channels(gaussians, splats.colors, torch.ones(3))
+    raster = (splats.means, splats.quats, splats.scales, splats.opacities)
+    return rasterize_splats(*raster, channels, view.camera, background).image[..., 3:]
+
+
+def accuracy(identities, gaussians, view):
+    """Share of pixels whose class is the mask's."""
+    with torch.no_grad():
+        image = blended(identities, gaussians, posed(gaussians), view)
+        answers = (image @ identities.params["classifier_weight"].T + identities.params["classifier_bias"]).argmax(-1)
+    return float((answers == identity.class_map(view, CLASSES)).float().mean())
+
+
+def disagreement(identities, gaussians):
+    """Share of pairs of neighbours with different labels."""
+    labels = identities.labels(gaussians)
+    found = identity_losses.Neighbourhood(gaussians.means).nearest(torch.arange(len(gaussians)), 5)
+    return float((labels[found] != labels[:, None]).float().mean())
+
+
+@pytest.mark.parametrize("training", ["joint", "detached"])
+def test_identities_beside_the_geometry_learn_the_masks(training):
+    view, gaussians = wall()
+    gaussians.motion_ids = gaussians.motion_ids.roll(40)  # many start with the wrong class
+    identities = make_joint(view, gaussians, training, **{"identity.every": 2})
+    before = accuracy(identities, gaussians, view)
+    values, _ = optimise(identities, gaussians, view, 120)
+    assert before < 0.8 and accuracy(identities, gaussians, view) > 0.93
+    assert (None in values) == (training == "detached")
+    found = [v for v in values if v is not None]
+    assert found[-1] < 0.6 * found[0]
+
+
+def test_identities_start_as_their_training_says():
+    view, gaussians = wall()
+    gaussians.motion_ids[7] = 5  # a shadow's group lies past the classes
+    identities = make_joint(view, gaussians, "detached")
+    expected = gaussians.motion_ids.clone()
+    expected[7] = 0
+    assert torch.equal(identities.labels(gaussians), expected)
+    view, gaussians = wall()
+    make_joint(view, gaussians, "joint")
+    drawn = gaussians.identities.detach() * 0.28209479 + 0.5
+    assert drawn.min() >= 0 and drawn.max() <= 1 and abs(float(drawn.mean()) - 0.5) < 0.02
+
+
+@pytest.mark.parametrize("training", ["joint", "detached"])
+def test_only_joint_identities_reach_the_geometry(training):
+    view, gaussians = wall()
+    identities = make_joint(view, gaussians, training, **{"identity.spatial": 1.0})
+    splats = posed(gaussians)
+    features = blended(identities, gaussians, splats, view) if training == "joint" else None
+    identities.loss(gaussians, splats, view, 0, features).backward()
+    assert gaussians.identities.grad.any() and all(p.grad.any() for p in identities.params.values())
+    for name in ("means", "quats", "log_scales", "opacity_logits"):
+        assert (gaussians.params[name].grad is not None) == (training == "joint"), name
+
+
+@pytest.mark.parametrize("name", ["spatial", "majority"])
+def test_each_loss_in_space_makes_neighbours_agree(name):
+    left = {}
+    for weight in (0.0, 2.0):
+        view, gaussians = wall()
+        identities = make_joint(view, gaussians, "joint", **{f"identity.{name}": weight, "identity.samples": 200})
+        optimise(identities, gaussians, view, 80)
+        left[weight] = disagreement(identities, gaussians)
+    assert left[2.0] < 0.6 * left[0.0]
+
+
+def test_each_loss_switched_off_leaves_its_part_out():
+    view, gaussians = wall()
+    on = {"identity.spatial": 2.0, "identity.majority": 0.5, "identity.samples": 50}
+    values = {}
+    for off in ("none", "identity.weight", "identity.spatial", "identity.majority"):
+        scene = wall()[1]
+        identities = make_joint(view, scene, "joint", **{**on, off: 0.0} if off != "none" else on)
+        splats = posed(scene)
+        loss = identities.loss(scene, splats, view, 0, blended(identities, scene, splats, view))
+        values[off] = float(loss.detach())
+    parts = [values["none"] - values[name] for name in values if name != "none"]
+    assert min(parts) > 1e-4
+    assert sum(parts) == pytest.approx(values["none"], rel=1e-5)
+    nothing = make_joint(view, wall()[1], "joint", **{"identity.weight": 0.0})
+    assert nothing.loss(scene, splats, view, 0, torch.zeros(12, 30, 16)) is None
+
+
+@pytest.mark.parametrize(
+    ("representation", "variant", "active"),
+    [("tracks", "r5dgs", True), ("field", "5dgs", False), ("field", "r5dgs", False), ("field", "r5dgs_extra", True)],
+)
+def test_of_the_variants_only_the_one_with_extra_losses_has_the_majority(representation, variant, active):
+    view, gaussians = wall()
+    changes = {"train.representation": representation, "field.variant": variant, "identity.weight": 0.0}
+    identities = make_joint(view, gaussians, "joint", **changes, **{"identity.majority": 0.5})
+    assert (identities.loss(gaussians, posed(gaussians), view, 0) is not None) == active
+
+
+def test_losses_come_at_their_intervals():
+    view, gaussians = wall()
+    changes = {"identity.every": 3, "identity.spatial": 1.0, "identity.regularise_every": 2, "identity.samples": 20}
+    identities = make_joint(view, gaussians, "detached", **changes)
+    none = [identities.loss(gaussians, posed(gaussians), view, k) is None for k in range(7)]
+    assert none == [False, True, False, False, False, True, False]
+
+
+def test_views_without_masks_have_no_pixel_loss_and_unknown_ids_do_not_count():
+    view, gaussians = wall()
+    identities = make_joint(view, gaussians, "detached")
+    blind = dataclasses.replace(view, mask=None)
+    assert identities.loss(gaussians, posed(gaussians), blind, 0) is None
+    unknown = dataclasses.replace(view, mask=np.full_like(view.mask, 77))
+    assert float(identities.loss(gaussians, posed(gaussians), unknown, 0).detach()) == 0
+
+
+def test_there_are_no_joint_identities_where_nothing_tells_objects_apart():
+    view, _ = row_of_blobs()
+    asked = config.Config().replace(**{"identity.training": "joint"})
+    assert identity.joint([view], CLASSES, config.Config()) is None
+    assert identity.joint([view], {0: 0}, asked) is None
+    assert identity.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
+    assert identity.joint([view], CLASSES, asked) is not None
+
+
+@pytest.mark.parametrize("training", ["joint", "detached"])
+@pytest.mark.parametrize("grown", [False, True])
+def test_identities_go_on_to_the_same_bits(training, grown):
+    """Broken off after 7 steps, with the Gaussians moved since neighbours were looked for, or grown just before."""
+    changes = {"identity.spatial": 1.0, "identity.samples": 64, "identity.every": 2}
+    view, gaussians = wall()
+    unbroken = make_joint(view, gaussians, training, **changes)
+    _, optimizer = optimise(unbroken, gaussians, view, 7)
+    with torch.no_grad():
+        gaussians.params["means"].add_(0.2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(3)))
+    if grown:
+        chosen = torch.arange(0, 300, 7)
+        gaussians.extend(optimizer, {n: p[chosen] for n, p in gaussians.params.items()}, gaussians.motion_ids[chosen])
+    stored = {n: t.detach().clone() for n, t in unbroken.tensors(gaussians).items()}
+    assert ("identity.points" in stored) != grown
+    copy = Gaussians({n: p.detach().clone() for n, p in gaussians.params.items()}, gaussians.motion_ids)
+    resumed = make_joint(view, wall()[1], training, **changes)
+    resumed.restore(stored, copy)
+    second = adam(resumed, copy)
+    for group, old in zip(second.param_groups, optimizer.param_groups, strict=True):
+        second.state[group["params"][0]] = {k: v.clone() for k, v in optimizer.state[old["params"][0]].items()}
+    optimise(unbroken, gaussians, view, 5, 7, optimizer)
+    optimise(resumed, copy, view, 5, 7, second)
+    assert torch.equal(gaussians.identities, copy.identities)
+    for name, tensor in unbroken.tensors(gaussians).items():
+        assert torch.equal(tensor, resumed.tensors(copy)[name]), name
 
 
 def test_pixels_of_the_trained_scene_belong_to_the_objects_of_the_masks(baked, tiny):

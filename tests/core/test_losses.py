@@ -1,9 +1,12 @@
-"""The fused photometric loss against its definition by convolutions, in float64 with autograd."""
+"""The losses of training against their definitions, in float64 with autograd: photometric, and roughness of tracks."""
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
+from r5dgs_core.model.tracks import Tracks
+from r5dgs_core.motion import rotations
 from r5dgs_core.raster import compile as kernels
 from r5dgs_core.train import losses
 
@@ -42,6 +45,64 @@ def test_value_and_gradient_follow_the_definition(size, weight):
     assert float(ours.detach()) == pytest.approx(float(theirs.detach()), rel=2e-5, abs=1e-6)
     scale = float(double.grad.abs().max())
     torch.testing.assert_close(single.grad.double() / scale, double.grad / scale, rtol=0, atol=1e-4)
+
+
+def awkward(kind):
+    """Pairs of images where the variances of SSIM vanish, or values leave [0, 1]."""
+    x, y = pair(17, 21)
+    flat = torch.full_like(x, 0.4)
+    return {
+        "flat against texture": (flat, y),
+        "texture against flat": (x, flat),
+        "flat against flat": (flat, flat + 0.3),
+        "black against white": (torch.zeros_like(x), torch.ones_like(x)),
+        "one pixel": (torch.zeros_like(x).index_put_((torch.tensor([8]), torch.tensor([9])), torch.ones(3)), x * 0),
+        "over and under": (3 * x - 1, y),
+        "equal in half": (torch.where(torch.arange(21)[None, :, None] < 10, y, x), y),
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "flat against texture",
+        "texture against flat",
+        "flat against flat",
+        "black against white",
+        "one pixel",
+        "over and under",
+        "equal in half",
+    ],
+)
+def test_awkward_images_have_the_gradient_of_the_definition(kind):
+    x, y = awkward(kind)
+    single, double = x.clone().requires_grad_(True), x.double().requires_grad_(True)
+    ours, theirs = losses.photometric(single, y, 0.2), by_definition(double, y.double(), 0.2)
+    ours.backward()
+    theirs.backward()
+    assert float(ours.detach()) == pytest.approx(float(theirs.detach()), rel=2e-5, abs=1e-6)
+    # Variances are differences of squares of order one, so float32 knows them to 1e-7, beside c2 = 9e-4 in a quotient.
+    scale = float(double.grad.abs().max())
+    torch.testing.assert_close(single.grad.double() / scale, double.grad / scale, rtol=0, atol=1e-3)
+
+
+def test_the_definition_that_the_kernel_is_held_to_has_the_gradient_of_its_own_value():
+    x, y = (image.double() for image in pair(3, 4))
+    assert torch.autograd.gradcheck(lambda image: by_definition(image, y, 0.2), (x.requires_grad_(True),))
+
+
+def test_the_roughness_of_tracks_has_the_gradient_of_its_value():
+    draws = torch.Generator().manual_seed(2)
+    quats = rotations.normalize(torch.randn(3, 5, 4, generator=draws, dtype=torch.float64))
+    shifts = torch.randn(3, 5, 3, generator=draws, dtype=torch.float64)
+    turns = 0.3 * torch.randn(3, 5, 3, generator=draws, dtype=torch.float64)
+
+    def roughness(translations, rotvecs):
+        tracks = Tracks(np.array([0.0, 0.1, 0.25, 0.3, 0.7]), torch.zeros(3, 3), shifts, quats)
+        tracks.params |= {"translations": translations, "rotvecs": rotvecs}
+        return tracks.roughness()
+
+    assert torch.autograd.gradcheck(roughness, (shifts.requires_grad_(True), turns.requires_grad_(True)))
 
 
 def test_equal_images_have_no_loss_and_no_gradient():

@@ -1,0 +1,129 @@
+"""Rigid motions of objects are free, everything else costs; representatives do not depend on chance."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r5dgs_core.motion import rotations
+from r5dgs_core.train import rigidity
+
+
+def cloud(n=60, seed=0, classes=4):
+    draws = torch.Generator().manual_seed(seed)
+    means = torch.randn(n, 3, generator=draws, dtype=torch.float64)
+    labels = torch.randint(-1, classes, (n,), generator=draws)
+    opacities = torch.rand(n, generator=draws)
+    return means, labels, opacities
+
+
+def rigid_motion(means, labels, seed=5):
+    """Every object turned and moved by itself; background and unassigned ones scattered."""
+    draws = torch.Generator().manual_seed(seed)
+    moved = means + torch.randn(means.shape, generator=draws, dtype=torch.float64)
+    for k in range(1, int(labels.max()) + 1):
+        quat = rotations.normalize(torch.randn(4, generator=draws, dtype=torch.float64))
+        shift = torch.randn(3, generator=draws, dtype=torch.float64)
+        moved[labels == k] = rotations.rotate(quat, means[labels == k]) + shift
+    return moved
+
+
+@given(st.integers(1, 80), st.integers(0, 10_000))
+def test_the_representative_is_the_visible_member_nearest_to_the_centroid(n, seed):
+    means, labels, opacities = cloud(n, seed)
+    found = rigidity.representatives(means, labels, opacities)
+    assert len(found) == max(int(labels.max()), 0) + 1 and found[0] == -1
+    for k in range(1, len(found)):
+        rows = torch.nonzero(labels == k)[:, 0]
+        seen = rows[opacities[rows] > rigidity.SEEN_OPACITY]
+        rows = seen if len(seen) else rows
+        if not len(rows):
+            assert found[k] == -1
+            continue
+        distances = (means[rows] - means[rows].mean(0)).norm(dim=1)
+        assert found[k] in rows
+        assert float((means[found[k]] - means[rows].mean(0)).norm()) == pytest.approx(float(distances.min()))
+
+
+def test_of_equally_near_members_the_first_is_taken():
+    corners = torch.tensor([[9.0, 9, 9], [1, 1, 0], [-1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    labels = torch.tensor([0, 1, 1, 1, 1])
+    opacities = torch.ones(5)
+    assert rigidity.representatives(corners, labels, opacities).tolist() == [-1, 1]
+    opacities[1] = 0.1
+    faint = rigidity.representatives(corners, labels, opacities)  # the centroid is now nearest to the inner corner
+    assert faint.tolist() == [-1, 4]
+
+
+def test_anchors_name_the_representative_of_each_member():
+    means, labels, opacities = cloud()
+    rows = rigidity.representatives(means, labels, opacities)
+    anchors = rigidity.anchors(means, labels, opacities)
+    for label, anchor in zip(labels.tolist(), anchors.tolist(), strict=True):
+        assert anchor == (-1 if label < 1 else rows[label])
+
+
+def test_rigid_motions_of_the_objects_are_free_whatever_the_background_does():
+    means, labels, opacities = cloud()
+    anchors = rigidity.anchors(means, labels, opacities)
+    moved = rigid_motion(means, labels)
+    assert float((moved - means).norm()) > 1
+    assert float(rigidity.rigidity(means, moved, anchors)) == pytest.approx(0, abs=1e-12)
+
+
+def test_growth_costs_the_mean_change_of_distance():
+    means, labels, opacities = cloud()
+    anchors = rigidity.anchors(means, labels, opacities)
+    members = [i for i, a in enumerate(anchors.tolist()) if a not in (-1, i)]
+    distances = [float((means[i] - means[anchors[i]]).norm()) for i in members]
+    for factor in (1.25, 0.5):
+        cost = float(rigidity.rigidity(means, factor * means, anchors))
+        assert cost == pytest.approx(abs(factor - 1) * sum(distances) / len(members), rel=1e-9)
+
+
+def test_slopes_are_those_of_the_value_and_reach_only_the_later_state():
+    means, labels, opacities = cloud(14, classes=3)
+    anchors = rigidity.anchors(means, labels, opacities)
+    assert len(set(anchors.tolist())) == 3
+    after = (means + 0.3 * cloud(14, seed=1)[0]).requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda x: rigidity.rigidity(means, x, anchors), (after,))
+    before = means.clone().requires_grad_(True)
+    rigidity.rigidity(before, after, anchors).backward()
+    assert before.grad is None and (after.grad[anchors >= 0] != 0).any() and not after.grad[anchors < 0].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("collapsed", ["before", "after", "both"])
+def test_members_on_their_representative_have_finite_slopes(dtype, collapsed):
+    means, labels, opacities = cloud(12, classes=3)
+    anchors = rigidity.anchors(means, labels, opacities)
+    points = torch.zeros(12, 3, dtype=dtype)
+    before = points if collapsed != "after" else means.to(dtype)
+    after = (points if collapsed != "before" else means.to(dtype)).clone().requires_grad_(True)
+    loss = rigidity.rigidity(before, after, anchors)
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(after.grad).all()
+
+
+def test_without_members_there_is_no_loss_and_no_slope():
+    for anchors in (torch.full((5,), -1), torch.arange(5), torch.zeros(0, dtype=torch.int64)):
+        after = torch.randn(len(anchors), 3, requires_grad=True)
+        loss = rigidity.rigidity(after.detach() + 1, after, anchors)
+        loss.backward()
+        assert float(loss.detach()) == 0 and not after.grad.any()
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_the_loss_holds_an_object_together_that_something_else_pulls_apart(weight):
+    means, labels, opacities = cloud(40, classes=2)
+    anchors = rigidity.anchors(means, labels, opacities)
+    target = rigid_motion(means, labels) + 0.3 * cloud(40, seed=7)[0]
+    after = means.clone().requires_grad_(True)
+    optimizer = torch.optim.Adam([after], lr=0.02)
+    for _ in range(300):
+        loss = 0.05 * (after - target).square().mean() + weight * rigidity.rigidity(means, after, anchors)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    left = float(rigidity.rigidity(means, after.detach(), anchors))
+    assert left < 0.04 if weight else left > 0.15
