@@ -30,6 +30,7 @@ from . import (
     posing,
     representation,
     sky,
+    strategies,
     sweep,
     thinning,
     views,
@@ -96,13 +97,19 @@ class Trainer:
         self._view_times = np.array([views.nearest_knot(self.times, v.t) for v in self.views])
         sizes = [v.camera.width * v.camera.height for v in self.views]
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
-        self._pixel_size = normalization.TARGET_DISTANCE / focal
-        width = float(np.median([v.camera.width for v in self.views]))
-        self._width_limit = config.densify.prune_width * width * self._pixel_size
-        self._eyes = [group[0].camera for group in sweep.by_camera(self.views, FLOATER_CAMERAS)]
-        self.cap = config.densify.max_gaussians or int(min(60000, 0.75 * np.median(sizes)))
+        eyes = [group[0].camera for group in sweep.by_camera(self.views, FLOATER_CAMERAS)]
+        self.cap = most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes))))
         self.optimizer = self._make_optimizer()
-        self.gradients = densification.ScreenGradients(len(self.gaussians))
+        conditions = densification.Conditions(
+            cap=self.cap,
+            iterations=config.train.iterations,
+            pixel_size=normalization.TARGET_DISTANCE / focal,
+            image_width=float(np.median([v.camera.width for v in self.views])),
+            extent=densification.extent_of(eyes),
+            eyes=eyes,
+            generator=self.generator,
+        )
+        self.growth = strategies.make(config, conditions, len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
     def _fixed_background(self) -> np.ndarray | None:
@@ -152,8 +159,10 @@ class Trainer:
             self._check_finite(0.0, view.name)
             raise
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        penalty = self.motion.penalty(self.gaussians, self.iteration)
-        total = loss if penalty is None else loss + penalty
+        penalties = (self.motion.penalty(self.gaussians, self.iteration), self.growth.penalty(self.gaussians))
+        total = loss
+        for penalty in penalties:
+            total = total if penalty is None else total + penalty
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         value = float(loss.detach())
@@ -161,10 +170,9 @@ class Trainer:
         sums = [p.grad.sum() for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
         if not math.isfinite(value + float(torch.stack(sums).sum())):
             self._check_finite(value, view.name)
+        self._hide_harmonics()
         self.optimizer.step()
-        if stats.grad_norm is not None and stats.visible is not None:
-            half_width = 0.5 * view.camera.width
-            self.gradients.add(half_width * stats.grad_norm, stats.visible)
+        self.growth.observe(stats, view.camera)
         self.iteration += 1
         self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
         self._maintain()
@@ -248,28 +256,20 @@ class Trainer:
             pool = np.arange(len(self.views))
         return int(pool[min(int(pick * len(pool)), len(pool) - 1)])
 
+    def _hide_harmonics(self) -> None:
+        """Keep harmonics whose degree is not trained yet at zero: their gradients, and so their moments, are."""
+        every, rest = self.config.train.sh_every, self.gaussians.params["sh_rest"]
+        if every > 0 and rest.grad is not None:
+            rest.grad[:, (self.iteration // every + 1) ** 2 - 1 :] = 0.0
+
     def _maintain(self) -> None:
-        section = self.config.densify
-        stop = section.stop * self.config.train.iterations
         self.motion.after_step(self.iteration)
-        if self.iteration % section.every == 0 and section.start <= self.iteration <= stop:
-            densification.densify(
-                self.gaussians,
-                self.optimizer,
-                self.gradients,
-                section,
-                self.cap,
-                self._pixel_size,
-                self._width_limit,
-                self._eyes,
-                self.generator,
+        self.growth.after_step(self.gaussians, self.optimizer, self.iteration, self._rate("means"))
+        if len(self.gaussians) == 0:
+            raise TrainingError(
+                f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
+                "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
             )
-            self.gradients = densification.ScreenGradients(len(self.gaussians))
-            if len(self.gaussians) == 0:
-                raise TrainingError(
-                    f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
-                    "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
-                )
 
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
@@ -290,7 +290,7 @@ class Trainer:
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
-        tensors |= {f"gradients.{n}": getattr(self.gradients, n) for n in ("total", "views")}
+        tensors |= self.growth.tensors()
         for group in self.optimizer.param_groups:
             moments = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
@@ -322,9 +322,7 @@ class Trainer:
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
         self.object_ids = tensors["object_ids"].numpy()
         self.generator.set_state(tensors["generator"])
-        self.gradients = densification.ScreenGradients(len(self.gaussians))
-        for name in ("total", "views"):
-            setattr(self.gradients, name, tensors[f"gradients.{name}"])
+        self.growth.restore(tensors)
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:
             prefix = f"adam.{group['name']}."

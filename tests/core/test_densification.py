@@ -1,12 +1,18 @@
-"""Densification: grows where the image asks, within its cap, and removes what nobody sees."""
+"""Densification: what the gradients ask for grows, within the cap, and what is not needed is removed."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.data import dataset as datasets
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.train import densification
-from r5dgs_core.train.config import DensifySection
+from r5dgs_core.raster import RasterStats
+from r5dgs_core.train import checkpoint, densification, strategies
+from r5dgs_core.train.config import Config, DensifyDefaultSection, DensifySection
+from r5dgs_core.train.trainer import Trainer
+from tests import datasets as tiny_datasets
 from tests import scenes
 
 PIXEL = 0.05
@@ -33,10 +39,29 @@ def gradients(values):
     return found
 
 
-def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=10.0, seed=0):
-    densification.densify(
-        gaussians, optimizer, found, section, cap, PIXEL, width_limit, [], torch.Generator().manual_seed(seed)
+def conditions(cap=1000, seed=0, extent=1.0, eyes=(), iterations=1000):
+    return densification.Conditions(
+        cap=cap,
+        iterations=iterations,
+        pixel_size=PIXEL,
+        image_width=100.0,
+        extent=extent,
+        eyes=eyes,
+        generator=torch.Generator().manual_seed(seed),
     )
+
+
+def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=10.0, seed=0):
+    section = dataclasses.replace(section, prune_width=width_limit / (100 * PIXEL))
+    strategy = strategies.Share(section, conditions(cap, seed), len(gaussians))
+    strategy.gradients = found
+    strategy.round(gaussians, optimizer)
+
+
+def adapt(gaussians, optimizer, found, cap=1000, seed=0, extent=1.0, sizes=False, **section):
+    strategy = strategies.Adaptive(DensifyDefaultSection(**section), conditions(cap, seed, extent), len(gaussians))
+    strategy.gradients = found
+    strategy.round(gaussians, optimizer, sizes=sizes)
 
 
 def test_the_mean_counts_only_views_that_show_the_gaussian():
@@ -69,8 +94,9 @@ def test_large_ones_become_two_smaller_ones_near_their_place():
     torch.testing.assert_close(gaussians.log_scales[6:].exp(), torch.full((4, 3), scale / 1.6))
 
 
+@pytest.mark.parametrize("densify", [densify, adapt])
 @pytest.mark.parametrize("size", [0.5 * PIXEL, 4 * PIXEL])
-def test_children_belong_to_their_parents_motion_group(size):
+def test_children_belong_to_their_parents_motion_group(size, densify):
     gaussians, optimizer = make(size=size)
     gaussians.params["sh"].data[:, 0, 0] = gaussians.motion_ids.float()  # children inherit colours
     for seed in range(3):
@@ -80,13 +106,14 @@ def test_children_belong_to_their_parents_motion_group(size):
 
 
 @pytest.mark.parametrize("size", [0.5 * PIXEL, 4 * PIXEL])
-@pytest.mark.parametrize("cap", [30, 40, 43, 60])
-def test_the_cap_holds_round_after_round(size, cap):
+@pytest.mark.parametrize("cap", [40, 43, 60])
+@pytest.mark.parametrize("densify", [densify, adapt])
+def test_the_cap_holds_round_after_round(size, cap, densify):
     gaussians, optimizer = make(size=size)
     for seed in range(6):
         densify(gaussians, optimizer, gradients(torch.rand(len(gaussians)) + 0.1), cap=cap, seed=seed)
-        assert len(gaussians) <= max(cap, 40)
-    assert len(gaussians) == max(cap, 40)
+        assert len(gaussians) <= cap
+    assert len(gaussians) == cap
 
 
 def test_faint_and_oversized_ones_go_and_without_gradients_nothing_grows():
@@ -131,3 +158,132 @@ def test_nothing_grows_under_the_gradient_of_the_configuration():
     gaussians, optimizer = make()
     densify(gaussians, optimizer, gradients(torch.full((40,), 0.9 * SECTION.gradient)))
     assert len(gaussians) == 40
+
+
+def test_the_default_strategy_grows_all_that_reach_the_threshold_whatever_their_share():
+    gaussians, optimizer = make()
+    adapt(gaussians, optimizer, gradients(torch.where(torch.arange(40) < 30, 3e-4, 1e-4)))
+    assert len(gaussians) == 70
+
+
+def test_the_default_strategy_splits_by_the_extent_of_the_cameras():
+    for extent, cloned in ((100.0, True), (1.0, False)):
+        gaussians, optimizer = make(n=4, size=0.5)  # a hundredth of the first extent is 1, of the second 0.01
+        adapt(gaussians, optimizer, gradients(torch.tensor([1.0, 0, 0, 0])), extent=extent)
+        sizes = gaussians.log_scales.exp()[:, 0].tolist()
+        expected = [0.5] * 5 if cloned else [0.5] * 3 + [0.5 / 1.6] * 2
+        assert sizes == pytest.approx(expected)
+
+
+def test_the_default_strategy_removes_large_ones_only_once_opacities_were_reset():
+    for sizes, expected in ((False, 40), (True, 37)):
+        gaussians, optimizer = make()
+        with torch.no_grad():
+            gaussians.log_scales[3, 1] = torch.tensor(0.11).log()
+        found = gradients(torch.zeros(40))
+        found.add(torch.zeros(40), torch.ones(40, dtype=torch.bool), torch.arange(40) - 17.0)  # two beyond 20 px
+        adapt(gaussians, optimizer, found, sizes=sizes)
+        assert len(gaussians) == expected
+
+
+def test_a_reset_lowers_what_is_opaque_and_forgets_its_moments():
+    gaussians, optimizer = make(n=3)
+    with torch.no_grad():
+        gaussians.opacity_logits.copy_(torch.tensor([0.9, 0.5, 0.006]).logit())
+    (gaussians.opacity_logits.sum() + gaussians.means.sum()).backward()
+    optimizer.step()
+    strategy = strategies.Adaptive(DensifyDefaultSection(), conditions(iterations=30000), 3)
+    strategy.after_step(gaussians, optimizer, 2999, 1e-3)
+    assert torch.sigmoid(gaussians.opacity_logits)[0] > 0.8
+    strategy.gradients = gradients(torch.zeros(3))
+    strategy.after_step(gaussians, optimizer, 3000, 1e-3)
+    opacities = torch.sigmoid(gaussians.opacity_logits).detach()
+    torch.testing.assert_close(opacities, torch.tensor([0.01, 0.01, 0.006]), atol=1e-4, rtol=0)
+    assert not optimizer.state[gaussians.opacity_logits]["exp_avg"].any()
+    assert optimizer.state[gaussians.means]["exp_avg"].all()
+
+
+def test_rounds_come_when_the_section_says():
+    section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
+    strategy = strategies.Adaptive(section, conditions(cap=10**6), 40)
+    gaussians, optimizer = make()
+    grew = []
+    for iteration in range(1, 1001):
+        strategy.gradients = gradients(torch.ones(len(gaussians)) * (torch.arange(len(gaussians)) < 1))
+        before = len(gaussians)
+        strategy.after_step(gaussians, optimizer, iteration, 1e-3)
+        if len(gaussians) > before:
+            grew.append(iteration)
+    assert grew == list(range(150, 500, 50))
+
+
+@pytest.mark.parametrize("name", ["share", "default", "mcmc"])
+def test_a_strategy_made_again_from_its_tensors_does_what_the_first_does(name):
+    results = []
+    for again in (False, True):
+        place = conditions(cap=60, seed=3)
+        config = Config().replace(**{"densify.strategy": name, "densify.start": 0, "densify_default.start": 50})
+        gaussians, optimizer = make(size=4 * PIXEL)
+        strategy = strategies.make(config, place, 40)
+        eye = scenes.orbit_camera(0.0, 48, 36)
+        draws = torch.Generator().manual_seed(1)
+        stats = RasterStats(torch.rand(40, generator=draws) > 0.3, torch.rand(40, generator=draws) * 9)
+        stats.grad_norm = torch.rand(40, generator=draws)
+        strategy.observe(stats, eye)
+        if again:
+            kept = {n: t.clone() for n, t in strategy.tensors().items()}
+            strategy = strategies.make(config, place, 40)
+            strategy.restore(kept)
+        strategy.after_step(gaussians, optimizer, 100, 1e-3)
+        results.append((gaussians.means.detach(), strategy.tensors()))
+    assert len(results[0][0]) > 40 or name == "mcmc"
+    assert torch.equal(results[0][0], results[1][0])
+    assert all(torch.equal(tensor, results[1][1][n]) for n, tensor in results[0][1].items())
+
+
+def test_the_extent_is_that_of_the_cameras():
+    eyes = [scenes.orbit_camera(angle, 48, 36) for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
+    centers = np.stack([eye.center for eye in eyes])
+    radius = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    assert densification.extent_of(eyes) == pytest.approx(1.1 * radius)
+    assert densification.extent_of(eyes[:1]) == 0.0
+
+
+SETTINGS = {
+    "share": [],
+    "default": ["start=10", "every=10", "reset_every=25", "prune_extent=10.0"],
+    "mcmc": ["start=10", "every=10"],
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_run_keeps_to_its_cap_and_goes_on_to_the_same_bits(tiny, tmp_path, name):
+    def begin():
+        keys = [f"densify_{name}.{setting}" for setting in SETTINGS[name]]
+        sets = ("train.iterations=60", f"densify.strategy={name}", "densify.max_gaussians=1100", *keys)
+        return Trainer(datasets.read(tiny.root), tiny_datasets.settings(*sets))
+
+    whole, sizes = begin(), set()
+    while not whole.done:
+        if whole.iteration == 35:
+            checkpoint.save(tmp_path, whole.state())
+        whole.step()
+        sizes.add(len(whole.gaussians))
+    assert len(sizes) > 1 and max(sizes) <= 1100
+    again = begin()
+    again.restore(checkpoint.load(tmp_path))
+    while not again.done:
+        again.step()
+    expected, found = whole.state().tensors, again.state().tensors
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(tensor, found[n]) for n, tensor in expected.items())
+
+
+def test_harmonics_join_one_degree_at_a_time(tiny):
+    sets = ("train.iterations=60", "train.sh_degree=2", "train.sh_every=4")
+    trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings(*sets))
+    trained = []
+    for _ in range(10):
+        trainer.step()
+        trained.append(int(trainer.gaussians.sh_rest.detach().abs().amax((0, 2)).count_nonzero()))
+    assert trained == [0] * 4 + [3] * 4 + [8] * 2
