@@ -155,9 +155,12 @@ class Trainer:
         stats = RasterStats()
         try:
             image = self.render(view.camera, view.t, stats, self.generator)
-        except ValueError:
+        except ValueError as error:
             self._check_finite(0.0, view.name)
-            raise
+            raise TrainingError(
+                f"step {self.iteration}, view {view.name}: cannot be drawn: {error}; the last checkpoint is kept. "
+                "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
+            ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
         penalties = (self.motion.penalty(self.gaussians, self.iteration), self.growth.penalty(self.gaussians))
         total = loss
@@ -277,9 +280,13 @@ class Trainer:
         bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
         bad += [f"gradient of {n}" for n, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
         if bad or not math.isfinite(value):
+            largest = max(named, key=lambda n: float(named[n].detach().abs().nan_to_num(0, 0).max()))
+            size = float(named[largest].detach().abs().nan_to_num(0, 0).max())
+            more = f" and {len(bad) - 4} more" if len(bad) > 4 else ""
             raise TrainingError(
-                f"step {self.iteration}, view {view}: {', '.join(bad) or 'loss'} is not finite; the last checkpoint is "
-                "kept. Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
+                f"step {self.iteration}, view {view}: {', '.join(bad[:4]) or 'loss'}{more} is not finite (largest "
+                f"finite value: {size:.3g}, of {largest}); the last checkpoint is kept. "
+                "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
             )
 
     def state(self) -> Checkpoint:
