@@ -280,12 +280,12 @@ class Trainer:
         bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
         bad += [f"gradient of {n}" for n, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
         if bad or not math.isfinite(value):
-            largest = max(named, key=lambda n: float(named[n].detach().abs().nan_to_num(0, 0).max()))
-            size = float(named[largest].detach().abs().nan_to_num(0, 0).max())
+            sizes = {n: float(p.detach().abs().nan_to_num(0, 0).max()) for n, p in named.items() if p.numel() > 0}
+            largest = max(sizes, key=sizes.__getitem__)
             more = f" and {len(bad) - 4} more" if len(bad) > 4 else ""
             raise TrainingError(
                 f"step {self.iteration}, view {view}: {', '.join(bad[:4]) or 'loss'}{more} is not finite (largest "
-                f"finite value: {size:.3g}, of {largest}); the last checkpoint is kept. "
+                f"finite value: {sizes[largest]:.3g}, of {largest}); the last checkpoint is kept. "
                 "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
             )
 
