@@ -181,7 +181,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"r5dgs {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add_training(p: argparse.ArgumentParser) -> None:
+    def add_settings(p: argparse.ArgumentParser) -> None:
         p.add_argument("--preset", metavar="NAME", help="named settings; --config and --set win over them")
         p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
         p.add_argument(
@@ -189,6 +189,9 @@ def parser() -> argparse.ArgumentParser:
         )
         p.add_argument("--max-gaussians", metavar="N", help="cap from the first step on; densify.max_gaussians")
         add_progress(p)
+
+    def add_training(p: argparse.ArgumentParser) -> None:
+        add_settings(p)
         again = p.add_mutually_exclusive_group()
         again.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
         again.add_argument("--overwrite", action="store_true", help="begin again where there is a run")
@@ -220,6 +223,15 @@ def parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
     add_progress(evaluate)
 
+    bench = commands.add_parser("bench", help="train variants on scenes and lay out the paper's tables")
+    bench.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="data set folders")
+    bench.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs and the tables")
+    bench.add_argument("--variants", nargs="+", metavar="NAME", help="of tracks, 5dgs, r5dgs, r5dgs_extra")
+    bench.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="seeds of training (default: 0)")
+    bench.add_argument("--modes", nargs="+", metavar="MODE", help="playback modes (default: all that a scene has)")
+    bench.add_argument("--remeasure", action="store_true", help="bake and measure finished runs again")
+    add_settings(bench)
+
     info = commands.add_parser("info", help="say what is in a scene file")
     info.add_argument("file", type=Path, help=".r5dgs file")
     info.add_argument("--json", action="store_true", help="as JSON")
@@ -250,11 +262,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _dispatch(args: argparse.Namespace) -> None:
+    cap = getattr(args, "max_gaussians", None)
+    overrides = [*getattr(args, "set", []), *([] if cap is None else [f"densify.max_gaussians={cap}"])]
     if args.command in ("demo", "train"):
-        cap = [] if args.max_gaussians is None else [f"densify.max_gaussians={args.max_gaussians}"]
         options = {
             "config_path": args.config,
-            "overrides": [*args.set, *cap],
+            "overrides": overrides,
             "preset": args.preset,
             "resume": args.resume,
             "overwrite": args.overwrite,
@@ -267,11 +280,26 @@ def _dispatch(args: argparse.Namespace) -> None:
 
             run_demo(args.out, **options)
     elif args.command == "bake":
-        run_bake(args.run, args.out, args.data, args.set)
+        run_bake(args.run, args.out, args.data, overrides)
     elif args.command == "evaluate":
         run_evaluate(
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress
         )
+    elif args.command == "bench":
+        from .bench import benchmark, cases
+        from .scene import playback
+
+        plan = cases.Plan(
+            scenes=tuple(args.scenes),
+            out=args.out,
+            variants=tuple(args.variants or cases.DEFAULT_VARIANTS),
+            seeds=tuple(args.seeds),
+            modes=tuple(args.modes or playback.MODES),
+            preset=args.preset,
+            config_path=args.config,
+            overrides=tuple(overrides),
+        )
+        benchmark.run_bench(plan, remeasure=args.remeasure, progress_kind=args.progress)
     elif args.command == "warm-up":
         run_warm_up(progress_kind=args.progress)
     else:

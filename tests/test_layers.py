@@ -24,13 +24,18 @@ ALLOWED = {
     "data": {"motion", "scene"},
     "model": {"motion", "scene"},
     "raster": {"motion", "scene", "model"},
+    "importing": {"motion", "scene", "data", "model"},
     "semantics": {"motion", "scene", "data", "model", "raster"},
     "train": {"motion", "scene", "data", "model", "raster"},
     "report": {"motion", "scene", "data", "model", "raster", "semantics"},
     "serve": {"motion", "scene", "model", "raster", "semantics"},
     "progress": set(),
     "demo": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
-    "cli": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress", "demo"},
+    "bench": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
+    "cli": {
+        *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress", "demo"),
+        "bench",
+    },
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}

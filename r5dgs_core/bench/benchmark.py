@@ -1,0 +1,226 @@
+"""A benchmark from its plan to its tables; what is finished stays, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import platform
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import __version__
+from ..data import dataset as datasets
+from ..errors import CheckpointError, R5dgsError, TrainingError
+from ..progress import make as make_progress
+from ..raster import compile as compilation
+from ..report import bench_plot, bench_tables, evaluate
+from ..scene import playback, scene_file
+from ..train import bake, checkpoint, stopping, warming
+from . import cases, playing, process
+from .cases import Case, Plan
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[dict[str, Any]], None]
+RESULT_FILE, TABLES_FILE, PLOT_FILE = "bench.json", "tables.md", "error_against_time.png"
+SPLITS = ("test", "val")
+
+
+def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto") -> dict[str, Any]:
+    """Train, bake and measure every case of a plan, and write what was found after each of them.
+
+    Writes into ``plan.out``: per case what `cases` says, and `RESULT_FILE`, `TABLES_FILE` and `PLOT_FILE`.
+
+    Args:
+        plan: What to do.
+        remeasure: Bake and measure finished runs again.
+        progress_kind: How progress is shown (`progress.make`).
+
+    Returns:
+        What is in `RESULT_FILE` (docs/bench.md).
+
+    Raises:
+        ConfigError, DatasetError, CheckpointError: As `cases.make`, before anything is trained.
+        TrainingError: Some cases failed; all others are done and written.
+        Interrupted: SIGINT or SIGTERM came; everything is kept that is needed to go on.
+    """
+    planned = cases.make(plan)
+    records: list[dict[str, Any]] = []
+    failures: list[dict[str, Any]] = []
+    result: dict[str, Any] = {}
+    with make_progress(progress_kind) as progress, stopping.at_once("stopped; give the same command to go on"):
+        progress({"event": "prepare", "text": "kernels; the first run compiles them"})
+        warming.warm_up()
+        for index, case in enumerate(planned):
+            progress({"event": "case", "text": f"{case.title} ({index + 1} of {len(planned)})"})
+            try:
+                records += run_case(plan, case, remeasure, progress)
+            except Exception as error:  # whatever one case suffers from, the others are worth having
+                if not isinstance(error, R5dgsError):
+                    log.exception("%s", case.title)
+                text = str(error) if isinstance(error, R5dgsError) else f"{type(error).__name__}: {error}"
+                failures.append({"scene": case.scene, "variant": case.variant, "seed": case.seed, "error": text})
+                progress({"event": "failed", "text": f"{case.title}: {text}"})
+            result = _write(plan, records, failures)
+        if progress_kind == "json":
+            progress({"event": "written", "table": str(plan.out / RESULT_FILE)})
+    if progress_kind != "json":
+        _show(plan, result)
+    if failures:
+        raise TrainingError(
+            f"{len(failures)} of {len(planned)} runs failed, the first one {failures[0]['scene']}, "
+            f"{failures[0]['variant']}, seed {failures[0]['seed']}: {failures[0]['error']}; "
+            f"see {plan.out / TABLES_FILE}, and give the same command to try them again"
+        )
+    return result
+
+
+def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
+    """Train a case as far as it is not, measure it as far as it is not, and return its records, one per mode."""
+    if not cases.is_finished(case):
+        _train(plan, case, progress)
+    record = cases.read_record(case)
+    stamp = _stamp(case)
+    measured = record.get("measured") or {}
+    if remeasure or measured.get("checkpoint") != stamp:
+        measured = {"checkpoint": stamp, "modes": {}}
+    lacking = [mode for mode in plan.modes if mode not in measured["modes"] and mode not in measured.get("absent", [])]
+    if lacking:
+        measured = _measure(case, measured, plan.modes, lacking, progress)
+        cases.write_record(case, {**record, "measured": measured})
+    shared = {
+        "scene": case.scene,
+        "representation": cases.VARIANTS[case.variant]["train.representation"],
+        "variant": case.variant,
+        "seed": case.seed,
+        "gaussians": measured["gaussians"],
+        "iterations": measured["iterations"],
+        "train": cases.cost(record["sittings"]),
+    }
+    return [{**shared, "mode": mode, **measured["modes"][mode]} for mode in plan.modes if mode in measured["modes"]]
+
+
+def _train(plan: Plan, case: Case, progress: Progress) -> None:
+    """Train a case in a process of its own, from its last checkpoint where there is one."""
+    record = cases.read_record(case)
+    arguments = ["train", str(case.root), "--out", str(case.run)]
+    if (case.run / checkpoint.RUN_FILE).exists():
+        arguments.append("--resume")
+    else:
+        record = {"sittings": []}
+        arguments += ["--preset", plan.preset] if plan.preset else []
+        arguments += ["--config", str(plan.config_path)] if plan.config_path else []
+        arguments += [text for override in case.overrides for text in ("--set", override)]
+    before = record["sittings"]
+    # Should this process be killed, the record says that there was a sitting of which nothing is known.
+    cases.write_record(case, {"sittings": [*before, {"status": None}]})
+    log_path = case.beside(".log")
+
+    def note(sitting: process.Sitting) -> None:
+        values = {key: getattr(sitting, key) for key in ("status", *cases.COSTS)}
+        cases.write_record(case, {"sittings": [*before, values]})
+
+    try:
+        sitting = process.train(arguments, log_path, progress, note)
+    except OSError as error:
+        raise CheckpointError(f"{log_path}: training cannot be started or followed: {error}") from error
+    if sitting.status == process.STOPPED:
+        raise KeyboardInterrupt  # someone stopped training from outside: that ends the benchmark, too
+    if sitting.status != 0:
+        raise TrainingError(process.reason(sitting))
+
+
+def _stamp(case: Case) -> list[int]:
+    """What tells a checkpoint from another one."""
+    found = (case.run / checkpoint.CHECKPOINT_FILE).stat()
+    return [found.st_size, found.st_mtime_ns]
+
+
+def _measure(
+    case: Case, measured: dict[str, Any], wanted: Sequence[str], lacking: Sequence[str], progress: Progress
+) -> dict[str, Any]:
+    """Bake a run, write its scene, and measure it in the modes that are lacking and that it has."""
+    progress({"event": "bake", "text": case.title})
+    run = checkpoint.open_run(case.run)
+    dataset = datasets.read(case.root)
+    if dataset.digest != run.digest:
+        raise CheckpointError(f"{case.run}: was trained on other data than {case.root} now holds; restore the data")
+    scene = bake.bake(run, dataset)
+    scene_file.write(scene, case.beside(".r5dgs"))
+    there = playback.modes(scene)
+    modes = [mode for mode in lacking if mode in there]
+    evaluation = evaluate.evaluate(
+        scene,
+        dataset,
+        modes=modes,
+        splits=SPLITS,
+        progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
+    )
+    found = {
+        mode: {
+            "splits": {split: evaluation["splits"][split][mode] for split in SPLITS},
+            "playback": playing.measure(scene, dataset.test or dataset.val, mode),
+        }
+        for mode in modes
+    }
+    return {
+        **measured,
+        "gaussians": evaluation["train"]["gaussians"],
+        "iterations": evaluation["train"]["iterations"],
+        "objects": evaluation["objects"],
+        "modes": {**measured["modes"], **found},
+        "absent": [mode for mode in wanted if mode not in there],
+    }
+
+
+def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Write result, tables and plot of what is there so far; returns the result."""
+    result = {
+        "machine": machine(),
+        "settings": {
+            "preset": plan.preset,
+            "config": None if plan.config_path is None else str(plan.config_path),
+            "set": list(plan.overrides),
+        },
+        "results": list(records),
+        "failures": list(failures),
+        "rows": bench_tables.report_rows(records),
+    }
+    cases.write(plan.out / RESULT_FILE, json.dumps(result, indent=2))
+    cases.write(plan.out / TABLES_FILE, bench_tables.markdown(result))
+    bench_plot.write(records, plan.out / PLOT_FILE)
+    return result
+
+
+def _show(plan: Plan, result: dict[str, Any]) -> None:
+    """Print tables and places."""
+    from rich.console import Console
+
+    for sheet in bench_tables.sheets(result):
+        table, console = bench_tables.to_rich(sheet), Console()
+        wide = console.measure(table, options=console.options.update(width=1000)).maximum
+        Console(width=max(wide, console.width)).print(table)  # rather lines too long than figures cut short
+    print(f"tables: {plan.out / TABLES_FILE}\nresult: {plan.out / RESULT_FILE}\nplot:   {plan.out / PLOT_FILE}")
+
+
+def machine() -> dict[str, Any]:
+    """What the times were measured on."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
+    except OSError:
+        pass  # another system
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "processor": model,
+        "cores": usable,
+        "raster_threads": compilation.threads(),
+        "torch_threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "versions": {**checkpoint.versions(), "r5dgs": __version__},
+    }

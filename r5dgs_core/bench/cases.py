@@ -1,0 +1,204 @@
+"""What a benchmark consists of: cases, one training each, and what is kept of them on the disk.
+
+A case of scene S, variant V and seed K has under the benchmark's folder: the run folder ``S/V_seedK``, and beside it
+``.r5dgs`` (the scene), ``.log`` (what training said on stderr) and ``.json`` (its record).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..data import dataset as datasets
+from ..errors import CheckpointError, ConfigError
+from ..scene import files, playback
+from ..train import checkpoint
+from ..train import config as configs
+
+# What each variant sets; it wins over everything that the user gives.
+VARIANTS: dict[str, dict[str, str]] = {
+    "5dgs": {"train.representation": "field", "field.variant": "5dgs"},
+    "r5dgs": {"train.representation": "field", "field.variant": "r5dgs"},
+    "r5dgs_extra": {"train.representation": "field", "field.variant": "r5dgs_extra"},
+    "tracks": {"train.representation": "tracks"},
+}
+# `5dgs` is trained as `r5dgs` is and differs only in how it is played, so its row comes from the checkpoint of `r5dgs`.
+DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "tracks")
+# Looking at held-out views while training would be counted into its time. The user's settings win over these.
+QUIET = ("train.probe_every=0",)
+COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # of a sitting; seconds add up
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the user asks for.
+
+    Attributes:
+        scenes: Data sets.
+        out: Folder of the benchmark.
+        variants: Of `VARIANTS`.
+        seeds: Of training.
+        modes: Of `playback.MODES`; a scene is played in those that it has data for.
+        preset: Named settings of training.
+        config_path: TOML configuration, wins over the preset.
+        overrides: ``section.key=value``, win over both.
+    """
+
+    scenes: tuple[Path, ...]
+    out: Path
+    variants: tuple[str, ...] = DEFAULT_VARIANTS
+    seeds: tuple[int, ...] = (0,)
+    modes: tuple[str, ...] = playback.MODES
+    preset: str | None = None
+    config_path: Path | None = None
+    overrides: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Case:
+    """One training and its measurement.
+
+    Attributes:
+        scene: Name of the data set.
+        root: Its folder.
+        variant: Of `VARIANTS`.
+        seed: Of training.
+        run: Run folder.
+        overrides: All ``section.key=value`` of its configuration.
+    """
+
+    scene: str
+    root: Path
+    variant: str
+    seed: int
+    run: Path
+    overrides: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """The case in a few words."""
+        return f"{self.scene}, {self.variant}, seed {self.seed}"
+
+    def beside(self, suffix: str) -> Path:
+        """A file beside the run folder, with its name."""
+        return self.run.with_name(self.run.name + suffix)
+
+
+def make(plan: Plan) -> list[Case]:
+    """The cases of a plan, by seed, scene and variant, so that a benchmark that is stopped holds whole tables early.
+
+    Everything that can be known before hours of training is checked here.
+
+    Raises:
+        ConfigError: A variant, mode or setting is unknown, or a case was begun with other settings.
+        DatasetError: A data set cannot be read, or two have one name.
+        CheckpointError: A run folder is damaged.
+    """
+    for name, given, known in (("--variants", plan.variants, VARIANTS), ("--modes", plan.modes, playback.MODES)):
+        if not given:
+            raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")
+        for item in given:
+            if item not in known:
+                raise ConfigError(f"{name} {item}: expected some of {', '.join(known)}")
+    if plan.out.exists() and not plan.out.is_dir():
+        raise ConfigError(f"--out {plan.out}: is a file; name a folder")
+    roots: dict[str, Path] = {}
+    for root in plan.scenes:
+        dataset = datasets.read(root)
+        name = Path(dataset.root).resolve().name
+        if name in roots:
+            raise ConfigError(f"{roots[name]} and {root}: are both called {name}; give one of them another name")
+        roots[name] = root
+    cases = []
+    for seed in dict.fromkeys(plan.seeds):
+        for scene, root in roots.items():
+            for variant in dict.fromkeys(plan.variants):
+                settings = {**VARIANTS[variant], "train.seed": str(seed)}
+                overrides = (*QUIET, *plan.overrides, *(f"{key}={value}" for key, value in settings.items()))
+                case = Case(scene, root, variant, seed, plan.out / scene / f"{variant}_seed{seed}", overrides)
+                _check_settings(case, configs.load(plan.config_path, overrides, plan.preset))
+                cases.append(case)
+    return cases
+
+
+def _check_settings(case: Case, wanted: configs.Config) -> None:
+    """Raise ConfigError where the case's run was begun with other settings; CheckpointError where it is damaged."""
+    if not (case.run / checkpoint.RUN_FILE).exists():
+        return
+    found = checkpoint.open_run(case.run).config.to_dict()
+    for section, keys in wanted.to_dict().items():
+        for key, value in keys.items():
+            if found[section][key] != value:
+                raise ConfigError(
+                    f"{case.run}: was begun with {section}.{key} = {found[section][key]}, not {value}; "
+                    "go on with the settings it was begun with, or choose another --out"
+                )
+
+
+def read_record(case: Case) -> dict[str, Any]:
+    """What is kept of a case: ``sittings`` of its training and, once it is measured, ``measured``.
+
+    Raises:
+        CheckpointError: The file is damaged.
+    """
+    path = case.beside(".json")
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {"sittings": []}
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}; remove it to measure this run again") from error
+    if not isinstance(record, dict) or not isinstance(record.get("sittings"), list):
+        raise CheckpointError(f"{path}: expected an object with 'sittings'; remove it to measure this run again")
+    return record
+
+
+def write_record(case: Case, record: dict[str, Any]) -> None:
+    """Replace the record of a case.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
+    write(case.beside(".json"), json.dumps(record, indent=2))
+
+
+def write(path: Path, text: str) -> None:
+    """Replace a file of the benchmark; its folder is made.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
+    try:
+        os.makedirs(path.parent, exist_ok=True)
+        files.write(path, text.encode())
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written: {error}; make room and give the command again") from error
+
+
+def is_finished(case: Case) -> bool:
+    """Whether the case's training has ended.
+
+    Raises:
+        CheckpointError: The checkpoint is damaged.
+    """
+    return (case.run / checkpoint.CHECKPOINT_FILE).exists() and checkpoint.load(case.run).finished
+
+
+def cost(sittings: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """What training took in all sittings: ``cpu_seconds``, ``wall_seconds``, ``peak_mb`` and ``peak_gpu_mb``.
+
+    A sum is None where a sitting is not known (the benchmark itself was killed), a peak where no sitting knows it.
+    """
+    result: dict[str, float | None] = {}
+    for key in COSTS[:2]:
+        values = [sitting.get(key) for sitting in sittings]
+        known = [value for value in values if value is not None]
+        result[key] = round(sum(known), 3) if known and len(known) == len(values) else None
+    for key in COSTS[2:]:
+        known = [sitting[key] for sitting in sittings if sitting.get(key) is not None]
+        result[key] = max(known) if known else None
+    return result

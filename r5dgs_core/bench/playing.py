@@ -1,0 +1,62 @@
+"""How fast a scene plays: whole frames along its test views, one after the other, as a player would draw them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..data.dataset import View
+from ..raster import scene_render
+from ..scene import playback
+from ..scene.scene import Scene
+
+LEAST_FRAMES = 60
+PATIENCE_S = 20.0  # after which what was measured is enough
+
+
+def measure(scene: Scene, views: Sequence[View], mode: str, *, backend: str = "auto") -> dict[str, Any]:
+    """Time frames of a scene, from the time t to the picture on the host: colours alone, no identity encodings.
+
+    The views are played camera by camera in the order of their times, again and again until there are enough frames.
+    One round goes ahead that does not count: it loads kernels and fills what the mode computes once.
+
+    Args:
+        scene: The scene.
+        views: Cameras and times.
+        mode: Of `playback.modes`.
+        backend: Rasterizer.
+
+    Returns:
+        ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,
+        ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th percentile), ``frames``; all but the last None without
+        views.
+    """
+    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_frame_low", "ms_frame_high")
+    if not views:
+        return {**dict.fromkeys(names), "frames": 0}
+    ordered = sorted(views, key=lambda view: (view.camera.name, view.t))
+    for view in ordered:
+        _draw(scene, view, mode, backend)
+    times: list[tuple[float, float]] = []
+    began = time.monotonic()
+    while len(times) < LEAST_FRAMES and (not times or time.monotonic() - began < PATIENCE_S):
+        times += [_draw(scene, view, mode, backend) for view in ordered]
+    motion, raster = np.array(times).T
+    frame = motion + raster
+    low, high = np.percentile(frame, (10, 90))
+    middle = float(np.median(frame))
+    values = (1e3 / middle, middle, float(np.median(motion)), float(np.median(raster)), float(low), float(high))
+    return {**dict(zip(names, values, strict=True)), "frames": len(times)}
+
+
+def _draw(scene: Scene, view: View, mode: str, backend: str) -> tuple[float, float]:
+    """Milliseconds of motion and rasterization of one frame."""
+    start = time.perf_counter()
+    frame = playback.frame(scene, view.t, mode)
+    moved = time.perf_counter()
+    output = scene_render.render_frame(scene, frame, view.camera, backend=backend)
+    scene_render.to_numpy(output.color, np.float32)  # waits for a GPU, too
+    return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved)

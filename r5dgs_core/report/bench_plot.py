@@ -1,0 +1,71 @@
+"""Error against run time of a benchmark, as a picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import ConfigError
+from ..scene import files
+from . import bench_tables
+
+_MARKERS = "osD^vP*X"
+
+
+def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
+    """Plot PSNR against the seconds of training, in the observed time and past it, and against the time of a frame.
+
+    Args:
+        records: Cases in their modes, with figures (docs/bench.md); a colour each method and mode, a marker each scene.
+        path: The PNG file.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        ConfigError: It cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    figure = Figure(figsize=(13.5, 4.6), constrained_layout=True)
+    canvas = FigureCanvasAgg(figure)
+    scenes = list(dict.fromkeys(record["scene"] for record in records))
+    kinds = list(dict.fromkeys((bench_tables.method(record), record["mode"]) for record in records))
+    panes = (
+        ("test", "training", "training, seconds", "past t_max (test)"),
+        ("val", "training", "training, seconds", "observed time (val)"),
+        ("test", "playback", "a frame, ms", "past t_max (test)"),
+    )
+    for axes, (split, work, label, title) in zip(figure.subplots(1, 3), panes, strict=True):
+        for record in records:
+            psnr = record["splits"][split]["psnr"]
+            ms = bench_tables.training_ms(record) if work == "training" else record["playback"]["ms_frame"]
+            if psnr is None or ms is None:
+                continue
+            kind = kinds.index((bench_tables.method(record), record["mode"]))
+            marker = _MARKERS[scenes.index(record["scene"]) % len(_MARKERS)]
+            axes.plot(ms / 1e3 if work == "training" else ms, psnr, marker, color=f"C{kind % 10}", alpha=0.8)
+        axes.set(xlabel=label, ylabel="PSNR, dB", title=title)
+        axes.set_xlim(left=0)
+        axes.grid(alpha=0.3)
+    handles = [
+        Line2D([], [], linestyle="", marker="o", color=f"C{i % 10}", label=f"{name}, {mode}")
+        for i, (name, mode) in enumerate(kinds)
+    ]
+    handles += [
+        Line2D([], [], linestyle="", marker=_MARKERS[i % len(_MARKERS)], color="0.4", label=scene)
+        for i, scene in enumerate(scenes)
+    ]
+    if handles:
+        figure.legend(handles=handles, loc="outside right center", fontsize=8)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer)
+    try:
+        files.write(path, buffer.getvalue())
+    except OSError as error:
+        raise ConfigError(f"{path}: the plot cannot be written: {error}") from error
+    return path

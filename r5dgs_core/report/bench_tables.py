@@ -1,0 +1,257 @@
+"""A benchmark as the paper's two tables: for the terminal, as Markdown, and as rows that other programs compare.
+
+Notation: a record is one case in one mode (docs/bench.md); a line of a table is what the seeds of one scene, variant
+and mode have in common: their mean, and half of their range behind a plus-minus where there are several.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.table import Table
+
+Record = dict[str, Any]
+ABSENT = "-"
+# What the paper calls a variant in a mode. 5DGS is trained as R5DGS is, so either checkpoint can stand for it.
+PAPER = {
+    ("5dgs", "standard"): "5DGS",
+    ("r5dgs", "standard"): "5DGS",
+    ("r5dgs", "rigid_paper"): "R5DGS",
+    ("r5dgs_extra", "rigid_paper"): "R5DGS + extra",
+}
+OURS = "ours"
+_ORDER = ("5DGS", "R5DGS", "R5DGS + extra", "", OURS)
+_QUALITY = (("PSNR", "psnr", "{:.2f}"), ("SSIM", "ssim", "{:.4f}"), ("LPIPS", "lpips", "{:.4f}"))
+_QUALITY = (*_QUALITY, ("FLIP", "flip", "{:.4f}"))
+_COST = (("CPU s", "cpu_seconds", "{:.0f}"), ("wall s", "wall_seconds", "{:.0f}"), ("MB", "peak_mb", "{:.0f}"))
+_PLAYED = (("FPS", "fps", "{:.1f}"), ("motion ms", "ms_motion", "{:.2f}"), ("raster ms", "ms_raster", "{:.2f}"))
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of figures.
+
+    Attributes:
+        label: Its head.
+        value: The figure of a record, None where there is none.
+        form: How it is written.
+    """
+
+    label: str
+    value: Callable[[Record], float | None]
+    form: str
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table before it is laid out.
+
+    Attributes:
+        title: What it shows.
+        head: Labels of its columns; the first ``words`` of them hold words, the others figures.
+        blocks: Lines of each scene, then those of the mean over scenes.
+        caption: What the reader has to know.
+        words: Number of columns of words.
+    """
+
+    title: str
+    head: tuple[str, ...]
+    blocks: tuple[tuple[tuple[str, ...], ...], ...]
+    caption: str
+    words: int = 4
+
+
+def sheets(result: dict[str, Any]) -> list[Sheet]:
+    """The tables of a benchmark: quality past t_max, quality in the observed time, speed and mIoU.
+
+    Args:
+        result: What `bench.benchmark.run_bench` writes.
+    """
+    records, failures, machine = result["results"], result["failures"], result["machine"]
+    costs = [Column(label, _at("train", key), form) for label, key, form in _COST]
+    tables = []
+    for split, title in (("test", "Table 1: extrapolation (test)"), ("val", "Table 1, observed time (val)")):
+        columns = [Column(label, _at("splits", split, key), form) for label, key, form in _QUALITY]
+        tables.append((title, [*columns, *costs], "less is better for LPIPS and FLIP"))
+    played = [Column(label, _at("playback", key), form) for label, key, form in _PLAYED]
+    overlaps = [Column(f"mIoU {split}", _at("splits", split, "miou"), "{:.3f}") for split in ("test", "val")]
+    count = Column("Gaussians", lambda record: record["gaussians"], "{:.0f}")
+    threads = f"rasterizer on {machine['raster_threads']} thread(s), {machine['gpu'] or machine['processor']}"
+    note = f"frames of the test views in sequence, medians, colours alone; {threads}"
+    tables.append(("Table 2: speed and identities", [*played, *overlaps, count, costs[0], costs[2]], note))
+    head = ("scene", "method", "mode", "paper's row")
+    seeds = sorted({record["seed"] for record in records})
+    spread = f"; seeds {', '.join(map(str, seeds))}: mean ± half the range" if len(seeds) > 1 else ""
+    return [
+        Sheet(title, (*head, *(column.label for column in columns)), _blocks(records, failures, columns), note + spread)
+        for title, columns, note in tables
+    ]
+
+
+def to_rich(sheet: Sheet) -> Table:
+    """A table for the terminal."""
+    table = Table(title=sheet.title, title_justify="left", caption=sheet.caption, caption_justify="left")
+    for index, label in enumerate(sheet.head):
+        table.add_column(label, justify="left" if index < sheet.words else "right", no_wrap=True)
+    for block in sheet.blocks:
+        for line in block:
+            table.add_row(*line)
+        table.add_section()
+    return table
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """All tables, what failed, and what the times were measured on."""
+    parts = []
+    for sheet in sheets(result):
+        rule = ["---"] * sheet.words + ["---:"] * (len(sheet.head) - sheet.words)
+        lines = [sheet.head, tuple(rule), *(line for block in sheet.blocks for line in block)]
+        rows = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+        parts.append(f"## {sheet.title}\n\n{rows}\n\n{sheet.caption}\n")
+    if result["failures"]:
+        lines = [f"- {f['scene']}, {f['variant']}, seed {f['seed']}: {f['error']}" for f in result["failures"]]
+        parts.append("## What failed\n\n" + "\n".join(lines) + "\n")
+    machine = result["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    threads = f"{machine['raster_threads']} of the rasterizer, {machine['torch_threads']} of torch"
+    settings = result["settings"]
+    given = [f"preset {settings['preset']}"] if settings["preset"] else []
+    given += [f"configuration {settings['config']}"] if settings["config"] else []
+    given += settings["set"]
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    parts.append(
+        "## How\n\n"
+        f"Settings: {', '.join(given) or 'defaults'}. CPU s, wall s and MB are of the process that trained, start and "
+        f"labels included; FPS of the process that measured. {machine['processor']}, {machine['cores']} usable "
+        f"cores{gpu}; threads: {threads}; {versions}.\n"
+    )
+    return "\n".join(parts)
+
+
+def report_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Rows in the shape of ``r5dgs report``: PSNR against training time, and against the time of a frame.
+
+    ``ms`` of a training is processor time, or wall time where that is unknown. ``pareto`` says that no faster row of
+    the same task is at least as good.
+    """
+    rows: list[dict[str, Any]] = []
+    for split in ("test", "val"):
+        found = [(record, record["splits"][split]["psnr"]) for record in records]
+        for task, ms in ((f"training, {split}", training_ms), (f"playback, {split}", _at("playback", "ms_frame"))):
+            rows += [
+                {
+                    "task": f"{record['scene']}, {task}",
+                    "mode": record["mode"],
+                    "method": method(record),
+                    "setting": f"seed {record['seed']}",
+                    "error_kind": "psnr",
+                    "error": psnr,
+                    "ms": ms(record),
+                    "pareto": False,
+                }
+                for record, psnr in found
+                if psnr is not None and ms(record) is not None
+            ]
+    best: dict[str, float] = {}
+    for row in sorted(rows, key=lambda row: (row["ms"], -row["error"])):
+        row["pareto"] = row["error"] > best.get(row["task"], -float("inf"))
+        best[row["task"]] = max(row["error"], best.get(row["task"], -float("inf")))
+    return rows
+
+
+def method(record: Record) -> str:
+    """Representation and variant: "tracks", "field/r5dgs"."""
+    representation, variant = record["representation"], record["variant"]
+    return representation if variant == representation else f"{representation}/{variant}"
+
+
+def training_ms(record: Record) -> float | None:
+    """What training took, milliseconds: processor time, or wall time where that is unknown."""
+    train = record["train"]
+    seconds = train["cpu_seconds"] if train["cpu_seconds"] is not None else train["wall_seconds"]
+    return None if seconds is None else 1e3 * seconds
+
+
+def paper_row(variant: str, mode: str, variants: Iterable[str]) -> str:
+    """Which row of the paper's tables a variant in a mode is; "ours" for what the paper has not, or "".
+
+    Args:
+        variant: The variant.
+        mode: The mode that it is played in.
+        variants: All variants of the benchmark.
+    """
+    if mode == "standard" and variant == "r5dgs" and "5dgs" in variants:
+        return ""
+    return OURS if mode == "rigid" else PAPER.get((variant, mode), "")
+
+
+def _at(*path: str) -> Callable[[Record], float | None]:
+    """Look up a figure of a record by the keys that lead to it."""
+
+    def value(record: Record) -> float | None:
+        found: Any = record
+        for key in path:
+            found = found[key]
+        return found
+
+    return value
+
+
+def _blocks(
+    records: Sequence[Record], failures: Sequence[dict[str, Any]], columns: Sequence[Column]
+) -> tuple[tuple[tuple[str, ...], ...], ...]:
+    """Lines of each scene, those of cases without any figures, and the mean over scenes where there are several."""
+    variants = {record["variant"] for record in records}
+    scenes = list(dict.fromkeys(item["scene"] for item in (*records, *failures)))
+    groups: dict[tuple[str, str], dict[str, list[Record]]] = {}
+    for record in records:
+        groups.setdefault((record["variant"], record["mode"]), {}).setdefault(record["scene"], []).append(record)
+    keys = sorted(groups, key=lambda key: (_ORDER.index(paper_row(*key, variants)), key))
+
+    def words(scene: str, key: tuple[str, str]) -> tuple[str, ...]:
+        some = next(iter(groups[key].values()))[0]
+        return scene, method(some), key[1], paper_row(*key, variants)
+
+    blocks = []
+    for scene in scenes:
+        lines = [
+            (*words(scene, key), *(_cell(groups[key][scene], column) for column in columns))
+            for key in keys
+            if scene in groups[key]
+        ]
+        done = {record["variant"] for record in records if record["scene"] == scene}
+        failed = dict.fromkeys(f["variant"] for f in failures if f["scene"] == scene and f["variant"] not in done)
+        lines += [(scene, variant, "", "", "failed", *[ABSENT] * (len(columns) - 1)) for variant in failed]
+        blocks.append(tuple(lines))
+    if len(scenes) > 1:
+        lines = []
+        for key in keys:
+            if set(groups[key]) == set(scenes):
+                means = [_mean_over_scenes(list(groups[key].values()), column) for column in columns]
+                lines.append((*words(f"mean of {len(scenes)}", key), *means))
+        blocks.append(tuple(lines))
+    return tuple(block for block in blocks if block)
+
+
+def _cell(records: Sequence[Record], column: Column) -> str:
+    """Mean over the seeds, and half their range where there are several; absent where one lacks the figure."""
+    values = [column.value(record) for record in records]
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return ABSENT
+    mean = column.form.format(sum(known) / len(known))
+    return mean if len(known) == 1 else f"{mean} ± {column.form.format((max(known) - min(known)) / 2)}"
+
+
+def _mean_over_scenes(scenes: Sequence[Sequence[Record]], column: Column) -> str:
+    """Mean of the scenes' means; absent where a scene lacks the figure."""
+    means = []
+    for records in scenes:
+        values = [column.value(record) for record in records]
+        known = [value for value in values if value is not None]
+        if len(known) < len(values):
+            return ABSENT
+        means.append(sum(known) / len(known))
+    return column.form.format(sum(means) / len(means))
