@@ -41,7 +41,7 @@ class Probe:
         """Mean PSNR of the views as they are now, dB, colours in 8 bits; no draw of the run is used up."""
         state = self._trainer.generator.get_state()
         with torch.random.fork_rng(devices=[]):
-            found = [_psnr(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
+            found = [psnr(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
         self._trainer.generator.set_state(state)
         return float(np.mean(found))
 
@@ -51,7 +51,7 @@ def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
     return np.round(datasets.load_image(view, behind) * 255).astype(np.uint8)
 
 
-def _psnr(image: np.ndarray, target: np.ndarray) -> float:
+def psnr(image: np.ndarray, target: np.ndarray) -> float:
     """PSNR of colours in [0, 1] against 8 bits, dB; at most 99, which equal images have. [H, W, 3]"""
     rounded = np.round(np.clip(image, 0, 1) * 255)
     error = float(np.mean(((rounded - target) / 255) ** 2))

@@ -10,10 +10,14 @@ import torch
 from ..model.gaussians import Gaussians
 
 
+WIDEST = 0.25  # normalised units; wider ones would soon be pruned
+
+
 def thin(gaussians: Gaussians, cap: int, rng: np.random.Generator) -> Gaussians:
     """Keep ``cap`` Gaussians, the same share of every motion group and one of each as long as there is room.
 
-    Those that stay grow by the square root of the factor by which they became fewer, so that surfaces stay covered.
+    Those that stay grow by the square root of the factor by which they became fewer, so that surfaces stay covered, but
+    not beyond `WIDEST`.
 
     Args:
         gaussians: The Gaussians before training.
@@ -34,5 +38,6 @@ def thin(gaussians: Gaussians, cap: int, rng: np.random.Generator) -> Gaussians:
         turn[members] = np.arange(members.sum()) / members.sum()
     rows = torch.from_numpy(np.sort(drawn[np.argsort(turn, kind="stable")[:cap]]))
     params = {name: tensor.detach()[rows].clone() for name, tensor in gaussians.params.items()}
-    params["log_scales"] += 0.5 * math.log(count / cap)
+    room = math.log(WIDEST) - params["log_scales"].amax(1, keepdim=True)
+    params["log_scales"] += room.clamp(0.0, 0.5 * math.log(count / cap))
     return Gaussians(params, gaussians.motion_ids[rows])
