@@ -1,0 +1,172 @@
+"""A run of others becomes a scene: bind state at t_max, residuals at knots, dynamics past t_max, table of objects.
+
+Everything belongs to one pinned motion group; what moves in the observed time does so by residuals.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import models, rotations
+from ..scene import scene
+from ..scene.scene import MotionGroup, Scene, SceneObject
+from .foreign import Foreign, State
+
+CHUNK = 16384  # rows that are evaluated at all knots at once
+STILL = 1e-4  # of the scene's extent: motion of a Gaussian's ellipsoid that is left out
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Observed motion of N Gaussians of which R move. S knots.
+
+    Attributes:
+        bind: Their state at the last knot.
+        rows: Those that move, increasing. [R] int32
+        offsets: Their displacement from the bind state. [R, S, 3] float32
+        turns: Their rotation from it, unit wxyz. [R, S, 4] float32
+        growths: Change of their log scales. [R, S, 3] float32
+        dynamics: Motion past the last knot. [N, 12] float32 or None
+    """
+
+    bind: State
+    rows: np.ndarray
+    offsets: np.ndarray
+    turns: np.ndarray
+    growths: np.ndarray
+    dynamics: np.ndarray | None
+
+
+def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Progress | None = None) -> Motion:
+    """Evaluate the deformation at the knots.
+
+    Args:
+        foreign: A run with a `state`.
+        times: Knots, the last is t_max. [S]
+        tolerance: World units; Gaussians whose ellipsoids stay that close to their bind state count as still.
+        progress: Told how many Gaussians of how many are done.
+    """
+    assert foreign.state is not None
+    count, last = len(foreign.splats.means), float(times[-1])
+    kept: list[tuple[np.ndarray, ...]] = []
+    binds, dynamics = [], []
+    for start in range(0, max(count, 1), CHUNK):
+        rows = slice(start, min(start + CHUNK, count))
+        bind = foreign.state(rows, last)
+        binds.append(bind)
+        if foreign.dynamics is not None:
+            dynamics.append(foreign.dynamics(rows, bind.means, last).astype(np.float32))
+        parts = _relative([foreign.state(rows, float(t)) for t in times[:-1]], bind)
+        moving = np.flatnonzero(_reach(bind, *parts) > tolerance)
+        kept.append((moving + start, *(part[moving].astype(np.float32) for part in parts)))
+        if progress is not None:
+            progress(rows.stop, count)
+    moved, offsets, turns, growths = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+    bind = State(*(np.concatenate([getattr(b, name) for b in binds]) for name in ("means", "quats", "log_scales")))
+    return Motion(bind, moved.astype(np.int32), offsets, turns, growths, np.concatenate(dynamics) if dynamics else None)
+
+
+def _relative(states: list[State], bind: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets [n, S, 3], turns [n, S, 4] and growths [n, S, 3] from the bind state, which is added as the last knot."""
+    states = [*states, bind]
+    offsets = np.stack([state.means - bind.means for state in states], axis=1)
+    growths = np.stack([state.log_scales - bind.log_scales for state in states], axis=1)
+    back = rotations.conjugate(bind.quats)
+    turns = rotations.make_continuous(np.stack([rotations.multiply(s.quats, back) for s in states])[::-1])[::-1]
+    turns = np.where(turns[-1, :, :1] < 0, -turns, turns)
+    turns[-1] = [1.0, 0.0, 0.0, 0.0]
+    return offsets, np.swapaxes(turns, 0, 1), growths
+
+
+def _reach(bind: State, offsets: np.ndarray, turns: np.ndarray, growths: np.ndarray) -> np.ndarray:
+    """How far a point on the ellipsoid of one standard deviation gets from where it is bound, at most. [n]"""
+    size = np.exp(bind.log_scales.max(-1))[:, None]
+    angle = np.linalg.norm(rotations.quats_to_rotvecs(turns), axis=-1)
+    stretch = np.abs(np.expm1(growths) * np.exp(bind.log_scales)[:, None]).max(-1)
+    return (np.linalg.norm(offsets, axis=-1) + size * angle + stretch).max(-1, initial=0.0)
+
+
+def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **rest) -> Scene:
+    """The scene.
+
+    Args:
+        foreign: The run.
+        motion: What `sample` gave, None where nothing moves.
+        times: Knots. [S]
+        **rest: The fields of `Scene` that do not come from the run: name, frames_per_unit, world_convention, cameras,
+            background_sh, provenance.
+    """
+    splats = foreign.splats
+    labels, weight, bias = classify(foreign)
+    order = np.argsort(labels, kind="stable")
+    means, quats, log_scales = splats.means, splats.quats, splats.log_scales
+    if motion is not None:
+        means, quats, log_scales = motion.bind.means, motion.bind.quats, motion.bind.log_scales
+    ranks = np.argsort(order)
+    moved = None if motion is None or len(motion.rows) == 0 else np.argsort(ranks[motion.rows])
+    residuals = {}
+    if motion is not None and moved is not None:
+        residuals = {
+            "residual_rows": ranks[motion.rows][moved].astype(np.int32),
+            "residual_offsets": motion.offsets[moved],
+            "residual_quats": motion.turns[moved],
+            "residual_log_scales": motion.growths[moved],
+        }
+    identities = splats.identities
+    if identities is not None and identities.shape[1] != scene.IDENTITY_DIM:
+        identities = None
+    group = MotionGroup(0, 0, "pinned", 0 if len(order) else -1, np.zeros(3), models.STATIC)
+    return Scene(
+        means=means[order].astype(np.float32),
+        quats=rotations.normalize(quats[order].astype(np.float64)).astype(np.float32),
+        log_scales=log_scales[order].astype(np.float32),
+        opacity_logits=splats.opacity_logits[order],
+        sh=splats.sh[order],
+        object_ids=labels[order],
+        motion_ids=np.zeros(len(order), np.int32),
+        track_times=times.astype(np.float64),
+        track_poses=np.tile([1.0, 0, 0, 0, 0, 0, 0], (1, len(times), 1)),
+        objects=_objects(labels[order]),
+        groups=(group,),
+        t_max=float(times[-1]),
+        identities=None if identities is None else identities[order].astype(np.float16),
+        classifier_weight=weight,
+        classifier_bias=bias,
+        dynamics=None if motion is None or motion.dynamics is None else motion.dynamics[order],
+        near_plane=foreign.near_plane,
+        **residuals,
+        **rest,
+    )
+
+
+def classify(foreign: Foreign) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Object of each Gaussian, the class its identity scores highest in, and the classifier of the objects there are.
+
+    Returns:
+        Object ids [N] int32, all 0 without a classifier; weight [M + 1, 16] and bias [M + 1] float32 or None.
+
+    Source: Gaussian Grouping, whose class 0 is what no mask covers.
+    """
+    identities = foreign.splats.identities
+    if foreign.classifier is None or identities is None:
+        return np.zeros(len(foreign.splats.means), np.int32), None, None
+    weight, bias = foreign.classifier
+    labels = (identities @ weight.T + bias).argmax(-1).astype(np.int32)
+    present = np.union1d(labels, [0])
+    return labels, weight[present].astype(np.float32), bias[present].astype(np.float32)
+
+
+def _objects(labels: np.ndarray) -> tuple[SceneObject, ...]:
+    """The table of sorted labels: the background and "object k"."""
+    table = []
+    for k in np.union1d(labels, [0]).tolist():
+        start, stop = np.searchsorted(labels, [k, k + 1]).tolist()
+        color = (0.5, 0.5, 0.5) if k == 0 else colorsys.hls_to_rgb(k * 0.6180339887 % 1.0, 0.55, 0.9 - 0.25 * (k % 2))
+        table.append(SceneObject(k, f"object {k}" if k else "background", (), "", color, start, stop - start))
+    return tuple(table)

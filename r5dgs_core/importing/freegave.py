@@ -1,0 +1,92 @@
+"""FreeGave: a code per Gaussian, and motion patterns whose weights depend on time alone.
+
+A Gaussian takes shares of the patterns; of the six weights that this gives, the first three are v and the last three
+-w: the velocity at p is v + w x p, p in the world. FreeGave asks for the weights anew at every step; here their value
+and slope at max_time are kept, which is the same to second order in the time that has passed since. Gaussians that
+stay within a hundredth of where they are at time 0 keep the state of time 0, as in FreeGave's own renderings.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import CheckpointError
+from ..motion import rotations
+from ..scene import ply
+from . import networks, weights
+from .foreign import TRACE_NEAR, Foreign, State, twisted_state
+from .run_folder import RunFolder
+from .trace import about_centers
+
+BANK = "vel_net.a_weight_bank"  # rates that FreeGave trains and does not use; no other layout has them
+WEIGHTS = 6
+STILL_TIMES = tuple(k / 100 for k in range(75))
+STILL_DISTANCE = 0.01  # world units
+
+
+def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
+    """Read the Gaussians, the code field and both networks.
+
+    Args:
+        run: The folder.
+        velocity: Of its ``vel.pth``.
+        t_max: Last time of the deformation.
+    """
+    splats = ply.read(run.ply)
+    if "code_field.pth" not in run.files:
+        raise CheckpointError(f"{run.weights('code_field.pth')}: the file is missing beside FreeGave's vel.pth")
+    field = networks.read_code_field(weights.load(run.weights("code_field.pth")))
+    deform = networks.read_deform(weights.load(run.weights("deform.pth")), field.size)
+    network = networks.read_velocity(velocity)
+    velocity.tensor(BANK, (field.size, WEIGHTS))
+    if (network.inputs, network.outputs) != (1, WEIGHTS * field.size):
+        raise CheckpointError(
+            f"{velocity.path}: expected a network from 1 to {WEIGHTS * field.size} numbers, found {network.inputs} to "
+            f"{network.outputs}; unknown layout"
+        )
+
+    def codes(rows: slice) -> Tensor:
+        with torch.no_grad():
+            return field.codes(torch.from_numpy(splats.means[rows]))
+
+    def predicted(rows: slice, t: float) -> State:
+        return twisted_state(splats, deform, rows, t, codes(rows))
+
+    def rates(rows: slice, means: np.ndarray, t: float) -> np.ndarray:
+        with torch.no_grad():
+            shares = field.pattern_shares(codes(rows))
+            value, slope = (shares @ x.reshape(-1, WEIGHTS) for x in network.value_and_slope(t))
+        turned = torch.cat([value[:, :3], -value[:, 3:], slope[:, :3], -slope[:, 3:]], -1)
+        return about_centers(turned.double().numpy(), means)
+
+    @functools.lru_cache(maxsize=1)  # one stretch of rows is asked for at many times
+    def resting(start: int, stop: int) -> tuple[np.ndarray, State]:
+        """Which rows stay where they are at time 0, and the state at time 0."""
+        rows = slice(start, stop)
+        first, last = predicted(rows, 0.0), predicted(rows, t_max).means
+        v, w, a, _ = np.split(rates(rows, last, t_max), 4, axis=-1)
+        result = np.ones(stop - start, bool)
+        for t in STILL_TIMES:
+            tau = t - t_max
+            later = last + v * tau + (a + rotations.cross(w, v)) * tau**2 / 2
+            means = predicted(rows, t).means if tau <= 0 else later
+            result &= np.linalg.norm(means - first.means, axis=-1) < STILL_DISTANCE
+        return result, first
+
+    def state(rows: slice, t: float) -> State:
+        rests, first = resting(rows.start, rows.stop)
+        moving = predicted(rows, t)
+        chosen = (
+            np.where(rests[:, None], getattr(first, name), getattr(moving, name))
+            for name in ("means", "quats", "log_scales")
+        )
+        return State(*chosen)
+
+    def dynamics(rows: slice, means: np.ndarray, t: float) -> np.ndarray:
+        return np.where(resting(rows.start, rows.stop)[0][:, None], 0.0, rates(rows, means, t))
+
+    return Foreign("freegave", splats, TRACE_NEAR, state, dynamics, t_max)

@@ -1,0 +1,162 @@
+"""`r5dgs import`: a run folder of others to a scene. docs/import.md says what is taken over and what is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..data import dataset as datasets
+from ..data.dataset import Dataset
+from ..errors import CheckpointError, ConfigError
+from ..model import spherical_harmonics
+from ..scene import cameras
+from ..scene.scene import Scene
+from . import assembly, camera_file, deformable, freegave, run_folder, splatting, trace, weights
+from .foreign import Foreign
+from .run_folder import RunFolder
+
+ROUNDING = 1e-9  # share of the extent below which a motion is none
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a user can say about an import.
+
+    Attributes:
+        iteration: Which iteration to read; the last without it.
+        data: The data set that the run was trained on; gives cameras, times and the world's axes.
+        knots: Number of times at which the deformation is sampled; without it the data set's times, or
+            `datasets.FRAMES_PER_UNIT` per unit of time.
+        t_max: Last time of the deformation; without it the run's, or the data set's, or 1.
+        world: Axes of the world, a key of `cameras.WORLD_TO_BLENDER`.
+        still: Motion that is left out, as a share of the scene's extent.
+    """
+
+    iteration: int | None = None
+    data: Path | None = None
+    knots: int | None = None
+    t_max: float | None = None
+    world: str | None = None
+    still: float = assembly.STILL
+
+    def __post_init__(self) -> None:
+        if self.knots is not None and self.knots < 2:
+            raise ConfigError(f"--knots {self.knots}: expected at least 2, the first and the last time")
+        if self.t_max is not None and not (math.isfinite(self.t_max) and self.t_max > 0):
+            raise ConfigError(f"--t-max {self.t_max:g}: expected a positive time")
+        if not (math.isfinite(self.still) and self.still >= 0):
+            raise ConfigError(f"--still {self.still:g}: expected a share of the scene's extent, 0 or more")
+        if self.world is not None and self.world not in cameras.WORLD_TO_BLENDER:
+            raise ConfigError(f"--world {self.world}: expected one of {', '.join(cameras.WORLD_TO_BLENDER)}")
+
+
+def read(run: RunFolder, t_max: float | None = None) -> Foreign:
+    """Read a run folder by the rules of whoever wrote it.
+
+    Args:
+        run: The folder.
+        t_max: Last time of the deformation, where the user says it.
+
+    Raises:
+        CheckpointError, SceneFileError: A file is missing, damaged, holds code, or is of an unknown layout.
+    """
+    if not run.deforms:
+        return splatting.read(run)
+    if "vel.pth" not in run.files:
+        return dataclasses.replace(deformable.read(run), t_max=t_max)
+    t_max = run.max_time() if t_max is None else t_max
+    velocity = weights.load(run.weights("vel.pth"))
+    return (freegave if freegave.BANK in velocity else trace).read(run, velocity, t_max)
+
+
+def import_run(folder: Path, options: Options = Options(), progress: assembly.Progress | None = None) -> Scene:
+    """Turn a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave into a scene.
+
+    Args:
+        folder: The run folder.
+        options: What the user says about it.
+        progress: Told how many Gaussians of how many are sampled.
+
+    Raises:
+        R5dgsError: The folder or the data set cannot be used; the message says why.
+    """
+    run = run_folder.open_run(folder, options.iteration)
+    dataset = None if options.data is None else datasets.read(options.data)
+    foreign = read(run, options.t_max)
+    motion, times = None, np.zeros(1)
+    if foreign.state is not None:
+        times = _times(run, foreign, dataset, options)
+        motion = assembly.sample(foreign, times, max(options.still, ROUNDING) * _extent(foreign), progress)
+    white = bool(run.config.get("white_background", foreign.dynamics is not None))
+    scene = assembly.make_scene(
+        foreign,
+        motion,
+        times,
+        name=run.folder.resolve().name,
+        frames_per_unit=datasets.FRAMES_PER_UNIT if dataset is None else dataset.frames_per_unit,
+        world_convention=_world(run, foreign, dataset, options),
+        cameras=camera_file.read(run.folder / "cameras.json") if dataset is None else dataset.cameras,
+        background_sh=spherical_harmonics.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
+        provenance={
+            "imported": {
+                "layout": run_folder.TITLES[foreign.kind],
+                "folder": str(run.folder.resolve()),
+                "iteration": run.iteration,
+                "settings": {key: _plain(value) for key, value in run.config.items()},
+            },
+            "versions": {"r5dgs": __version__},
+        },
+    )
+    return scene
+
+
+def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> np.ndarray:
+    """Knots, the last at t_max. [S]"""
+    t_max = foreign.t_max
+    if t_max is None:
+        t_max = 1.0 if dataset is None else dataset.t_max
+    if t_max <= 0:
+        raise CheckpointError(f"{run.folder}: expected motion up to a time after 0, found t_max {t_max:g}")
+    if options.knots is not None:
+        return np.linspace(0.0, t_max, options.knots)
+    if dataset is None:
+        return np.linspace(0.0, t_max, max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1))
+    seen = dataset.times[dataset.times < t_max - 1e-6]
+    return np.concatenate([seen if len(seen) else [0.0], [t_max]])
+
+
+def _extent(foreign: Foreign) -> float:
+    """Diagonal of the box that holds the middle 98 % of the centres, as `Scene.extent` has it."""
+    if len(foreign.splats.means) == 0:
+        return 1.0
+    low, high = np.quantile(foreign.splats.means, [0.01, 0.99], axis=0)
+    return max(float(np.linalg.norm(high - low)), 1e-12)
+
+
+def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> str:
+    """Axes of the world: as user or data set say; else z up for what was trained on Blender's, else COLMAP's."""
+    if options.world is not None:
+        return options.world
+    if dataset is not None:
+        return dataset.world_convention
+    source = run.config.get("source_path")
+    blender = bool(run.config.get("is_blender", foreign.dynamics is not None))
+    if not blender and isinstance(source, str) and source:
+        blender = (Path(source) / "transforms_train.json").is_file()
+    world = "blender" if blender else "colmap"
+    _log.info("%s: world axes taken to be those of %s; --world says otherwise", run.folder, world)
+    return world
+
+
+def _plain(value: Any) -> Any:
+    """JSON form of a setting."""
+    if isinstance(value, str | bool | int) or value is None or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else repr(value)

@@ -1,0 +1,143 @@
+"""The run folders of 3DGS and of what was built on it: which one it is, its iterations and its settings.
+
+All of them have ``point_cloud/iteration_N/point_cloud.ply`` and most have ``cfg_args``. Gaussian Grouping adds
+``classifier.pth`` beside the PLY; Deformable-3DGS ``deform/iteration_N/deform.pth``; TRACE and FreeGave put ``vel.pth``
+(and ``code_field.pth``) beside that.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import CheckpointError
+
+KINDS = ("3dgs", "gaussian_grouping", "deformable_3dgs", "trace", "freegave")
+TITLES: dict[str, str] = dict(
+    zip(KINDS, ("3D Gaussian Splatting", "Gaussian Grouping", "Deformable-3DGS", "TRACE", "FreeGave"), strict=True)
+)
+_KNOWN = f"known are the run folders of {', '.join(TITLES.values())}"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A folder that somebody else's training wrote.
+
+    Attributes:
+        folder: The folder.
+        iteration: The iteration that is read.
+        config: Settings of ``cfg_args``; empty without that file.
+        deforms: Whether there is a deformation network.
+        files: Names of the files of weights.
+    """
+
+    folder: Path
+    iteration: int
+    config: dict[str, Any]
+    deforms: bool
+    files: frozenset[str]
+
+    @property
+    def ply(self) -> Path:
+        """The Gaussians."""
+        return self.folder / "point_cloud" / f"iteration_{self.iteration}" / "point_cloud.ply"
+
+    def weights(self, name: str) -> Path:
+        """A file of weights, "classifier.pth" or one of the deformation's."""
+        part = "deform" if self.deforms else "point_cloud"
+        return self.folder / part / f"iteration_{self.iteration}" / name
+
+    def max_time(self) -> float:
+        """Last time of the deformation of TRACE and FreeGave.
+
+        Raises:
+            CheckpointError: ``cfg_args`` does not say it.
+        """
+        value = self.config.get("max_time")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            found = repr(value) if "max_time" in self.config else "nothing"
+            raise CheckpointError(
+                f"{self.folder / 'cfg_args'}: 'max_time': expected the last time of the deformation, found {found}; "
+                "say it with --t-max (both codes take 0.7 where nothing is said)"
+            )
+        return float(value)
+
+
+def open_run(folder: Path, iteration: int | None = None) -> RunFolder:
+    """Look at a run folder.
+
+    Args:
+        folder: The folder that was the training's ``--model_path``.
+        iteration: Which one to read; the last without it.
+
+    Raises:
+        CheckpointError: It is none of the known layouts, or lacks the iteration.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        raise CheckpointError(f"{folder}: expected a run folder, found {found}")
+    if not (folder / "point_cloud").is_dir():
+        remedy = ""
+        for parent in folder.absolute().parents[:3]:
+            if (parent / "point_cloud").is_dir():
+                remedy = f"; name the run folder itself, {parent}"
+                break
+        raise CheckpointError(f"{folder}: expected a folder 'point_cloud', found none{remedy}; {_KNOWN}")
+    there = _iterations(folder / "point_cloud", "point_cloud.ply")
+    deforms = (folder / "deform").is_dir()
+    if deforms:
+        there &= _iterations(folder / "deform", "deform.pth")
+    wanted = "point_cloud/iteration_N/point_cloud.ply" + " and deform/iteration_N/deform.pth" * deforms
+    if not there:
+        raise CheckpointError(f"{folder}: expected {wanted} of one iteration N, found none; is the run complete?")
+    chosen = max(there) if iteration is None else iteration
+    if chosen not in there:
+        listed = ", ".join(map(str, sorted(there)))
+        raise CheckpointError(f"{folder}: expected {wanted} for N = {chosen}, found the iterations {listed}")
+    part = folder / ("deform" if deforms else "point_cloud") / f"iteration_{chosen}"
+    files = frozenset(path.name for path in part.glob("*.pth"))
+    known = {"deform.pth", "vel.pth", "code_field.pth"} if deforms else {"classifier.pth"}
+    if files - known:
+        raise CheckpointError(
+            f"{part}: unknown layout: nothing is known of {', '.join(sorted(files - known))}; {_KNOWN}"
+        )
+    return RunFolder(folder, chosen, read_config(folder / "cfg_args"), deforms, files)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read ``cfg_args``, the text ``Namespace(key=value, ...)``, without running it; empty where there is no file.
+
+    Values that are no literals (a device, a path object) are kept as their text.
+    """
+    if not path.exists():
+        return {}
+    try:
+        text = path.read_text(encoding="utf-8")
+        call = ast.parse(text.strip(), mode="eval").body
+    except (OSError, UnicodeDecodeError, SyntaxError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', cannot be read ({error})") from error
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+        raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', found {text.strip()[:40]!r}")
+    config: dict[str, Any] = {}
+    for keyword in call.keywords:
+        if keyword.arg is None:
+            continue
+        try:
+            config[keyword.arg] = ast.literal_eval(keyword.value)
+        except ValueError:
+            config[keyword.arg] = ast.unparse(keyword.value)
+    return config
+
+
+def _iterations(folder: Path, file: str) -> set[int]:
+    """Numbers of the folders ``iteration_N`` that hold a file."""
+    found = set()
+    for path in folder.glob("iteration_*"):
+        number = path.name.removeprefix("iteration_")
+        if number.isdecimal() and (path / file).is_file():
+            found.add(int(number))
+    return found

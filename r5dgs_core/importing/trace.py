@@ -1,0 +1,74 @@
+"""TRACE: a deformation network up to max_time, and a velocity network whose twists carry each Gaussian past it.
+
+The velocity network gives v, w and raw rates once, at the centre that a Gaussian has at max_time; a rate is raw times
+|raw| / 10. The velocity at p is v + a tau + (w + e tau) x p, p in the world. With codes (the variant `freegave` of
+TRACE) the network sees the time alone and gives that for every motion pattern, and a Gaussian takes shares of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import CheckpointError
+from ..motion import rotations
+from ..scene import ply
+from . import networks, weights
+from .foreign import TRACE_NEAR, Foreign, State, twisted_state
+from .run_folder import RunFolder
+
+TWIST = 12  # v, w and their rates
+
+
+def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
+    """Read the Gaussians and both networks.
+
+    Args:
+        run: The folder.
+        velocity: Of its ``vel.pth``.
+        t_max: Last time of the deformation.
+    """
+    splats = ply.read(run.ply)
+    field = None
+    if "code_field.pth" in run.files:
+        field = networks.read_code_field(weights.load(run.weights("code_field.pth")))
+    deform = networks.read_deform(weights.load(run.weights("deform.pth")), 0 if field is None else field.size)
+    network = networks.read_velocity(velocity)
+    inputs, outputs = (4, TWIST) if field is None else (1, TWIST * field.size)
+    if (network.inputs, network.outputs) != (inputs, outputs):
+        raise CheckpointError(
+            f"{velocity.path}: expected a network from {inputs} to {outputs} numbers, "
+            f"found {network.inputs} to {network.outputs}; unknown layout"
+        )
+
+    def codes(rows: slice) -> Tensor | None:
+        with torch.no_grad():
+            return None if field is None else field.codes(torch.from_numpy(splats.means[rows]))
+
+    def state(rows: slice, t: float) -> State:
+        return twisted_state(splats, deform, rows, t, codes(rows))
+
+    def dynamics(rows: slice, means: np.ndarray, t: float) -> np.ndarray:
+        with torch.no_grad():
+            if field is None:
+                points = torch.from_numpy(means.astype(np.float32))
+                twists = squash(network(torch.cat([points, torch.full_like(points[:, :1], t)], -1)))
+            else:
+                patterns = squash(network(torch.tensor([[t]])).reshape(-1, TWIST))
+                twists = field.pattern_shares(field.codes(torch.from_numpy(splats.means[rows]))) @ patterns
+        return about_centers(twists.double().numpy(), means)
+
+    return Foreign("trace", splats, TRACE_NEAR, state, dynamics, t_max)
+
+
+def squash(raw: Tensor) -> Tensor:
+    """Rates from raw ones; the first six numbers stay. [..., 12]"""
+    rates = raw[..., 6:]
+    return torch.cat([raw[..., :6], rates * rates.abs() / 10], -1)
+
+
+def about_centers(twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """World twists v, w and their rates a, e [n, 12], seen from centres [n, 3]: v and a become those of the centre."""
+    v, w, a, e = np.split(twists, 4, axis=-1)
+    return np.concatenate([v + rotations.cross(w, centers), w, a + rotations.cross(e, centers), e], -1)
