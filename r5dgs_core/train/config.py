@@ -153,6 +153,7 @@ class FieldSection:
         trd_steps: Steps that fit the TRD to the motion of the field, without images, at every ``trd_every``.
         trd_every: Steps between two such fits, as a share of the run; 0 for none.
         twist: Weight of the cross-Gaussian twist loss in these fits: one twist must carry its neighbours too.
+        stiffness: Weight of the squared distance of moved Gaussians from the best rigid motion of their group.
         chunk: Gaussians that pass the networks at once; bounds memory.
     """
 
@@ -168,6 +169,7 @@ class FieldSection:
     trd_steps: int = 200
     trd_every: float = 0.2
     twist: float = 1.0
+    stiffness: float = 1.0
     chunk: int = 65536
 
 

@@ -23,34 +23,16 @@ from ..model import deformation, spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import GroupPoses, Tracks
 from ..model.trd import SHAPES as TRD_SHAPES
-from ..model.trd import TRD, MotionState
-from ..motion import dynamics, rotations
+from ..model.trd import TRD
+from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import initialization, posing
+from . import field_fitting, initialization, posing
 from .config import Config
+from .field_motion import Clock, Motion
 
-PLAYBACK_STEP = 1 / 60  # scene time per step of the TRD where a picture is wanted
+QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
-
-
-@dataclass(frozen=True)
-class Clock:
-    """From scene time to the networks' time: (t - origin) / scale."""
-
-    origin: float
-    scale: float
-
-    @staticmethod
-    def of(times: np.ndarray) -> Clock:
-        """The clock of the observed times: the identity where they lie in [0, 1] and fill a quarter of it."""
-        first, last = float(times[0]), float(times[-1])
-        if first >= 0 and last <= 1 and last - first >= 0.25:
-            return Clock(0.0, 1.0)
-        return Clock(first, max(last - first, 1e-9))
-
-    def __call__(self, t: float) -> float:
-        return (t - self.origin) / self.scale
 
 
 @dataclass(frozen=True)
@@ -70,62 +52,6 @@ class Moved:
     offsets: Tensor
     quats: Tensor
     log_scales: Tensor
-
-
-class Motion:
-    """Field and TRD with the clock that they share.
-
-    Args:
-        field: The deformation field.
-        trd: The TRD network.
-        clock: From scene time to theirs.
-        horizon: Scene time T.
-        step: Scene time h that the TRD bridges in training.
-        chunk: Gaussians that pass the networks at once.
-    """
-
-    def __init__(
-        self, field: deformation.DeformationField, trd: TRD, clock: Clock, horizon: float, step: float, chunk: int
-    ):
-        self.field = field
-        self.trd = trd
-        self.clock = clock
-        self.horizon = horizon
-        self.step = step
-        self.chunk = chunk
-
-    def deltas(self, means: Tensor, t: float) -> deformation.Deltas:
-        """The field at a scene time, held past the horizon."""
-        return self.field(means, self.clock(min(t, self.horizon)), self.chunk)
-
-    def state(self, positions: Tensor, t: float) -> MotionState:
-        """The TRD's answer for Gaussians that are somewhere at a scene time, per unit of network time."""
-        return self.trd(positions, self.clock(t), self.chunk)
-
-    def carry(self, positions: Tensor, state: MotionState, duration: float, step: float) -> tuple[Tensor, Tensor]:
-        """Positions and rotations after a signed scene time, by TRACE's integrator. [R, 3], [R, 4]"""
-        return dynamics.rk2(
-            positions,
-            state.equiv_velocity,
-            state.angular_velocity,
-            state.equiv_acceleration,
-            state.angular_acceleration,
-            duration / self.clock.scale,
-            step / self.clock.scale,
-        )
-
-    def at(self, means: Tensor, t: float) -> deformation.Deltas:
-        """Where Gaussians are at any time: by the field up to T, by the TRD from there on."""
-        deltas = self.deltas(means, t)
-        return deltas if t <= self.horizon else self.through(means, self.horizon, t, PLAYBACK_STEP)
-
-    def through(self, means: Tensor, start: float, t: float, step: float) -> deformation.Deltas:
-        """By the field to ``start``, by the TRD from there to ``t``. The TRD's start has no gradient."""
-        deltas = self.deltas(means, start)
-        begin = (means + deltas.offsets).detach()
-        end, turns = self.carry(begin, self.state(begin, start), t - start, step)
-        quats = rotations.multiply(turns, deltas.quats)
-        return deformation.Deltas(deltas.offsets + (end - begin), quats, deltas.log_scales)
 
 
 class FieldRepresentation:
@@ -158,6 +84,12 @@ class FieldRepresentation:
         self._tracks = start.tracks
         self._last: Moved | None = None
         bring_together(start.gaussians, start.tracks, start.first_time)
+        rows = self.movers(start.gaussians)
+        means, groups = start.gaussians.means.detach()[rows], start.gaussians.motion_ids[rows]
+        if start.tracks.bodies > 1:
+            steps = section.place_steps
+            field_fitting.fit_field(self.motion, means, groups, start.tracks, start.first_time, steps, generator)
+            field_fitting.fit_trd(self.motion, means, groups, min(section.trd_steps, steps), section.twist, generator)
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -220,14 +152,24 @@ class FieldRepresentation:
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
-        """Nothing yet."""
-        return None
+        """Distance of the moved Gaussians from the best rigid motion of their group."""
+        moved, weight = self._last, self._config.field.stiffness
+        self._last = None
+        if moved is None or weight <= 0 or self._tracks.bodies < 2:
+            return None
+        return weight * stiffness(moved, gaussians.motion_ids[moved.rows])
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
         """A field reaches all times already."""
 
-    def after_step(self, iteration: int) -> None:
-        """Nothing to keep up."""
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
+        """Fit the TRD to the motion that the field has by now."""
+        section = self._config.field
+        every = round(section.trd_every * self._config.train.iterations)
+        if section.trd_steps > 0 and every > 0 and iteration % every == 0:
+            rows = self.movers(gaussians)
+            means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+            field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
 
     def tensors(self) -> dict[str, Tensor]:
         """Weights by ``field.NAME`` and ``trd.NAME``, and the times."""
@@ -243,6 +185,51 @@ class FieldRepresentation:
 def _pinned() -> GroupPoses:
     """The pose of one group that rests."""
     return GroupPoses(torch.tensor([[1.0, 0, 0, 0]]), torch.eye(3)[None], torch.zeros(1, 3))
+
+
+def stiffness(moved: Moved, groups: Tensor) -> Tensor:
+    """Mean squared distance from the best rigid motion of each group, and difference from its rotation.
+
+    Args:
+        moved: The moved Gaussians; those of group 0 do not count.
+        groups: Their motion groups. [R]
+    """
+    after = moved.before + moved.offsets
+    with torch.no_grad():
+        turn, shift, known = rigid_fits(moved.before, after, groups)
+        goal = rotations.rotate(turn[groups], moved.before) + shift[groups]
+        counted = (groups > 0) & known[groups]
+        sign = torch.where((moved.quats * turn[groups]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    off = (after - goal).square().sum(-1) + QUAT_WEIGHT * (moved.quats - sign * turn[groups]).square().sum(-1)
+    off = off + moved.log_scales.square().sum(-1) * QUAT_WEIGHT
+    return torch.where(counted, off, 0.0).sum() / counted.sum().clamp(min=1)
+
+
+def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Least-squares rigid motion of each group of points (Kabsch).
+
+    Args:
+        before: Points. [R, 3]
+        after: Where they went. [R, 3]
+        groups: Group of each. [R]
+
+    Returns:
+        Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and whether a group has points enough. [G]
+    """
+    count = int(groups.max()) + 1 if len(groups) else 0
+    n = torch.bincount(groups, minlength=count).to(before.dtype)
+
+    def mean(x: Tensor) -> Tensor:
+        return torch.zeros(count, 3, dtype=x.dtype).index_add(0, groups, x) / n.clamp(min=1)[:, None]
+
+    a, b = mean(before), mean(after)
+    outer = (after - b[groups])[:, :, None] * (before - a[groups])[:, None, :]
+    spread = torch.zeros(count, 3, 3, dtype=before.dtype).index_add(0, groups, outer)
+    u, _, vt = torch.linalg.svd(spread)
+    flip = torch.ones(count, 3, dtype=before.dtype)
+    flip[:, 2] = torch.sign(torch.linalg.det(u @ vt))
+    quats = rotations.rotmats_to_quats(u @ (flip[:, :, None] * vt))
+    return quats, b - rotations.rotate(quats, a), n >= 4
 
 
 def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int) -> None:

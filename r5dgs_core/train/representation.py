@@ -59,8 +59,8 @@ class Representation(Protocol):
         """An observed time joins the training: ``knot`` from its neighbours in direction ``towards`` (+1 or -1)."""
         ...
 
-    def after_step(self, iteration: int) -> None:
-        """Upkeep after ``iteration`` steps."""
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
+        """Upkeep after ``iteration`` steps; ``draw`` is the training's source of draws."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:

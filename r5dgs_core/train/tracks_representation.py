@@ -106,7 +106,7 @@ class TracksRepresentation:
             elif steady:
                 shifts[row, knot] = 2 * shifts[row, near] - shifts[row, next_near]
 
-    def after_step(self, iteration: int) -> None:
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Fold learned rotations into the base."""
         if iteration % REBASE_EVERY == 0:
             self.tracks.rebase()

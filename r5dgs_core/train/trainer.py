@@ -266,7 +266,7 @@ class Trainer:
             rest.grad[:, (self.iteration // every + 1) ** 2 - 1 :] = 0.0
 
     def _maintain(self) -> None:
-        self.motion.after_step(self.iteration)
+        self.motion.after_step(self.gaussians, self.iteration, self.generator)
         self.growth.after_step(self.gaussians, self.optimizer, self.iteration, self._rate("means"))
         if len(self.gaussians) == 0:
             raise TrainingError(
