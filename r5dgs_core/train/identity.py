@@ -145,8 +145,8 @@ class JointIdentity:
         generator: Source of all draws; nobody else's.
 
     Attributes:
-        params: What the optimizer moves beside the encodings: ``classifier_weight`` [C, 16], ``classifier_bias`` [C].
-        rates: Learning rate of each of these and of the encodings, constant over the run.
+        params: What the optimizer moves beside the encodings: ``classifier.weight`` [C, 16], ``classifier.bias`` [C].
+        rates: Learning rates of ``identities`` and ``classifier``, constant over the run.
         with_geometry: Whether the trainer draws the encodings beside the colours.
     """
 
@@ -168,14 +168,13 @@ class JointIdentity:
             weight, bias = _distinct_classes(count, generator)
         self.params: dict[str, Tensor] = {}
         self._set_classifier(weight, bias)
-        rates = (self._section.rate, self._section.classifier_rate, self._section.classifier_rate)
-        self.rates = dict(zip(("identities", "classifier_weight", "classifier_bias"), rates, strict=True))
+        self.rates = {"identities": self._section.rate, "classifier": self._section.classifier_rate}
         self._neighbourhood: identity_losses.Neighbourhood | None = None
         self._found_at = 0
         self._found_for: Tensor | None = None  # the parameter `means` then; a new one has other rows
 
     def _set_classifier(self, weight: Tensor, bias: Tensor) -> None:
-        named = {"classifier_weight": weight, "classifier_bias": bias}
+        named = {"classifier.weight": weight, "classifier.bias": bias}
         self.params = {n: t.detach().clone().contiguous().requires_grad_(True) for n, t in named.items()}
 
     def begin(self, gaussians: Gaussians) -> None:
@@ -188,7 +187,7 @@ class JointIdentity:
             draws = torch.rand(len(gaussians), IDENTITY_DIM, generator=self._generator)
             encodings = spherical_harmonics.rgb_to_dc(draws)
         else:
-            weight = self.params["classifier_weight"].detach()
+            weight = self.params["classifier.weight"].detach()
             ids = gaussians.motion_ids
             encodings = weight[torch.where(ids < len(weight), ids, 0)].clone()
         gaussians.add("identities", encodings)
@@ -224,7 +223,7 @@ class JointIdentity:
                 features = _rasterize(splats, gaussians.identities, view)
             if features is not None:
                 target = class_map(view, self._classes)
-                weight, bias = self.params["classifier_weight"], self.params["classifier_bias"]
+                weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
                 terms.append(section.weight * identity_losses.pixel_cross_entropy(features, weight, bias, target))
         if iteration % section.regularise_every == 0 and max(section.spatial, self._majority) > 0:
             terms.append(self._regularisation(gaussians, iteration))
@@ -237,7 +236,7 @@ class JointIdentity:
         both = torch.cat([rows[:, None], found], dim=1)
         # index_select sums its gradients in the same order on any number of threads; indexing does not.
         encodings = gaussians.identities.index_select(0, both.reshape(-1))
-        answers = encodings @ self.params["classifier_weight"].T + self.params["classifier_bias"]
+        answers = encodings @ self.params["classifier.weight"].T + self.params["classifier.bias"]
         probabilities = answers.softmax(dim=1).reshape(*both.shape, -1)
         queries, neighbours = probabilities[:, 0], probabilities[:, 1:]
         total = queries.new_zeros(())
@@ -259,14 +258,14 @@ class JointIdentity:
     @torch.no_grad()
     def labels(self, gaussians: Gaussians) -> Tensor:
         """Class of each Gaussian: the classifier's answer to its encoding. [N] int64"""
-        return (gaussians.identities @ self.params["classifier_weight"].T + self.params["classifier_bias"]).argmax(1)
+        return (gaussians.identities @ self.params["classifier.weight"].T + self.params["classifier.bias"]).argmax(1)
 
     def outcome(self, gaussians: Gaussians) -> dict[str, Tensor]:
         """What a finished run hands to baking, by the names of the checkpoint."""
         named = {
             "identities": gaussians.identities,
-            "classifier.weight": self.params["classifier_weight"],
-            "classifier.bias": self.params["classifier_bias"],
+            "classifier.weight": self.params["classifier.weight"],
+            "classifier.bias": self.params["classifier.bias"],
         }
         return {name: tensor.detach().clone() for name, tensor in named.items()}
 
@@ -281,7 +280,7 @@ class JointIdentity:
 
     def restore(self, tensors: dict[str, Tensor], gaussians: Gaussians) -> None:
         """Go on from `tensors`, with the Gaussians of the same state; before the optimizer is made."""
-        self._set_classifier(tensors["identity.classifier_weight"], tensors["identity.classifier_bias"])
+        self._set_classifier(tensors["identity.classifier.weight"], tensors["identity.classifier.bias"])
         self._generator.set_state(tensors["identity.generator"])
         self._neighbourhood, self._found_for = None, None
         if "identity.points" in tensors:

@@ -115,7 +115,8 @@ def make_joint(view, gaussians, training, **changes):
 
 def adam(identities, gaussians):
     named = {"identities": gaussians.identities, **identities.params}
-    return torch.optim.Adam([{"params": [p], "lr": identities.rates[n], "name": n} for n, p in named.items()])
+    rates = {n: identities.rates[n.partition(".")[0]] for n in named}
+    return torch.optim.Adam([{"params": [p], "lr": rates[n], "name": n} for n, p in named.items()])
 
 
 def optimise(identities, gaussians, view, steps, first=0, optimizer=None):
@@ -145,7 +146,7 @@ def accuracy(identities, gaussians, view):
     """Share of pixels whose class is the mask's."""
     with torch.no_grad():
         image = blended(identities, gaussians, posed(gaussians), view)
-        answers = (image @ identities.params["classifier_weight"].T + identities.params["classifier_bias"]).argmax(-1)
+        answers = (image @ identities.params["classifier.weight"].T + identities.params["classifier.bias"]).argmax(-1)
     return float((answers == identity.class_map(view, CLASSES)).float().mean())
 
 
