@@ -30,33 +30,32 @@ def measure(scene: Scene, views: Sequence[View], mode: str, *, backend: str = "a
         backend: Rasterizer.
 
     Returns:
-        ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,
-        ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th percentile), ``frames``; all but the last None without
-        views.
+        ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``, ``ms_cpu``
+        (processor time of a frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
+        percentile), ``frames``; all but the last None without views.
     """
-    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_frame_low", "ms_frame_high")
+    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_cpu", "ms_frame_low", "ms_frame_high")
     if not views:
         return {**dict.fromkeys(names), "frames": 0}
     ordered = sorted(views, key=lambda view: (view.camera.name, view.t))
     for view in ordered:
         _draw(scene, view, mode, backend)
-    times: list[tuple[float, float]] = []
+    times: list[tuple[float, float, float]] = []
     began = time.monotonic()
     while len(times) < LEAST_FRAMES and (not times or time.monotonic() - began < PATIENCE_S):
         times += [_draw(scene, view, mode, backend) for view in ordered]
-    motion, raster = np.array(times).T
-    frame = motion + raster
-    low, high = np.percentile(frame, (10, 90))
-    middle = float(np.median(frame))
-    values = (1e3 / middle, middle, float(np.median(motion)), float(np.median(raster)), float(low), float(high))
-    return {**dict(zip(names, values, strict=True)), "frames": len(times)}
+    motion, raster, cpu = np.array(times).T
+    low, middle, high = np.percentile(motion + raster, (10, 50, 90))
+    medians = (np.median(motion), np.median(raster), np.median(cpu))
+    values = (1e3 / middle, middle, *medians, low, high)
+    return {**dict(zip(names, map(float, values), strict=True)), "frames": len(times)}
 
 
-def _draw(scene: Scene, view: View, mode: str, backend: str) -> tuple[float, float]:
-    """Milliseconds of motion and rasterization of one frame."""
-    start = time.perf_counter()
+def _draw(scene: Scene, view: View, mode: str, backend: str) -> tuple[float, float, float]:
+    """Milliseconds of motion, of rasterization, and of processor time of one frame."""
+    cpu, start = time.process_time(), time.perf_counter()
     frame = playback.frame(scene, view.t, mode)
     moved = time.perf_counter()
     output = scene_render.render_frame(scene, frame, view.camera, backend=backend)
     scene_render.to_numpy(output.color, np.float32)  # waits for a GPU, too
-    return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved)
+    return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)

@@ -41,6 +41,7 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
         ("test", "playback", "a frame, ms", "past t_max (test)"),
     )
     for axes, (split, work, label, title) in zip(figure.subplots(1, 3), panes, strict=True):
+        right = 0.0
         for record in records:
             psnr = record["splits"][split]["psnr"]
             ms = bench_tables.training_ms(record) if work == "training" else record["playback"]["ms_frame"]
@@ -48,9 +49,13 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
                 continue
             kind = kinds.index((bench_tables.method(record), record["mode"]))
             marker = _MARKERS[scenes.index(record["scene"]) % len(_MARKERS)]
-            axes.plot(ms / 1e3 if work == "training" else ms, psnr, marker, color=f"C{kind % 10}", alpha=0.8)
-        axes.set(xlabel=label, ylabel="PSNR, dB", title=title)
-        axes.set_xlim(left=0)
+            x = ms / 1e3 if work == "training" else ms
+            axes.plot(x, psnr, marker, color=f"C{kind % 10}", alpha=0.8)
+            right = max(right, x)
+        low, high = axes.get_ylim()
+        axes.set(
+            xlabel=label, ylabel="PSNR, dB", title=title, xlim=(0, 1.08 * right or 1), ylim=(low - 0.5, high + 0.5)
+        )
         axes.grid(alpha=0.3)
     handles = [
         Line2D([], [], linestyle="", marker="o", color=f"C{i % 10}", label=f"{name}, {mode}")

@@ -27,6 +27,7 @@ _QUALITY = (("PSNR", "psnr", "{:.2f}"), ("SSIM", "ssim", "{:.4f}"), ("LPIPS", "l
 _QUALITY = (*_QUALITY, ("FLIP", "flip", "{:.4f}"))
 _COST = (("CPU s", "cpu_seconds", "{:.0f}"), ("wall s", "wall_seconds", "{:.0f}"), ("MB", "peak_mb", "{:.0f}"))
 _PLAYED = (("FPS", "fps", "{:.1f}"), ("motion ms", "ms_motion", "{:.2f}"), ("raster ms", "ms_raster", "{:.2f}"))
+_PLAYED = (*_PLAYED, ("CPU ms", "ms_cpu", "{:.2f}"))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
 """A benchmark trains what is not trained, measures what is not measured, and goes on over what fails."""
 
 import contextlib
+import dataclasses
 import json
+import shutil
 import signal
 
 import numpy as np
@@ -13,7 +15,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import bake, checkpoint
 from tests import datasets as tiny_datasets
 
 OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
@@ -102,6 +104,27 @@ def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     (one,), (other,) = again["results"], result["results"]
     assert one["train"] == other["train"]
     assert all(one["splits"][split]["psnr"] == other["splits"][split]["psnr"] for split in ("val", "test"))
+
+
+def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path, monkeypatch):
+    plan, _, _, _ = made
+    shutil.copytree(plan.out, tmp_path / "out")
+    plan = plan_for(tiny, tmp_path / "out", modes=("rigid",))
+    plain, before = bake.bake, benchmark.run_bench(plan, remeasure=True, progress_kind="none")["results"]
+
+    def with_dynamics(run, dataset):
+        scene = plain(run, dataset)
+        still = np.zeros((len(scene.means), 12), np.float32)
+        return dataclasses.replace(scene, dynamics=still, canonical_means=scene.means)
+
+    monkeypatch.setattr(bake, "bake", with_dynamics)
+    result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
+    assert [record["mode"] for record in result] == list(playback.MODES)
+    assert result[0] == before[0], "what was measured before stays"
+    # Motion past t_max stops in the modes that read the dynamics, which are none; up to t_max all modes are the same.
+    rigid, standard, literal = (record["splits"] for record in result)
+    assert standard["val"]["psnr"] == literal["val"]["psnr"] == pytest.approx(rigid["val"]["psnr"])
+    assert standard["test"]["psnr"] == literal["test"]["psnr"] != pytest.approx(rigid["test"]["psnr"])
 
 
 def test_a_case_that_fails_is_reported_and_the_others_go_on(made, tiny, capsys):

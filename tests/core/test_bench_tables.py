@@ -32,7 +32,14 @@ def record(scene="room", variant="tracks", mode="rigid", seed=0, psnr=30.0, cpu=
         "iterations": 20,
         "train": {"cpu_seconds": cpu, "wall_seconds": 40.0, "peak_mb": 600.0, "peak_gpu_mb": None},
         "splits": {"test": metrics, "val": {**metrics, "psnr": psnr + 3}},
-        "playback": {"fps": 1e3 / ms, "ms_frame": ms, "ms_motion": 1.0, "ms_raster": ms - 1, "frames": 60},
+        "playback": {
+            "fps": 1e3 / ms,
+            "ms_frame": ms,
+            "ms_motion": 1.0,
+            "ms_raster": ms - 1,
+            "ms_cpu": ms,
+            "frames": 60,
+        },
     }
 
 
