@@ -92,7 +92,10 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: expected uint8, uint16 or floats, got {pixels.dtype}")
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: cannot write the image: its folder cannot be made ({error})") from error
     height, width, channels = pixels.shape
     kind = oiio.UINT8 if pixels.dtype == np.uint8 else oiio.UINT16
     spec = oiio.ImageSpec(width, height, channels, kind)
@@ -101,15 +104,15 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.png")
     try:
         target = oiio.ImageOutput.create(str(temporary))
-        if (
-            target is None
-            or not target.open(str(temporary), spec)
-            or not target.write_image(np.ascontiguousarray(pixels))
-        ):
-            problem = oiio.geterror() if target is None else target.geterror()
-            raise errors.DatasetError(f"{path}: cannot write the image ({problem})")
-        target.close()
+        good = target is not None and target.open(str(temporary), spec)
+        good = good and target.write_image(np.ascontiguousarray(pixels))
+        problem = oiio.geterror() if target is None else target.geterror()  # a full disk is told here alone
+        if not good or problem or not target.close():
+            problem = " ".join(problem.split()) or "no reason given"
+            raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
         os.replace(temporary, path)
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: cannot write the image ({error})") from error
     finally:
         temporary.unlink(missing_ok=True)
 

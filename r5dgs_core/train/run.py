@@ -84,12 +84,14 @@ def train(
     state, replaces = None, False
     if resume:
         run = checkpoint.open_run(folder)
+        state = checkpoint.load(folder) if (folder / checkpoint.CHECKPOINT_FILE).exists() else None
+        if run.digest != dataset.digest and state is None:  # nothing of the other data is in it
+            run = checkpoint.create_run(folder, dataset, run.config)
         if run.digest != dataset.digest:
             raise CheckpointError(
                 f"{folder}: was trained on other data than {dataset_root} now holds; "
                 "restore the data set or train into another folder"
             )
-        state = checkpoint.load(folder) if (folder / checkpoint.CHECKPOINT_FILE).exists() else None
     else:
         replaces = (folder / checkpoint.CHECKPOINT_FILE).exists()
         run = (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config)

@@ -9,7 +9,6 @@ import torch
 
 from ..model.gaussians import Gaussians
 
-
 WIDEST = 0.25  # normalised units; wider ones would soon be pruned
 
 

@@ -1,5 +1,8 @@
 """Image files: what is written is read, and what cannot be read says so."""
 
+import subprocess
+import sys
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -101,3 +104,27 @@ def test_writing_leaves_no_temporary_file_and_replaces_the_old_one(tmp_path):
 def test_arrays_that_are_no_picture_are_refused(tmp_path, pixels):
     with pytest.raises(ValueError, match="expected"):
         images.write_png(tmp_path / "a.png", pixels)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of files")
+def test_a_full_disk_is_an_error_and_leaves_the_old_image(tmp_path):
+    path = tmp_path / "picture.png"
+    old = np.zeros((4, 4, 3), np.uint8)
+    images.write_png(path, old)
+    code = (
+        "import resource, sys; import numpy as np; from pathlib import Path\n"
+        "from r5dgs_core import errors; from r5dgs_core.data import images\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.RLIM_INFINITY))\n"
+        "noise = np.random.default_rng(0).integers(0, 255, (100, 100, 3)).astype(np.uint8)\n"
+        "try: images.write_png(Path(sys.argv[1]), noise)\n"
+        "except errors.DatasetError as error: print(error)"
+    )
+    shown = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
+    assert f"{path}: cannot write the image" in shown and "room" in shown
+    assert (images.read_raw(path) == old).all() and [p.name for p in tmp_path.iterdir()] == ["picture.png"]
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(errors.DatasetError, match="x.png: cannot write the image"):
+        images.write_png(tmp_path / "file" / "x.png", np.zeros((2, 2), np.uint8))
