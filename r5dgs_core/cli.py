@@ -1,4 +1,4 @@
-"""The ``r5dgs`` command: demo, train, bake, evaluate, info, warm-up.
+"""The ``r5dgs`` command: demo, train, bake, import, evaluate, info, warm-up.
 
 Each sub-command is a function ``run_<name>`` that does the work and can be called without the command line.
 """
@@ -12,9 +12,12 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import __version__, errors
+
+if TYPE_CHECKING:
+    from .scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -43,11 +46,44 @@ def run_bake(run_folder: Path, out: Path, data: Path | None, overrides: Sequence
     """Turn a run into a scene file (see `train.bake.run_bake`)."""
     from .train import bake
 
+    _check_scene_name(out)
+    _tell_scene(bake.run_bake(run_folder, out, data, overrides), out)
+
+
+def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **options: Any) -> None:
+    """Turn a run folder that another program trained into a scene file (see `importing.importer.import_run`).
+
+    Args:
+        run_folder: The folder.
+        out: The scene file to write.
+        progress_kind: How progress is shown (`progress.make`).
+        **options: The fields of `importing.importer.Options`.
+    """
+    from .importing import importer
+    from .progress import make
+    from .scene import scene_file
+
+    _check_scene_name(out)
+    chosen = importer.Options(**{name: value for name, value in options.items() if value is not None})
+    with make(progress_kind) as progress:
+        scene = importer.import_run(
+            run_folder, chosen, lambda done, total: progress({"event": "import", "done": done, "total": total})
+        )
+        scene_file.write(scene, out)
+        if progress_kind == "json":
+            progress({"event": "imported", "path": str(out), "gaussians": len(scene.means)})
+    if progress_kind != "json":
+        _tell_scene(scene, out)
+
+
+def _check_scene_name(out: Path) -> None:
     if out.is_dir():
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
     if out.suffix.lower() != ".r5dgs":
         raise errors.SceneFileError(f"{out}: expected a name that ends in .r5dgs, which is what Blender looks for")
-    scene = bake.run_bake(run_folder, out, data, overrides)
+
+
+def _tell_scene(scene: Scene, out: Path) -> None:
     count = sum(o.id > 0 for o in scene.objects)
     objects = "1 object" if count == 1 else f"{count} objects"
     print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
@@ -216,6 +252,19 @@ def parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="needs.NAME=on|off", help="override a need; may be repeated"
     )
 
+    foreign = commands.add_parser("import", help="turn a run folder of 3DGS and its kin into a scene file")
+    foreign.add_argument(
+        "run", type=Path, help="run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE, FreeGave"
+    )
+    foreign.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
+    foreign.add_argument("--iteration", type=int, metavar="N", help="iteration to read (default: the last)")
+    foreign.add_argument("--data", type=Path, metavar="DIR", help="data set of the run: its cameras, times and axes")
+    foreign.add_argument("--knots", type=int, metavar="N", help="times to sample motion at (default: the data set's)")
+    foreign.add_argument("--t-max", type=float, metavar="T", help="last observed time (default: the run's)")
+    foreign.add_argument("--world", metavar="NAME", help="axes of the world: blender, colmap or opengl")
+    foreign.add_argument("--still", type=float, metavar="SHARE", help="motion below this share of the extent is none")
+    add_progress(foreign)
+
     evaluate = commands.add_parser("evaluate", help="measure a run or scene on held-out views")
     evaluate.add_argument("target", type=Path, help="run folder or .r5dgs file")
     evaluate.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
@@ -281,6 +330,10 @@ def _dispatch(args: argparse.Namespace) -> None:
             run_demo(args.out, **options)
     elif args.command == "bake":
         run_bake(args.run, args.out, args.data, overrides)
+    elif args.command == "import":
+        names = ("iteration", "data", "knots", "t_max", "world", "still")
+        options = {name: getattr(args, name) for name in names}
+        run_import(args.run, args.out, progress_kind=args.progress, **options)
     elif args.command == "evaluate":
         run_evaluate(
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress

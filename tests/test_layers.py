@@ -34,7 +34,7 @@ ALLOWED = {
     "bench": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
     "cli": {
         *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress", "demo"),
-        "bench",
+        *("bench", "importing"),
     },
 }
 LIGHT = {"errors", "motion", "scene"}

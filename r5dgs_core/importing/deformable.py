@@ -17,6 +17,7 @@ from .foreign import SPLATTING_NEAR, Foreign, State
 from .run_folder import RunFolder
 
 _SMALLEST = 1e-12  # standard deviation that a Gaussian keeps where exp(s) + ds vanishes, world units
+_ROUNDING = 1e-14  # of the sum of variances: what float64 leaves off the diagonal of spheres and discs
 _SWEEPS = 8  # Jacobi converges quadratically: far more than float64 needs for 3 x 3
 
 
@@ -70,7 +71,7 @@ def _turn_of(quats: np.ndarray) -> np.ndarray:
 def _rotate_pair(covariance: np.ndarray, axes: np.ndarray, p: int, q: int) -> tuple[np.ndarray, np.ndarray]:
     """One Jacobi rotation by at most 45 degrees that makes element (p, q) zero. [n, 3, 3] each"""
     off = covariance[:, p, q]
-    wanted = off != 0
+    wanted = np.abs(off) > _ROUNDING * np.trace(covariance, axis1=-2, axis2=-1)
     with np.errstate(over="ignore"):  # an infinite ratio gives no rotation
         ratio = np.divide(covariance[:, q, q] - covariance[:, p, p], 2 * off, out=np.zeros_like(off), where=wanted)
         tangent = np.where(wanted, np.copysign(1, ratio) / (np.abs(ratio) + np.sqrt(1 + ratio * ratio)), 0)
