@@ -12,6 +12,7 @@ import colorsys
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, needs, representation
+from . import checkpoint, groups, needs, point_baking, representation
 from .normalization import Normalization
 
 MIN_BIND_FACTOR = 0.1
@@ -49,20 +50,26 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     if not all(np.isfinite(a).all() for a in g.values()):
         raise CheckpointError(f"{run.folder}: the checkpoint holds values that are not finite; train again")
     present = tensors["object_ids"].numpy()
-    motion = representation.observed_motion(state.representation, tensors, present, state.observed.numpy())
+    labels = tensors["labels"].numpy() if "labels" in tensors else None  # an unfinished run has none yet
+    if labels is None:
+        labels = representation.group_classes(state.representation, tensors)[g["motion_ids"]]
+    motion = representation.observed_motion(
+        state.representation, tensors, present, state.observed.numpy(), labels, run.config
+    )
+    g |= motion.gaussians or {}
+    if motion.motion_ids is not None:
+        g["motion_ids"] = motion.motion_ids
     light, strength = _unit(motion.light)
     wanted = run.config.needs
     identities = tensors["identities"].numpy() if "identities" in tensors else None
-    labels = tensors["labels"].numpy() if "labels" in tensors else None  # an unfinished run has none yet
-    groups = motion.groups
+    groups, points = motion.groups, motion.points
     if wanted.shadows == "off":
         groups = tuple(group for group in groups if group.role != "shadow")
         kept = g["motion_ids"] < len(groups)  # shadows are the last groups
         g = {n: a[kept] for n, a in g.items()}
-        identities, labels = (None if a is None else a[kept] for a in (identities, labels))
+        identities, labels = None if identities is None else identities[kept], labels[kept]
+        points = None if points is None else points.keep(kept)
     motion_ids = g["motion_ids"].astype(np.int32)
-    if labels is None:
-        labels = representation.group_classes(groups, present)[motion_ids]
     object_ids = present[labels].astype(np.int32)
     log_scales = g["log_scales"] + np.log(norm.scale)
     means = norm.points_to_world(g["means"])
@@ -102,6 +109,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     )
     keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
     classified = identities is not None and needs.is_on(decisions, "classifier")
+    single: dict[str, Any] = {}
+    if points is not None:
+        pivots = np.stack([row.pivot for row in rows])
+        extent = float(np.ptp(np.quantile(means, [0.01, 0.99], axis=0), axis=0).max())
+        single = point_baking.members(points, norm, motion_ids, np.stack(track_poses), pivots, order, extent)
     rank = np.argsort(order)
     rows = [
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
@@ -143,6 +155,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         },
         needs=decisions,
         near_plane=NEAR_PLANE * norm.scale,
+        **single,
     )
 
 

@@ -27,9 +27,10 @@ from ..model.trd import TRD
 from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import field_fitting, initialization, posing
+from . import field_baking, field_fitting, initialization, posing
 from .config import Config
 from .field_motion import Clock, Motion
+from .groups import ObservedMotion
 
 QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
@@ -65,43 +66,22 @@ class FieldRepresentation:
     name = "field"
 
     def __init__(self, start: initialization.Start, config: Config):
-        section = config.field
-        times = start.tracks.times
-        last = float(times[-1])
-        spacing = float(np.median(np.diff(times))) if len(times) > 1 else last or 1.0
-        horizon = section.horizon or float(times[0]) + HORIZON * (last - float(times[0]))
-        generator = torch.Generator().manual_seed(config.train.seed)
-        self.motion = Motion(
-            deformation.DeformationField(deformation.SHAPES[section.size], generator),
-            TRD(TRD_SHAPES[section.size], generator),
-            Clock.of(times),
-            min(horizon, last),
-            section.step or 2 * spacing,
-            section.chunk,
-        )
-        self.times = times
+        self.times = start.tracks.times
+        self.motion = _motion_of(self.times, config)
         self._config = config
         self._tracks = start.tracks
         self._last: Moved | None = None
+        self._first = start.first_time
         bring_together(start.gaussians, start.tracks, start.first_time)
-        rows = self.movers(start.gaussians)
-        means, groups = start.gaussians.means.detach()[rows], start.gaussians.motion_ids[rows]
-        if start.tracks.bodies > 1:
-            steps = section.place_steps
-            field_fitting.fit_field(self.motion, means, groups, start.tracks, start.first_time, steps, generator)
-            field_fitting.fit_trd(self.motion, means, groups, min(section.trd_steps, steps), section.twist, generator)
 
     @property
     def params(self) -> dict[str, Tensor]:
         """Weights of both networks."""
-        named = {f"field.{n}": p for n, p in self.motion.field.named_parameters()}
-        return named | {f"trd.{n}": p for n, p in self.motion.trd.named_parameters()}
+        return _parameters(self.motion)
 
     def movers(self, gaussians: Gaussians) -> Tensor:
         """Rows that the networks move. [R] int64"""
-        if self._config.field.movers == "all" or self._tracks.bodies < 2:
-            return torch.arange(len(gaussians))
-        return (gaussians.motion_ids > 0).nonzero()[:, 0]
+        return _movers(gaussians.motion_ids, self._tracks.bodies, self._config)
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -133,6 +113,16 @@ class FieldRepresentation:
             _pinned(),
             torch.zeros(1, 3),
         )
+
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """Fit field and TRD to the places of the objects, before the first image is looked at."""
+        section = self._config.field
+        if self._tracks.bodies < 2 or section.place_steps == 0:
+            return
+        rows = self.movers(gaussians)
+        means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+        field_fitting.fit_field(self.motion, means, groups, self._tracks, self._first, section.place_steps, draw)
+        field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
 
     def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> Moved:
         """Where the movers are at a time: in training by a drawn path through field and TRD, else by the rule."""
@@ -173,18 +163,80 @@ class FieldRepresentation:
 
     def tensors(self) -> dict[str, Tensor]:
         """Weights by ``field.NAME`` and ``trd.NAME``, and the times."""
-        return {n: p.detach() for n, p in self.params.items()} | {"field.times": torch.from_numpy(self.times)}
+        named = {n: p.detach() for n, p in self.params.items()}
+        tracks = self._tracks
+        named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
+        return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
-        with torch.no_grad():
-            for name, parameter in self.params.items():
-                parameter.copy_(tensors[name])
+        _load(self.motion, tensors)
 
 
 def _pinned() -> GroupPoses:
     """The pose of one group that rests."""
     return GroupPoses(torch.tensor([[1.0, 0, 0, 0]]), torch.eye(3)[None], torch.zeros(1, 3))
+
+    @staticmethod
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
+        shadows = len(tensors["field.casters"])
+        return np.concatenate([np.arange(int(tensors["field.bodies"])), np.zeros(shadows, np.int64)])
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
+        """See `Representation.observed_motion`: groups are the classes and the shadows."""
+        motion = _motion_of(tensors["field.times"].numpy(), config)
+        _load(motion, tensors)
+        gaussians = {n.removeprefix("gaussians."): p for n, p in tensors.items() if n.startswith("gaussians.")}
+        return field_baking.observed_motion(
+            motion,
+            gaussians,
+            _movers(gaussians["motion_ids"], int(tensors["field.bodies"]), config),
+            labels,
+            object_ids,
+            observed,
+            tensors["field.times"].numpy(),
+            tensors["field.casters"].tolist(),
+            tensors["field.plane_normal"].numpy().astype(np.float64),
+        )
+
+
+def _motion_of(times: np.ndarray, config: Config) -> Motion:
+    """Networks as they start, on the clock of the observed times."""
+    section = config.field
+    first, last = float(times[0]), float(times[-1])
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    generator = torch.Generator().manual_seed(config.train.seed)
+    return Motion(
+        deformation.DeformationField(deformation.SHAPES[section.size], generator),
+        TRD(TRD_SHAPES[section.size], generator),
+        Clock.of(times),
+        min(section.horizon or first + HORIZON * (last - first), last),
+        section.step or 2 * spacing,
+        section.chunk,
+    )
+
+
+def _parameters(motion: Motion) -> dict[str, Tensor]:
+    """Weights of both networks, by ``field.NAME`` and ``trd.NAME``."""
+    named = {f"field.{n}": p for n, p in motion.field.named_parameters()}
+    return named | {f"trd.{n}": p for n, p in motion.trd.named_parameters()}
+
+
+@torch.no_grad()
+def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
+    for name, parameter in _parameters(motion).items():
+        parameter.copy_(tensors[name])
+
+
+def _movers(motion_ids: Tensor, bodies: int, config: Config) -> Tensor:
+    """Rows that the networks move. [R] int64"""
+    if config.field.movers == "all" or bodies < 2:
+        return torch.arange(len(motion_ids))
+    return (motion_ids > 0).nonzero()[:, 0]
 
 
 def stiffness(moved: Moved, groups: Tensor) -> Tensor:

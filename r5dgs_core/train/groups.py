@@ -33,9 +33,51 @@ class GroupTrack:
 
 
 @dataclass(frozen=True)
+class PointMotion:
+    """Motion of single Gaussians at the knots, in training coordinates; for what their groups do not explain.
+
+    Attributes:
+        rows: Which ones. [R]
+        means: Their centres. [R, S, 3]
+        quats: Their rotations, unit wxyz. [R, S, 4]
+        log_scales: Their log scales. [R, S, 3]
+        dynamics: Velocity, angular velocity and the rates of both at the last knot, about each Gaussian's own centre,
+            per unit of scene time; None where Gaussians have no dynamics of their own. [N, 12]
+        canonical: Centres in the canonical state. [N, 3] or None
+    """
+
+    rows: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    dynamics: np.ndarray | None = None
+    canonical: np.ndarray | None = None
+
+    def keep(self, kept: np.ndarray) -> PointMotion:
+        """The same for the Gaussians that are kept. [N] bool"""
+        mine = kept[self.rows]
+        rows = (np.cumsum(kept) - 1)[self.rows[mine]]
+        dynamics = None if self.dynamics is None else self.dynamics[kept]
+        canonical = None if self.canonical is None else self.canonical[kept]
+        return PointMotion(rows, self.means[mine], self.quats[mine], self.log_scales[mine], dynamics, canonical)
+
+
+@dataclass(frozen=True)
 class ObservedMotion:
-    """What a trained representation hands to baking: knots [S], groups by id, and the light of the shading [3]."""
+    """What a trained representation hands to baking.
+
+    Attributes:
+        times: Knots. [S]
+        groups: Motion groups by id.
+        light: Light of the shading. [3]
+        gaussians: Parameters by name that the groups' tracks start from, where they are not the canonical ones.
+        motion_ids: Group of each Gaussian, where it is not that of the training. [N]
+        points: Motion of single Gaussians, or None where all move with their groups.
+    """
 
     times: np.ndarray
     groups: tuple[GroupTrack, ...]
     light: np.ndarray
+    gaussians: dict[str, np.ndarray] | None = None
+    motion_ids: np.ndarray | None = None
+    points: PointMotion | None = None

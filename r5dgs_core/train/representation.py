@@ -7,7 +7,6 @@ same face.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..scene.cameras import Camera
 from . import initialization, posing
 from .config import Config
 from .field import FieldRepresentation
-from .groups import GroupTrack, ObservedMotion
+from .groups import ObservedMotion
 from .tracks_representation import TracksRepresentation
 
 
@@ -36,6 +35,10 @@ class Representation(Protocol):
     @property
     def params(self) -> dict[str, Tensor]:
         """What the optimizer moves, by the names of the learning rates."""
+        ...
+
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """What is done once, before the first step."""
         ...
 
     def splats(
@@ -72,13 +75,22 @@ class Representation(Protocol):
         ...
 
     @staticmethod
-    def observed_motion(tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray) -> ObservedMotion:
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """Class that a group's Gaussians have where no mask says otherwise, out of a checkpoint's `tensors`. [G]"""
+        ...
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
         """Motion groups out of a checkpoint's `tensors`.
 
         Args:
-            tensors: By name, as stored.
+            tensors: By name, as stored, those of the Gaussians too.
             object_ids: Object id of each class, 0 first. [B]
             observed: Knots at which each object was placed by its masks. [B - 1, S] bool
+            labels: Class of each Gaussian. [N]
+            config: The run's configuration.
         """
         ...
 
@@ -95,20 +107,32 @@ def make(start: initialization.Start, config: Config) -> Representation:
 
 
 def observed_motion(
-    name: str, tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray
+    name: str,
+    tensors: dict[str, Tensor],
+    object_ids: np.ndarray,
+    observed: np.ndarray,
+    labels: np.ndarray,
+    config: Config,
 ) -> ObservedMotion:
-    """Motion groups out of a checkpoint of the representation ``name``.
+    """`Representation.observed_motion` of the representation ``name``.
 
     Raises:
         CheckpointError: This version has no such representation.
     """
+    return _known(name).observed_motion(tensors, object_ids, observed, labels, config)
+
+
+def group_classes(name: str, tensors: dict[str, Tensor]) -> np.ndarray:
+    """`Representation.group_classes` of the representation ``name``. [G]
+
+    Raises:
+        CheckpointError: This version has no such representation.
+    """
+    return _known(name).group_classes(tensors)
+
+
+def _known(name: str) -> type[TracksRepresentation] | type[FieldRepresentation]:
     if name not in REPRESENTATIONS:
         known = ", ".join(REPRESENTATIONS)
         raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
-    return REPRESENTATIONS[name].observed_motion(tensors, object_ids, observed)
-
-
-def group_classes(groups: Sequence[GroupTrack], object_ids: np.ndarray) -> np.ndarray:
-    """Class that a group's Gaussians have where no mask says otherwise: a body's object, else the background. [G]"""
-    row = {int(object_id): k for k, object_id in enumerate(object_ids)}
-    return np.array([row[g.object_id] if g.role == "body" else 0 for g in groups], np.int64)
+    return REPRESENTATIONS[name]

@@ -17,7 +17,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, probing, representation, stopping
+from . import checkpoint, curves, identity, probing, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -226,8 +226,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
     """Labels and identity encodings on the finished geometry, then the last checkpoint."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
-    motion = trainer.motion.observed_motion(trainer.motion.tensors(), trainer.object_ids, trainer.places.measured)
-    group_classes = representation.group_classes(motion.groups, trainer.object_ids)
+    group_classes = trainer.motion.group_classes(trainer.motion.tensors())
     fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
     extra: dict[str, torch.Tensor] = {"labels": fallback}
     if any(v.mask is not None for v in trainer.views):

@@ -47,6 +47,9 @@ class TracksRepresentation:
         """Tracks and light direction."""
         return {**self.tracks.params, "light": self.light}
 
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """Nothing: the tracks start where the masks put them."""
+
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
     ) -> posing.Splats:
@@ -127,7 +130,15 @@ class TracksRepresentation:
         self.light = tensors["light"].clone().requires_grad_(True)
 
     @staticmethod
-    def observed_motion(tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray) -> ObservedMotion:
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
+        bodies, shadows = len(tensors["tracks.centers"]), len(tensors["tracks.casters"])
+        return np.concatenate([np.arange(bodies), np.zeros(shadows, np.int64)])
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
         """See `Representation.observed_motion`: the pinned group, one body per object, then the shadows."""
         tracks = tracks_of(tensors)
         quats = tracks.knot_quats().detach().numpy().astype(np.float64)

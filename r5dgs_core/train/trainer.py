@@ -147,6 +147,8 @@ class Trainer:
         Raises:
             TrainingError: The loss is not finite; the message names step, view and parameter.
         """
+        if self.iteration == 0:
+            self.motion.begin(self.gaussians, self.generator)
         self._grow_times()
         index = self._draw()
         view = self.views[index]

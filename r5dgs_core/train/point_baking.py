@@ -1,0 +1,74 @@
+"""Motion of single Gaussians as a scene stores it: relative to the bind state and to what their groups do.
+
+Notation: R Gaussians with states x_s at the knots s, last knot T. Their group takes the bind state x_T to
+Q_s (x_T - p) + p + D_s; a residual is the change of the bind state that its group then brings to x_s.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..motion import rotations
+from .groups import PointMotion
+from .normalization import Normalization
+
+VISIBLE = 1e-4  # residuals below this share of the scene's size, and below this angle or log scale, are left out
+
+
+def members(
+    points: PointMotion,
+    norm: Normalization,
+    motion_ids: np.ndarray,
+    track_poses: np.ndarray,
+    pivots: np.ndarray,
+    order: np.ndarray,
+    extent: float,
+) -> dict[str, Any]:
+    """The fields of `Scene` that hold motion of single Gaussians.
+
+    Args:
+        points: States at the knots, training coordinates.
+        norm: From training coordinates to the world.
+        motion_ids: Group of each Gaussian, in the order of training. [N]
+        track_poses: Poses of the groups at the knots, relative to the bind state. [G, S, 7]
+        pivots: Points that they turn about, world. [G, 3]
+        order: Row of training of each row of the scene. [N]
+        extent: Size of the scene, world units.
+
+    Returns:
+        ``residual_rows``, ``residual_offsets``, ``residual_quats``, ``residual_log_scales``, ``dynamics`` and
+        ``canonical_means``; None where a scene needs none.
+    """
+    result: dict[str, Any] = {}
+    if points.dynamics is not None and np.any(points.dynamics):
+        linear = np.repeat([norm.scale, 1.0, norm.scale, 1.0], 3)
+        result["dynamics"] = (points.dynamics * linear)[order].astype(np.float32)
+        if points.canonical is not None:
+            result["canonical_means"] = norm.points_to_world(points.canonical)[order].astype(np.float32)
+    ids = motion_ids[points.rows]
+    quats, shifts = track_poses[ids, :, :4], track_poses[ids, :, 4:]
+    pivot = pivots[ids][:, None]
+    world = norm.points_to_world(points.means)
+    back = rotations.conjugate(quats)
+    before = pivot + rotations.rotate(back, world - pivot - shifts)
+    offsets = before - world[:, -1:]
+    turns = rotations.multiply(rotations.multiply(back, points.quats), rotations.conjugate(points.quats[:, -1:]))
+    turns = rotations.normalize(turns)
+    growths = points.log_scales - points.log_scales[:, -1:]
+    offsets[:, -1], growths[:, -1], turns[:, -1] = 0.0, 0.0, [1.0, 0, 0, 0]
+    seen = np.abs(offsets).max((1, 2)) > VISIBLE * extent
+    seen |= np.abs(growths).max((1, 2)) > VISIBLE
+    seen |= rotations.angle_between(turns, turns[:, -1:]).max(1) > VISIBLE
+    if not seen.any():
+        return result
+    rank = np.argsort(order)[points.rows[seen]]
+    increasing = np.argsort(rank)
+    kept = np.flatnonzero(seen)[increasing]
+    flat = np.moveaxis(rotations.make_continuous(np.moveaxis(turns[kept][:, ::-1], 1, 0)), 0, 1)[:, ::-1]
+    result["residual_rows"] = rank[increasing].astype(np.int32)
+    result["residual_offsets"] = offsets[kept].astype(np.float32)
+    result["residual_quats"] = np.ascontiguousarray(flat).astype(np.float32)
+    result["residual_log_scales"] = growths[kept].astype(np.float32)
+    return result
