@@ -125,7 +125,7 @@ def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -
         classes: Class of each object id.
         config: The run's configuration.
     """
-    asked = config.identity.training in ("joint", "detached")
+    asked = config.identity.training in ("joint", "detached") and config.identity.iterations > 0
     if not asked or max(classes.values(), default=0) == 0 or all(view.mask is None for view in views):
         return None
     # A generator of its own: the other draws of a run are the same with identities and without.
