@@ -172,11 +172,6 @@ class FieldRepresentation:
         """Go on from `tensors`."""
         _load(self.motion, tensors)
 
-
-def _pinned() -> GroupPoses:
-    """The pose of one group that rests."""
-    return GroupPoses(torch.tensor([[1.0, 0, 0, 0]]), torch.eye(3)[None], torch.zeros(1, 3))
-
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
         """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
@@ -202,6 +197,11 @@ def _pinned() -> GroupPoses:
             tensors["field.casters"].tolist(),
             tensors["field.plane_normal"].numpy().astype(np.float64),
         )
+
+
+def _pinned() -> GroupPoses:
+    """The pose of one group that rests."""
+    return GroupPoses(torch.tensor([[1.0, 0, 0, 0]]), torch.eye(3)[None], torch.zeros(1, 3))
 
 
 def _motion_of(times: np.ndarray, config: Config) -> Motion:
