@@ -251,10 +251,30 @@ def test_views_without_masks_have_no_pixel_loss_and_unknown_ids_do_not_count():
     assert float(identities.loss(gaussians, posed(gaussians), unknown, 0).detach()) == 0
 
 
+def test_encodings_grow_and_shrink_with_the_gaussians():
+    view, gaussians = wall()
+    identities = make_joint(view, gaussians, "detached")
+    _, optimizer = optimise(identities, gaussians, view, 1)
+    before, moments = gaussians.identities.detach().clone(), optimizer.state[gaussians.identities]["exp_avg"].clone()
+    chosen, kept = torch.arange(0, 300, 9), torch.arange(334) % 4 > 0
+    gaussians.extend(optimizer, {n: p[chosen] for n, p in gaussians.params.items()}, gaussians.motion_ids[chosen])
+    gaussians.keep(optimizer, kept)
+    assert torch.equal(gaussians.identities, torch.cat([before, before[chosen]])[kept])
+    found = optimizer.state[gaussians.identities]["exp_avg"]
+    assert torch.equal(found, torch.cat([moments, torch.zeros(34, 16)])[kept]) and moments.any()
+
+
+@pytest.mark.parametrize(("name", "count"), [("identities", 299), ("identity", 300)])
+def test_gaussians_take_only_parameters_that_are_known_and_fit(name, count):
+    with pytest.raises(ValueError, match=name):
+        wall()[1].add(name, torch.zeros(count, 16))
+
+
 def test_there_are_no_joint_identities_where_nothing_tells_objects_apart():
     view, _ = row_of_blobs()
     asked = config.Config().replace(**{"identity.training": "joint"})
     assert identity.joint([view], CLASSES, config.Config()) is None
+    assert identity.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
     assert identity.joint([view], {0: 0}, asked) is None
     assert identity.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
     assert identity.joint([view], CLASSES, asked) is not None
