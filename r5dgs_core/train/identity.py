@@ -27,6 +27,7 @@ from .posing import Splats
 from .views import TrainView, spread
 
 VOTE_VIEWS = 80
+VOTE_CLASSES = 32  # that vote in one pass, so that many objects take no more memory than some
 NEIGHBOURS_EVERY = 300  # steps after which neighbours are looked for anew, where the Gaussians are still the same
 
 
@@ -49,13 +50,15 @@ def vote(
     weights = torch.zeros(len(fallback), count)
     for view in masked:
         target = class_map(view, classes)
-        one_hot = F.one_hot(target.clamp(min=0), count).float() * (target >= 0)[..., None]
         with torch.no_grad():
             splats = pose(view)
-        channels = torch.zeros(len(fallback), count, requires_grad=True)
-        image = _rasterize(splats, channels, view)
-        (gradient,) = torch.autograd.grad((image * one_hot).sum(), channels)
-        weights += gradient
+        for first in range(0, count, VOTE_CLASSES):
+            some = torch.arange(first, min(first + VOTE_CLASSES, count))
+            one_hot = (target[..., None] == some).float()
+            channels = torch.zeros(len(fallback), len(some), requires_grad=True)
+            image = _rasterize(splats, channels, view)
+            (gradient,) = torch.autograd.grad(image, channels, one_hot)
+            weights[:, some] += gradient
     return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
 
 
