@@ -240,7 +240,7 @@ def parser() -> argparse.ArgumentParser:
     add_training(demo)
 
     train = commands.add_parser("train", help="train a data set into a run folder")
-    train.add_argument("data", type=Path, help="data set folder with transforms_train.json")
+    train.add_argument("data", type=Path, help="data set folder: transforms_train.json, or images and sparse/")
     train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
     add_training(train)
 

@@ -1,7 +1,8 @@
 """A data set on disk: views with camera, time and mask, object names, and poses where they are known.
 
 Layout: ``transforms_{train,val,test}.json`` (`transforms`), images beside them, ``object_mask/<view name>.png``
-(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time).
+(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time). Without
+camera files, images with a COLMAP reconstruction are read the same (`colmap`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from .. import errors
 from ..scene import cameras
-from . import images, masks, transforms
+from . import colmap, images, masks, transforms
 from .annotations import GroundTruth, read_ground_truth, read_objects
 
 SPLITS = ("train", "val", "test")
@@ -64,6 +65,8 @@ class Dataset:
         frames_per_unit: Blender frames per unit of scene time.
         has_alpha: Whether images have pixels that are not opaque (looked for in three training images).
         digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
+        points: Points of the world that a reconstruction (COLMAP) gives. [P, 3] float64 or None
+        point_colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
     """
 
     root: Path
@@ -78,6 +81,8 @@ class Dataset:
     frames_per_unit: float
     has_alpha: bool
     digest: str
+    points: np.ndarray | None = None
+    point_colors: np.ndarray | None = None
 
     def views(self, split: str) -> tuple[View, ...]:
         """The views of "train", "val" or "test"."""
@@ -109,7 +114,7 @@ def read(root: Path) -> Dataset:
     """Read and check a data set; images and masks are looked at, not loaded.
 
     Args:
-        root: Folder with ``transforms_train.json``.
+        root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`colmap`).
 
     Returns:
         The data set. A split without camera file is empty.
@@ -120,7 +125,8 @@ def read(root: Path) -> Dataset:
             f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}"
         )
     path = root / "transforms_train.json"
-    if not path.exists():
+    reconstruction = None if path.exists() or colmap.folder(root) is None else colmap.read(root)
+    if not path.exists() and reconstruction is None:
         lone = (root / "transforms.json").exists()
         remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
         raise errors.DatasetError(f"{path}: the file is missing; {remedy}")
@@ -134,11 +140,16 @@ def read(root: Path) -> Dataset:
             entries[split], top = transforms.read(path)
             header = {**top, **header}
             hasher.update(path.read_bytes())
+    if reconstruction is not None:
+        entries, header = reconstruction.entries, reconstruction.header
+        for path in reconstruction.files:
+            hasher.update(path.read_bytes())
     if not entries["train"]:
         raise errors.DatasetError(f"{root / 'transforms_train.json'}: expected at least one frame, found none")
 
     camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]])
-    views = {split: _make_views(root, split, entries[split], camera_names) for split in SPLITS}
+    image_root = root if reconstruction is None else root / colmap.IMAGES
+    views = {split: _make_views(root, image_root, split, entries[split], camera_names) for split in SPLITS}
     views = _attach_mask_colors(views)
     every = [view for split in SPLITS for view in views[split]]
     for view in every:
@@ -169,6 +180,8 @@ def read(root: Path) -> Dataset:
         frames_per_unit=_frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]]),
         has_alpha=_has_alpha(views["train"]),
         digest=hasher.hexdigest(),
+        points=None if reconstruction is None else reconstruction.points,
+        point_colors=None if reconstruction is None else reconstruction.colors,
     )
 
 
@@ -233,13 +246,15 @@ class _CameraNames:
         return self.by_key[key]
 
 
-def _make_views(root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames) -> tuple[View, ...]:
+def _make_views(
+    root: Path, image_root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames
+) -> tuple[View, ...]:
     views: dict[str, View] = {}
     for entry in entries:
         name = transforms.view_name(entry.file_path)
         if name in views:
             raise errors.DatasetError(f"{entry.place}: the image is listed twice; each frame needs its own")
-        image_path = _find_image(root, entry)
+        image_path = _find_image(image_root, entry)
         width, height, _ = images.size(image_path)
         matrix = cameras.opengl_to_cam_world(entry.matrix)
         camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)

@@ -1,0 +1,233 @@
+"""A folder of images with a COLMAP reconstruction beside it, static or with a time per image.
+
+Layouts, with ``sparse/0/{cameras,images,points3D}.{bin,txt}`` (or ``sparse/``) in all of them:
+
+- ``images/NAME``: every image is registered. With ``times.json`` each has a time, without it all are of time 0.
+- ``images/CAMERA/FRAME``: cameras that stand still, each registered once: one of its frames, or an image ``CAMERA``
+  beside the folders. Times are those of ``times.json``, or the numbers at the end of the frames' names, spread over
+  [0, 1].
+
+``times.json`` maps images to times; beside "times" it may hold "t_max" (later views are the test) and
+"frames_per_unit".
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+from ..scene import cameras
+from . import colmap_model, images, transforms
+from .colmap_model import Registered
+from .transforms import Entry
+
+HELD_OUT = 8  # every eighth camera is held out, as 3D Gaussian Splatting does
+IMAGES = "images"
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What `read` found.
+
+    Attributes:
+        entries: Frames of each split; file paths are relative to the folder ``images``.
+        header: Keys as at the top of a camera file.
+        points: Points of the reconstruction, world. [P, 3] float64 or None
+        colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
+        files: The files that say all that.
+    """
+
+    entries: dict[str, list[Entry]]
+    header: dict[str, Any]
+    points: np.ndarray | None
+    colors: np.ndarray | None
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """An image, whose pose it has, when it was taken, and its number where its name gives the time."""
+
+    name: str
+    pose: Registered
+    camera: str
+    t: float = 0.0
+    number: float | None = None
+
+
+def folder(root: Path) -> Path | None:
+    """The folder of the reconstruction in a data set, None where there is none."""
+    for candidate in (root / "sparse" / "0", root / "sparse"):
+        if any((candidate / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return candidate
+    return None
+
+
+def read(root: Path) -> Found:
+    """Read cameras, times and points of a data set.
+
+    Every eighth camera (by name, from the first one on) is held out where there are at least eight, within the times
+    that the others observe; views later than "t_max" of ``times.json`` are the test.
+
+    Raises:
+        DatasetError: Something is missing or damaged; distorted lenses are not supported.
+    """
+    sparse = folder(root)
+    if sparse is None:
+        raise errors.DatasetError(f"{root / 'sparse' / '0'}: expected a COLMAP reconstruction, found none")
+    if not (root / IMAGES).is_dir():
+        raise errors.DatasetError(f"{root / IMAGES}: expected the folder of the images, found none")
+    model = colmap_model.read(sparse)
+    path = root / "times.json"
+    header: dict[str, Any] = {"world_convention": "colmap"}
+    if path.exists():
+        times, more = _read_times(path)
+        header |= more
+        frames = _timed(root, model.images, times, path)
+    else:
+        frames = _videos(root, model.images)
+        frames = frames or [_Frame(image.name, image, _stem(image.name)) for image in model.images]
+    splits = _split(frames, header.get("t_max", math.inf))
+    entries = {
+        split: [_entry(sparse, frame) for frame in sorted(part, key=lambda frame: (frame.t, frame.name))]
+        for split, part in splits.items()
+    }
+    files = (*model.files, path) if path.exists() else model.files
+    return Found(entries, header, model.points, model.colors, files)
+
+
+def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """Time of each image, and the other keys of ``times.json``."""
+    content = transforms.read_json(path)
+    if not isinstance(content, dict):
+        raise errors.DatasetError(f"{path}: expected image names and times, found {type(content).__name__}")
+    more = {}
+    times = content
+    if isinstance(content.get("times"), dict):
+        times = content["times"]
+        more = {key: _number(path, key, content[key]) for key in ("t_max", "frames_per_unit") if key in content}
+    if not times:
+        raise errors.DatasetError(f"{path}: expected image names and times, found none")
+    return {str(name).replace("\\", "/"): _number(path, name, t) for name, t in times.items()}, more
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise errors.DatasetError(f"{path}: {key!r}: expected a finite number, found {value!r}")
+    return float(value)
+
+
+def _timed(root: Path, registered: tuple[Registered, ...], times: dict[str, float], path: Path) -> list[_Frame]:
+    """The images that ``times.json`` lists."""
+    own = {image.name: image for image in registered}
+    standing = _standing(registered)
+    frames = []
+    for name, t in times.items():
+        camera = name.rpartition("/")[0]
+        if name in own and not (camera in standing and _count(root, camera) > 1):
+            frames.append(_Frame(name, own[name], _stem(name), t))
+        elif camera in standing:
+            frames.append(_Frame(name, standing[camera], camera, t))
+        else:
+            raise errors.DatasetError(
+                f"{path}: {name!r}: expected a registered image, or one of a camera that is registered once, found "
+                "neither; was it left out by COLMAP? Remove it here"
+            )
+    return frames
+
+
+def _videos(root: Path, registered: tuple[Registered, ...]) -> list[_Frame]:
+    """The frames of cameras that stand still; empty where there are none with more than one frame."""
+    found: list[tuple[str, Registered, str]] = []
+    moving = False
+    for camera, pose in _standing(registered).items():
+        names = list(_names(root, camera))
+        moving = moving or len(names) > 1
+        found += [(name, pose, camera) for name in names]
+    if not moving:
+        return []
+    numbers = []
+    for name, _, _ in found:
+        match = re.search(r"(\d+)$", _stem(name))
+        if match is None:
+            raise errors.DatasetError(
+                f"{root / IMAGES / name}: expected a number at the end of the frame's name, found none; give the times "
+                f"in {root / 'times.json'}"
+            )
+        numbers.append(int(match[1]))
+    first, span = min(numbers), max(max(numbers) - min(numbers), 1)
+    used = {pose.name for _, pose, _ in found}
+    for image in registered:
+        if image.name not in used:
+            _log.warning("%s: left out, as nothing says its time; give times.json", image.name)
+    return [
+        _Frame(name, pose, camera, (number - first) / span, float(number))
+        for (name, pose, camera), number in zip(found, numbers, strict=True)
+    ]
+
+
+def _standing(registered: tuple[Registered, ...]) -> dict[str, Registered]:
+    """Cameras that are registered once: a folder with one registered image, or an image called like a folder."""
+    inside: dict[str, list[Registered]] = {}
+    for image in registered:
+        inside.setdefault(image.name.rpartition("/")[0], []).append(image)
+    alone = {_stem(image.name): image for image in inside.pop("", [])}
+    return {**alone, **{camera: part[0] for camera, part in inside.items() if len(part) == 1}}
+
+
+def _names(root: Path, camera: str) -> Iterator[str]:
+    """Images in the folder of a camera."""
+    place = root / IMAGES / camera
+    for path in sorted(place.iterdir()) if place.is_dir() else []:
+        if path.suffix.lower() in images.SUFFIXES and path.is_file() and not path.name.startswith("."):
+            yield f"{camera}/{path.name}"
+
+
+def _count(root: Path, camera: str) -> int:
+    return sum(1 for _ in _names(root, camera))
+
+
+def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
+    """Frames of each split."""
+    names = sorted({frame.camera for frame in frames})
+    held = set(names[::HELD_OUT]) if len(names) >= HELD_OUT else set()
+    early = [frame for frame in frames if frame.t <= t_max + 1e-9]
+    seen = [frame.t for frame in early if frame.camera not in held]
+    if not seen:
+        raise errors.DatasetError(f"t_max {t_max:g} of times.json: expected images up to it, found none")
+    splits: dict[str, list[_Frame]] = {"train": [], "val": [], "test": []}
+    for frame in frames:
+        if frame.t > t_max + 1e-9:
+            splits["test"].append(frame)
+        else:
+            inside = min(seen) - 1e-9 <= frame.t <= max(seen) + 1e-9
+            splits["val" if frame.camera in held and inside else "train"].append(frame)
+    return splits
+
+
+def _entry(sparse: Path, frame: _Frame) -> Entry:
+    lens = frame.pose.lens
+    return Entry(
+        place=f"{sparse}: image {frame.name}",
+        file_path=frame.name,
+        t=frame.t,
+        matrix=cameras.cam_world_to_opengl(frame.pose.T_cam_world),
+        camera=frame.camera,
+        lens={"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width, "h": lens.height},
+        frame=frame.number,
+    )
+
+
+def _stem(name: str) -> str:
+    """The name without the suffix."""
+    head, dot, _ = name.rpartition(".")
+    return head if dot and "/" not in name[len(head) :] else name
