@@ -63,7 +63,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
                 if not isinstance(error, R5dgsError):
                     log.exception("%s", case.title)
                 text = str(error) if isinstance(error, R5dgsError) else f"{type(error).__name__}: {error}"
-                failures.append({"scene": case.scene, "variant": case.variant, "seed": case.seed, "error": text})
+                failures.append({**case.names, "error": text})
                 progress({"event": "failed", "text": f"{case.title}: {text}"})
             result = _write(plan, records, failures)
         if progress_kind == "json":
@@ -93,10 +93,7 @@ def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> lis
         measured = _measure(case, measured, plan.modes, lacking, progress)
         cases.write_record(case, {**record, "measured": measured})
     shared = {
-        "scene": case.scene,
-        "representation": cases.VARIANTS[case.variant]["train.representation"],
-        "variant": case.variant,
-        "seed": case.seed,
+        **case.names,
         "gaussians": measured["gaussians"],
         "iterations": measured["iterations"],
         "train": cases.cost(record["sittings"]),

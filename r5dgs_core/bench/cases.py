@@ -83,6 +83,12 @@ class Case:
         """The case in a few words."""
         return f"{self.scene}, {self.variant}, seed {self.seed}"
 
+    @property
+    def names(self) -> dict[str, Any]:
+        """What tells the case from the others, for its records."""
+        representation = VARIANTS[self.variant]["train.representation"]
+        return {"scene": self.scene, "representation": representation, "variant": self.variant, "seed": self.seed}
+
     def beside(self, suffix: str) -> Path:
         """A file beside the run folder, with its name."""
         return self.run.with_name(self.run.name + suffix)

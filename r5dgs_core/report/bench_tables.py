@@ -29,6 +29,9 @@ _COST = (("CPU s", "cpu_seconds", "{:.0f}"), ("wall s", "wall_seconds", "{:.0f}"
 _PLAYED = (("FPS", "fps", "{:.1f}"), ("motion ms", "ms_motion", "{:.2f}"), ("raster ms", "ms_raster", "{:.2f}"))
 _PLAYED = (*_PLAYED, ("CPU ms", "ms_cpu", "{:.2f}"))
 
+_AGAINST = (("PSNR dB", "psnr", "{:+.2f}"), ("objects dB", "psnr_objects", "{:+.2f}"), ("FPS x", "fps", "{:.2f}"))
+_AGAINST = (*_AGAINST, ("motion x", "ms_motion", "{:.2f}"))
+
 
 @dataclass(frozen=True)
 class Column:
@@ -65,7 +68,8 @@ class Sheet:
 
 
 def sheets(result: dict[str, Any]) -> list[Sheet]:
-    """The tables of a benchmark: quality past t_max, quality in the observed time, speed and mIoU.
+    """The tables of a benchmark: quality past t_max, quality in the observed time, speed and mIoU, and where a run was
+    played in mode "standard", what the others lose and gain against that.
 
     Args:
         result: What `bench.benchmark.run_bench` writes.
@@ -82,12 +86,17 @@ def sheets(result: dict[str, Any]) -> list[Sheet]:
     threads = f"rasterizer on {machine['raster_threads']} thread(s), {machine['gpu'] or machine['processor']}"
     note = f"frames of the test views in sequence, medians, colours alone; {threads}"
     tables.append(("Table 2: speed and identities", [*played, *overlaps, count, costs[0], costs[2]], note))
+    data = [(records, failures)] * len(tables)
+    if compared := against_standard(records):
+        columns = [Column(label, _at("against", key), form) for label, key, form in _AGAINST]
+        tables.append(("Table 3: against `standard` of the same run", columns, "differences and ratios on test"))
+        data.append((compared, []))
     head = ("scene", "method", "mode", "paper's row")
     seeds = sorted({record["seed"] for record in records})
     spread = f"; seeds {', '.join(map(str, seeds))}: mean ± half the range" if len(seeds) > 1 else ""
     return [
-        Sheet(title, (*head, *(column.label for column in columns)), _blocks(records, failures, columns), note + spread)
-        for title, columns, note in tables
+        Sheet(title, (*head, *(column.label for column in columns)), _blocks(*rows, columns), note + spread)
+        for (title, columns, note), rows in zip(tables, data, strict=True)
     ]
 
 
@@ -162,6 +171,26 @@ def report_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
     return rows
 
 
+def against_standard(records: Sequence[Record]) -> list[Record]:
+    """Records of the other modes of runs that were played in mode "standard", with ``against``: differences of PSNR on
+    test, of all pixels and those of objects (dB), and ratios of frames per second and milliseconds of motion."""
+    runs = {(r["scene"], r["variant"], r["seed"]): r for r in records if r["mode"] == "standard"}
+    found = []
+    for record in records:
+        base = runs.get((record["scene"], record["variant"], record["seed"]))
+        if base is None or record is base:
+            continue
+        against: dict[str, float | None] = {}
+        for key in ("psnr", "psnr_objects"):
+            ours, theirs = record["splits"]["test"][key], base["splits"]["test"][key]
+            against[key] = None if ours is None or theirs is None else ours - theirs
+        for key in ("fps", "ms_motion"):
+            ours, theirs = record["playback"][key], base["playback"][key]
+            against[key] = None if ours is None or not theirs else ours / theirs
+        found.append({**record, "against": against})
+    return found
+
+
 def method(record: Record) -> str:
     """Representation and variant: "tracks", "field/r5dgs"."""
     representation, variant = record["representation"], record["variant"]
@@ -223,8 +252,8 @@ def _blocks(
             if scene in groups[key]
         ]
         done = {record["variant"] for record in records if record["scene"] == scene}
-        failed = dict.fromkeys(f["variant"] for f in failures if f["scene"] == scene and f["variant"] not in done)
-        lines += [(scene, variant, "", "", "failed", *[ABSENT] * (len(columns) - 1)) for variant in failed]
+        failed = dict.fromkeys(method(f) for f in failures if f["scene"] == scene and f["variant"] not in done)
+        lines += [(scene, name, "", "", "failed", *[ABSENT] * (len(columns) - 1)) for name in failed]
         blocks.append(tuple(lines))
     if len(scenes) > 1:
         lines = []
@@ -243,7 +272,8 @@ def _cell(records: Sequence[Record], column: Column) -> str:
     if len(known) < len(values):
         return ABSENT
     mean = column.form.format(sum(known) / len(known))
-    return mean if len(known) == 1 else f"{mean} ± {column.form.format((max(known) - min(known)) / 2)}"
+    half = column.form.format((max(known) - min(known)) / 2).removeprefix("+")
+    return mean if len(known) == 1 else f"{mean} ± {half}"
 
 
 def _mean_over_scenes(scenes: Sequence[Sequence[Record]], column: Column) -> str:

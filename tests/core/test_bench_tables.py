@@ -84,6 +84,15 @@ def test_the_papers_rows_come_first_and_ours_last():
     ]
 
 
+def test_modes_are_compared_with_standard_of_the_same_run():
+    records = [record(variant="r5dgs", mode="standard", seed=s, psnr=30.0 + 5 * s, ms=10.0) for s in (0, 1)]
+    records += [record(variant="r5dgs", mode="rigid", seed=s, psnr=31.0 + 4 * s, ms=5.0) for s in (0, 1)]
+    (line,) = lines_of(bench_tables.sheets(result([*records, record()]))[3])
+    assert (line["mode"], line["PSNR dB"], line["FPS x"]) == ("rigid", "+0.50 ± 0.50", "2.00 ± 0.00")
+    assert line["objects dB"] == "-"
+    assert len(bench_tables.sheets(result([record()]))) == 3
+
+
 def test_only_one_row_is_called_5dgs():
     both = ("5dgs", "r5dgs")
     assert bench_tables.paper_row("5dgs", "standard", both) == "5DGS"
@@ -101,9 +110,10 @@ def test_the_mean_over_scenes_is_given_where_all_scenes_have_a_figure():
 
 
 def test_what_failed_is_in_the_tables_and_below_them():
-    failures = [{"scene": "b", "variant": "r5dgs", "seed": 0, "error": "loss: nan | at step 3"}]
-    found = result([record("a")], failures)
-    assert [line["PSNR"] for line in lines_of(bench_tables.sheets(found)[0]) if line["scene"] == "b"] == ["failed"]
+    names = {"scene": "b", "representation": "field", "variant": "r5dgs", "seed": 0}
+    found = result([record("a")], [{**names, "error": "loss: nan | at step 3"}])
+    (line,) = [line for line in lines_of(bench_tables.sheets(found)[0]) if line["scene"] == "b"]
+    assert (line["method"], line["PSNR"]) == ("field/r5dgs", "failed")
     assert "b, r5dgs, seed 0: loss: nan" in bench_tables.markdown(found)
 
 
