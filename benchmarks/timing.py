@@ -102,25 +102,25 @@ def measure_peak(run: Callable[[], object], calls: int = 2) -> float | None:
     """Largest resident memory during a call beyond that before it, MB; None on systems that do not tell."""
     peaks = []
     for _ in range(calls):
-        before = _reset_peak_mb()
+        before = reset_peak_mb()
         if before is None:
             return None
         run()
-        peaks.append(_status_mb("VmHWM") - before)
+        peaks.append(status_mb("VmHWM") - before)
     return max(peaks)
 
 
-def _reset_peak_mb() -> float | None:
+def reset_peak_mb() -> float | None:
     """Give freed memory back and let Linux forget its largest size; returns the present one, None on other systems."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
-        return _status_mb("VmRSS")
+        return status_mb("VmRSS")
     except (OSError, AttributeError, TypeError):
         return None
 
 
-def _status_mb(key: str) -> float:
+def status_mb(key: str) -> float:
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(key + ":"):
             return int(line.split()[1]) / 1024

@@ -15,7 +15,7 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 from . import sky
 
-BASES_BYTES = 1 << 28  # what the harmonics of the cameras' rays may take before they are made anew
+BASES_BYTES = 1 << 29  # what the harmonics of the cameras' rays may take before they are made anew
 
 
 class Background:
@@ -38,9 +38,8 @@ class Background:
             return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
         key = camera.T_cam_world[:3, :3].tobytes() + camera.intrinsics.tobytes() + bytes([len(coefficients)])
         if key not in self._bases:
-            rays = cameras.pixel_rays(camera)
-            values = spherical_harmonics.basis(rays.reshape(-1, 3), spherical_harmonics.degree_of(len(coefficients)))
-            basis = torch.from_numpy(np.asarray(values, np.float32))
+            rays = torch.from_numpy(cameras.pixel_rays(camera).reshape(-1, 3).astype(np.float32))
+            basis = spherical_harmonics.basis(rays, spherical_harmonics.degree_of(len(coefficients)))
             if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
                 self._bases.clear()
             self._bases[key] = basis

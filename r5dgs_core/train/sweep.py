@@ -25,6 +25,8 @@ from .views import TrainView, spread
 MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
 MAX_FRAMES = 31  # of one camera, for the median
+MEDIAN_VALUES = 1 << 23  # colours that are sorted at a time
+COST_VALUES = 1 << 22  # depths of rays that are compared at a time
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
 PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
@@ -46,13 +48,37 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     result = []
     for group in by_camera(views, MAX_BACKDROPS):
         frames = spread(group, MAX_FRAMES)
-        images = np.stack([v.image for v in frames]).astype(np.float32) / 255
         free = np.stack([_free(v) for v in frames])
-        known = np.asarray(free.any(0))
-        images[~free] = np.nan
-        images[:, ~known] = 0.0
-        median = np.nanmedian(images, axis=0)
-        result.append(Backdrop(group[0].camera, median, known))
+        image = _median([v.image for v in frames], free)
+        result.append(Backdrop(group[0].camera, image, np.asarray(free.any(0))))
+    return result
+
+
+def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
+    """Median of the pixels that are free, 0 where none is, band by band so that little memory is taken.
+
+    Args:
+        images: F images. [H, W, 3] uint8
+        free: Which of their pixels count. [F, H, W] bool
+
+    Returns:
+        Colours in [0, 1]. [H, W, 3] float32
+    """
+    count, height, width = free.shape
+    result = np.zeros((height, width, 3), np.float32)
+    rows = max(1, MEDIAN_VALUES // (3 * count * width))
+    for top in range(0, height, rows):
+        band = slice(top, top + rows)
+        values = np.stack([image[band] for image in images]).astype(np.int16)
+        values[~free[:, band]] = 256  # after all colours
+        values.sort(axis=0)
+        free_count = free[:, band].sum(0)
+        low, high = (
+            np.take_along_axis(values, np.broadcast_to(k[None, ..., None], (1, *values.shape[1:])), 0)[0]
+            for k in (np.maximum(free_count - 1, 0) // 2, np.minimum(free_count // 2, count - 1))
+        )
+        middle = (low + high).astype(np.float32) / np.float32(510)
+        result[band] = np.where((free_count > 0)[..., None], middle, np.float32(0))
     return result
 
 
@@ -149,7 +175,7 @@ class Sweep:
         directions = cameras.pixel_rays(reference.camera)[rows, cols]
         directions = directions / (directions @ reference.camera.forward)[..., None]
         colors = reference.image[rows, cols]
-        cost = _smooth(self._compare(i, directions[:, :, None] * z[:, None], colors, neighbours))
+        cost = _smooth(self._compare(i, directions, z, colors, neighbours))
         best, at = cost[..., :-1].min(-1)
         low = cost <= best[..., None] + SAME
         comparable = torch.isfinite(cost[..., :-1]).sum(-1)
@@ -158,10 +184,20 @@ class Sweep:
         costs = np.where(known, best.numpy(), np.inf)
         return Rays(i, directions, colors, z[at.numpy()], costs, flat.numpy(), low[..., -1].numpy(), known, neighbours)
 
-    def _compare(self, i: int, offsets: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]) -> torch.Tensor:
-        world = torch.from_numpy(self.scenes[i].camera.center + offsets).float()
+    def _compare(
+        self, i: int, directions: np.ndarray, depths: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]
+    ) -> torch.Tensor:
+        """Colour difference of rays [h, w, 3] at depths [D] or [h, w, D] to the neighbours, band by band. [h, w, D]"""
         others = [(self.scenes[j].camera, self._images[j], self._known[j]) for j in neighbours]
-        return _cost(world, torch.from_numpy(colors), others)
+        height, width = directions.shape[:2]
+        rows = max(1, COST_VALUES // (width * depths.shape[-1] * max(1, len(others))))
+        bands = []
+        for top in range(0, height, rows):
+            band = slice(top, top + rows)
+            z = depths if depths.ndim == 1 else depths[band]
+            world = self.scenes[i].camera.center + directions[band][:, :, None] * z[..., None]
+            bands.append(_cost(torch.from_numpy(world).float(), torch.from_numpy(colors[band]), others))
+        return torch.cat(bands)
 
     def distinct_points(self) -> np.ndarray:
         """Points on rays with one clear depth, for finding planes. [P, 3]"""
@@ -233,8 +269,8 @@ class Sweep:
             depth = (height - center @ normal) / slope
         hits = np.isfinite(depth) & (depth > NEAREST) & (depth < FARTHEST)
         depth = np.where(hits, depth, 1.0)
-        offsets = rays.directions[:, :, None] * depth[..., None, None]
-        cost = _smooth(self._compare(rays.backdrop, offsets, rays.colors, rays.neighbours))[..., 0].numpy()
+        compared = self._compare(rays.backdrop, rays.directions, depth[..., None], rays.colors, rays.neighbours)
+        cost = _smooth(compared)[..., 0].numpy()
         return depth, np.where(hits, cost, np.inf)
 
 

@@ -25,7 +25,7 @@ class TrainView:
         camera: Camera in normalised coordinates.
         t: Scene time.
         image: sRGB. [H, W, 3] uint8
-        mask: Object ids, or None. [H, W] uint16
+        mask: Object ids, or None. [H, W] uint8 where they fit, else uint16
         alpha: Opacity of the pixels, or None where the image has none. [H, W] uint8
     """
 
@@ -59,7 +59,7 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
         image = np.round(datasets.load_image(view, background) * 255).astype(np.uint8)
         camera = normalization.camera(view.camera)
         mask = datasets.load_mask(view)
-        small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint16)
+        small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint8 if mask.max() < 256 else np.uint16)
         views.append(TrainView(view.name, camera, view.t, image, small, alpha))
     return views
 
