@@ -2,8 +2,7 @@
 
 Notation: in training a body moves x -> c + R_s (x - c) + d_s. With the bind state at the last knot T and any pivot p,
 the same motion is x_bind -> p + Q_s (x_bind - p) + D_s with Q_s = R_s R_T^-1 and
-D_s = c + d_s + Q_s (p - c - d_T) - p. Shading 1 + (R^T l - l) . g keeps its form when colours are taken at the bind
-state: with b = 1 + (R_T^T l - l) . g the colour becomes colour * b and g becomes R_T g / b.
+D_s = c + d_s + Q_s (p - c - d_T) - p. Colours are taken over to the bind state by `shading`.
 """
 
 from __future__ import annotations
@@ -23,10 +22,9 @@ from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, needs, point_baking, representation
+from . import checkpoint, groups, needs, point_baking, representation, residual
+from . import shading as shading_vectors
 from .normalization import Normalization
-
-MIN_BIND_FACTOR = 0.1
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
@@ -88,7 +86,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         q, d = group.quats[-1], path[-1]
         means[members] = center + rotations.rotate(q, means[members] - center) + d
         quats[members] = rotations.multiply(q, quats[members])
-        sh[members], shading[members] = _bind_shading(sh[members], shading[members], q, light)
+        sh[members], shading[members] = shading_vectors.rebind(sh[members], shading[members], q, light)
         pivot = _pivot(means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
         if group.observed.any():  # nothing is known of an object before it is seen
@@ -104,16 +102,22 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
     order = np.lexsort((motion_ids, object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
-    decisions = needs.decide(
-        rows, track_poses, motion_ids, shading, light, used_background, sh.shape[1], identities is not None, wanted
-    )
-    keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
-    classified = identities is not None and needs.is_on(decisions, "classifier")
     single: dict[str, Any] = {}
     if points is not None:
         pivots = np.stack([row.pivot for row in rows])
         extent = float(np.ptp(np.quantile(means, [0.01, 0.99], axis=0), axis=0).max())
         single = point_baking.members(points, norm, motion_ids, np.stack(track_poses), pivots, order, extent)
+    bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
+    bases, classified = sh.shape[1], identities is not None
+    decisions = needs.decide(
+        rows, track_poses, motion_ids, shading, light, used_background, bases, classified, wanted, bent
+    )
+    keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
+    classified = classified and needs.is_on(decisions, "classifier")
+    if not needs.is_on(decisions, "residuals"):
+        single = {name: value for name, value in single.items() if not name.startswith("residual_")}
+    elif "residual_rows" in single:
+        rows = point_baking.departures(rows, motion_ids[order], single["residual_rows"], single["residual_offsets"])
     rank = np.argsort(order)
     rows = [
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
@@ -205,7 +209,7 @@ def _motion_group(
     radius: float,
     anchor: int,
 ) -> MotionGroup:
-    """A row of the scene's table of groups. Tracks move their members rigidly, so that no residual is left."""
+    """A row of the scene's table of groups, as of one whose members all move rigidly with it."""
     if group.role == "body" and np.any(poses[:, 1:] != 0):
         fit = fitting.fit(times, poses[:, :4], poses[:, 4:], radius=radius, weights=group.observed.astype(np.float64))
         model = fit.model
@@ -229,18 +233,6 @@ def _unit(vector: np.ndarray) -> tuple[np.ndarray, float]:
     """Direction and length of a vector; along z where it has no length."""
     length = float(np.linalg.norm(vector))
     return (vector / length, length) if length > 1e-12 else (np.array([0.0, 0, 1]), 0.0)
-
-
-def _bind_shading(
-    sh: np.ndarray, shading: np.ndarray, quat: np.ndarray, light: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and shading vectors taken over to the bind state; see the module's notation."""
-    change = rotations.rotate(rotations.conjugate(quat), light) - light
-    factor = np.maximum(1 + shading @ change, MIN_BIND_FACTOR)
-    colored = sh * factor[:, None, None]
-    # The offset of one half scales too: dc_to_rgb(dc') = factor * dc_to_rgb(dc).
-    colored[:, 0] = spherical_harmonics.rgb_to_dc(spherical_harmonics.dc_to_rgb(sh[:, 0]) * factor[:, None])
-    return colored, rotations.rotate(quat, shading) / factor[:, None]
 
 
 def _pivot(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np.ndarray:

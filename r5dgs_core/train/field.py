@@ -27,12 +27,14 @@ from ..model.trd import TRD
 from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import field_baking, field_fitting, initialization, posing
+from . import field_baking, field_fitting, posing, rigidity, shading
 from .config import Config
 from .field_motion import Clock, Motion
 from .groups import ObservedMotion
+from .tracks_representation import TracksRepresentation
 
 QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
+ANCHORS_EVERY = 200  # steps between two elections of the representatives
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
 
 
@@ -56,28 +58,30 @@ class Moved:
 
 
 class FieldRepresentation:
-    """Gaussians moved one by one by `Motion`.
+    """Gaussians moved one by one by `Motion`, with shading that follows their rotations.
 
     Args:
-        start: What training starts from; its Gaussians are brought to the first time of training.
+        tracks: Where the masks put the objects, or tracks that were trained; the field may be fitted to them.
+        first: Knot of the tracks at which the Gaussians are canonical.
         config: The run's configuration.
     """
 
     name = "field"
 
-    def __init__(self, start: initialization.Start, config: Config):
-        self.times = start.tracks.times
+    def __init__(self, tracks: Tracks, first: int, config: Config):
+        self.times = tracks.times
         self.motion = _motion_of(self.times, config)
+        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._config = config
-        self._tracks = start.tracks
+        self._tracks = tracks
+        self._first = first
         self._last: Moved | None = None
-        self._first = start.first_time
-        bring_together(start.gaussians, start.tracks, start.first_time)
+        self._anchors: tuple[Tensor, Tensor] | None = None
 
     @property
     def params(self) -> dict[str, Tensor]:
-        """Weights of both networks."""
-        return _parameters(self.motion)
+        """Weights of both networks, and the light of the shading."""
+        return {**_parameters(self.motion), "light": self.light}
 
     def movers(self, gaussians: Gaussians) -> Tensor:
         """Rows that the networks move. [R] int64"""
@@ -101,13 +105,18 @@ class FieldRepresentation:
             colors = harmonics.seen_colors(
                 means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
             )
+        if self._config.train.shading:
+            change = rotations.rotate(rotations.conjugate(moved.quats), self.light) - self.light
+            factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
+            lit = colors[rows].clamp(min=0) * factor.clamp(min=0)
+            colors = colors.index_copy(0, rows, lit)
         return posing.pose(
             means,
             quats,
             log_scales,
             params["opacity_logits"],
             colors,
-            params["shading"],
+            torch.zeros(len(gaussians), 3),
             torch.zeros(3),
             torch.zeros(len(gaussians), dtype=torch.int64),
             _pinned(),
@@ -142,12 +151,28 @@ class FieldRepresentation:
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
-        """Distance of the moved Gaussians from the best rigid motion of their group."""
-        moved, weight = self._last, self._config.field.stiffness
-        self._last = None
-        if moved is None or weight <= 0 or self._tracks.bodies < 2:
+        """Stiffness of the groups, and L_rigid in the variant that has it."""
+        moved, self._last = self._last, None
+        if moved is None or self._tracks.bodies < 2:
             return None
-        return weight * stiffness(moved, gaussians.motion_ids[moved.rows])
+        groups, terms = gaussians.motion_ids[moved.rows], []
+        if self._config.field.stiffness > 0:
+            terms.append(self._config.field.stiffness * stiffness(moved, groups))
+        losses = self._config.losses
+        started = iteration >= losses.rigid_start * self._config.train.iterations
+        if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
+            anchors = self._anchors_of(gaussians, moved, groups, iteration)
+            terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def _anchors_of(self, gaussians: Gaussians, moved: Moved, groups: Tensor, iteration: int) -> Tensor:
+        """Representative of each mover's object among the movers; taken anew now and then and when rows change. [R]"""
+        means = gaussians.means
+        if self._anchors is None or self._anchors[0] is not means or iteration % ANCHORS_EVERY == 0:
+            bodies = torch.where(groups < self._tracks.bodies, groups, 0)
+            opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
+            self._anchors = means, rigidity.anchors(moved.before, bodies, opacities)
+        return self._anchors[1]
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
         """A field reaches all times already."""
@@ -166,11 +191,15 @@ class FieldRepresentation:
         named = {n: p.detach() for n, p in self.params.items()}
         tracks = self._tracks
         named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
-        return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
+        named |= {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
+        if self._anchors is not None:
+            named["field.anchors"] = self._anchors[1]
+        return named
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
         _load(self.motion, tensors)
+        self.light = tensors["light"].clone().requires_grad_(True)
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
@@ -196,6 +225,7 @@ class FieldRepresentation:
             tensors["field.times"].numpy(),
             tensors["field.casters"].tolist(),
             tensors["field.plane_normal"].numpy().astype(np.float64),
+            tensors["light"].numpy().astype(np.float64),
         )
 
 
@@ -284,12 +314,51 @@ def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, T
     return quats, b - rotations.rotate(quats, a), n >= 4
 
 
-def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int) -> None:
-    """Move each group of Gaussians, which start where they were seen best, to where it is at one knot, in place."""
+def from_tracks(
+    source: TracksRepresentation, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
+) -> FieldRepresentation:
+    """A field that goes on from tracks: fitted to their motion, with the Gaussians brought to one time.
+
+    Args:
+        source: The trained tracks.
+        gaussians: Changed in place: each body from its own canonical state to where it is at ``first``.
+        first: Knot at which the field's Gaussians are canonical.
+        config: The run's configuration.
+        draw: Source of the draws.
+    """
+    made = FieldRepresentation(source.tracks, first, config)
+    with torch.no_grad():
+        made.light.copy_(source.light)
+    bring_together(gaussians, source.tracks, first, source.light.detach())
+    rows = made.movers(gaussians)
+    means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+    section = config.field
+    field_fitting.fit_field(made.motion, means, groups, source.tracks, first, section.distill_steps, draw)
+    field_fitting.fit_trd(made.motion, means, groups, section.distill_steps, section.twist, draw)
+    return made
+
+
+def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor | None = None) -> None:
+    """Move each group of Gaussians, which start where they were seen best, to where it is at one knot, in place.
+
+    Args:
+        gaussians: The Gaussians.
+        tracks: The tracks that they moved by.
+        knot: The knot.
+        light: Light of their shading, where there is some. [3]
+    """
     with torch.no_grad():
         poses = tracks.poses(float(tracks.times[knot]))
         ids, centers = gaussians.motion_ids, tracks.group_centers()
-        means, quats = gaussians.params["means"], gaussians.params["quats"]
+        means, quats = gaussians.means, gaussians.quats
         arm = (means - centers[ids])[..., None]
         means.copy_((poses.rotmats[ids] @ arm)[..., 0] + centers[ids] + poses.displacements[ids])
         quats.copy_(rotations.multiply(poses.quats[ids], quats))
+        if light is None:
+            return
+        sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
+        vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
+        sh, vectors = shading.rebind(sh, vectors, turns, light.double().numpy())
+        gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
+        gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))
+        gaussians.shading.copy_(torch.from_numpy(vectors))

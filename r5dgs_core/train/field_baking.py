@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..motion import poses, rotations, se3
+from . import shading
 from .field_motion import Motion
 from .groups import GroupTrack, ObservedMotion, PointMotion
 
@@ -36,6 +37,7 @@ def observed_motion(
     times: np.ndarray,
     shadows: Sequence[int],
     normal: np.ndarray,
+    light: np.ndarray,
 ) -> ObservedMotion:
     """Sample a field at the knots and fit its groups.
 
@@ -49,6 +51,7 @@ def observed_motion(
         times: These knots. [K]
         shadows: Caster, a class, of each group from B on.
         normal: Normal of the plane that carries shadows. [3]
+        light: Light of the shading. [3]
     """
     at = knots(times, motion.horizon)
     rows, means = movers, gaussians["means"][movers]
@@ -63,6 +66,11 @@ def observed_motion(
     bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
     canonical = bind["means"].copy()
     for name, value in (("means", path[:, -1]), ("quats", turns[:, -1]), ("log_scales", sizes[:, -1])):
+        bind[name][rows.numpy()] = value
+    sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows.numpy()]
+    since = states[-1].quats.numpy().astype(np.float64)
+    sh, vectors = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), since, light)
+    for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
         bind[name][rows.numpy()] = value
     motion_ids = np.zeros(len(labels), np.int64)
     start_ids = gaussians["motion_ids"].numpy()[rows.numpy()]
@@ -88,7 +96,7 @@ def observed_motion(
         shift = leader.displacements @ matrix.T
         groups.append(GroupTrack(leader.object_id, "shadow", center, still[0], shift, leader.observed, caster, matrix))
     points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
-    return ObservedMotion(at, tuple(groups), np.zeros(3), bind, motion_ids, points)
+    return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points)
 
 
 def _track(path: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from ..model.gaussians import Gaussians
 from ..scene.cameras import Camera
 from . import initialization, posing
 from .config import Config
-from .field import FieldRepresentation
+from .field import FieldRepresentation, bring_together
 from .groups import ObservedMotion
 from .tracks_representation import TracksRepresentation
 
@@ -102,8 +102,11 @@ REPRESENTATIONS: dict[str, type[TracksRepresentation] | type[FieldRepresentation
 
 
 def make(start: initialization.Start, config: Config) -> Representation:
-    """The representation that the configuration asks for, at the start of training."""
-    return REPRESENTATIONS[config.train.representation](start, config)
+    """The representation that training starts with: the one asked for, or the tracks that a field starts from."""
+    if config.train.representation == TracksRepresentation.name or config.field.tracks_steps > 0:
+        return TracksRepresentation(start, config)
+    bring_together(start.gaussians, start.tracks, start.first_time)
+    return FieldRepresentation(start.tracks, start.first_time, config)
 
 
 def observed_motion(

@@ -239,7 +239,9 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
         extra["labels"] = identity.vote(trainer.views, pose, classes, fallback)
         section = trainer.config.identity
         steps, started = _identity_steps(trainer), time.monotonic()
-        if steps > 0:
+        if trainer.identity is not None:
+            extra |= trainer.identity.outcome(trainer.gaussians)
+        elif steps > 0:
 
             def report(step: int, loss: float) -> None:
                 if step % trainer.config.train.log_every == 0 or step == steps:

@@ -23,6 +23,8 @@ from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import (
     densification,
+    field,
+    identity,
     initialization,
     losses,
     needs,
@@ -37,6 +39,7 @@ from . import (
 )
 from .checkpoint import Checkpoint
 from .config import Config
+from .tracks_representation import TracksRepresentation
 
 log = logging.getLogger(__name__)
 
@@ -90,6 +93,10 @@ class Trainer:
             degree = 0 if config.needs.sky_gradient == "off" else sky.DEGREE
             self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color(), degree)
         self.generator = torch.Generator().manual_seed(config.train.seed)
+        classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
+        self.identity = identity.joint(self.views, classes, config)
+        if self.identity is not None:
+            self.identity.begin(self.gaussians)
         self.iteration = 0
         self.entered = (self.first_time, self.first_time)
         self.queue: list[int] = []
@@ -125,13 +132,14 @@ class Trainer:
 
     def _make_optimizer(self) -> torch.optim.Adam:
         rates = self.config.rates
+        classifier = {} if self.identity is None else self.identity.params
         groups = [
-            {"params": [p], "lr": getattr(rates, name), "name": name, "eps": 1e-15}
+            {"params": [p], "lr": self._base_rate(name), "name": name, "eps": 1e-15}
             for name, p in self.gaussians.params.items()
         ]
         groups += [
-            {"params": [p], "lr": getattr(rates, name.partition(".")[0]), "name": name, "eps": 1e-8}
-            for name, p in {**self.motion.params, **self.background.params}.items()
+            {"params": [p], "lr": self._base_rate(name), "name": name, "eps": 1e-8}
+            for name, p in {**self.motion.params, **self.background.params, **classifier}.items()
             if p.requires_grad
         ]
         return torch.optim.Adam(groups, fused=True)
@@ -149,6 +157,8 @@ class Trainer:
         """
         if self.iteration == 0:
             self.motion.begin(self.gaussians, self.generator)
+        if self.iteration == self.config.field.tracks_steps > 0 and isinstance(self.motion, TracksRepresentation):
+            self._leave_tracks(self.motion)
         self._grow_times()
         index = self._draw()
         view = self.views[index]
@@ -156,7 +166,7 @@ class Trainer:
             group["lr"] = self._rate(group["name"])
         stats = RasterStats()
         try:
-            image = self.render(view.camera, view.t, stats, self.generator)
+            image, features, splats = self._draw_all(view, stats)
         except ValueError as error:
             self._check_finite(0.0, view.name)
             raise TrainingError(
@@ -164,7 +174,9 @@ class Trainer:
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        penalties = (self.motion.penalty(self.gaussians, self.iteration), self.growth.penalty(self.gaussians))
+        penalties = [self.motion.penalty(self.gaussians, self.iteration), self.growth.penalty(self.gaussians)]
+        if self.identity is not None:
+            penalties.append(self.identity.loss(self.gaussians, splats, view, self.iteration, features))
         total = loss
         for penalty in penalties:
             total = total if penalty is None else total + penalty
@@ -183,11 +195,28 @@ class Trainer:
         self._maintain()
         return value
 
-    def render(
-        self, camera: Camera, t: float, stats: RasterStats | None = None, draw: torch.Generator | None = None
-    ) -> Tensor:
-        """Image of a camera in normalised coordinates at a time; ``draw`` as for `splats`. [H, W, 3]"""
-        splats = self.splats(camera, t, draw)
+    def _draw_all(self, view: views.TrainView, stats: RasterStats) -> tuple[Tensor, Tensor | None, posing.Splats]:
+        """A training view's image, its blended encodings where they are drawn in the same pass, and the splats."""
+        splats = self.splats(view.camera, view.t, self.generator)
+        colors, background = splats.colors, self.background.image(view.camera)
+        together = self.identity is not None and self.identity.with_geometry
+        if self.identity is not None and together:
+            colors, background = self.identity.channels(self.gaussians, colors, background)
+        image = rasterize_splats(
+            splats.means,
+            splats.quats,
+            splats.scales,
+            splats.opacities,
+            colors,
+            view.camera,
+            background,
+            stats=stats,
+        ).image
+        return (image[..., :3].contiguous(), image[..., 3:], splats) if together else (image, None, splats)
+
+    def render(self, camera: Camera, t: float) -> Tensor:
+        """Image of a camera in normalised coordinates at a time. [H, W, 3]"""
+        splats = self.splats(camera, t)
         return rasterize_splats(
             splats.means,
             splats.quats,
@@ -196,12 +225,17 @@ class Trainer:
             splats.colors,
             camera,
             self.background.image(camera),
-            stats=stats,
         ).image
 
     def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> posing.Splats:
         """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
         return self.motion.splats(self.gaussians, camera, t, draw)
+
+    def _leave_tracks(self, tracks: TracksRepresentation) -> None:
+        """Go on with a field where the configuration asks for one that starts from tracks."""
+        if self.config.train.representation == field.FieldRepresentation.name:
+            self.motion = field.from_tracks(tracks, self.gaussians, self.first_time, self.config, self.generator)
+            self.optimizer = self._make_optimizer()
 
     def _target(self, index: int) -> Tensor:
         """The view's image in [0, 1]; kept as long as all of them fit, converted each time where they do not."""
@@ -212,10 +246,17 @@ class Trainer:
             self._targets[index] = target
         return target
 
+    def _base_rate(self, name: str) -> float:
+        """Learning rate that a parameter begins with, by the part of its name before the first dot."""
+        group = name.partition(".")[0]
+        if self.identity is not None and group in self.identity.rates:
+            return self.identity.rates[group]
+        return getattr(self.config.rates, group)
+
     def _rate(self, name: str) -> float:
         rates = self.config.rates
+        base = self._base_rate(name)
         name = name.partition(".")[0]
-        base = getattr(rates, name)
         if name == "shading" and not self.config.train.shading:
             return 0.0
         progress = self.iteration / self.config.train.iterations
@@ -279,6 +320,7 @@ class Trainer:
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
         named = {**self.gaussians.params, **self.motion.params, **self.background.params}
+        named |= {} if self.identity is None else self.identity.params
         bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
         bad += [f"gradient of {n}" for n, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
         if bad or not math.isfinite(value):
@@ -296,6 +338,8 @@ class Trainer:
         tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
         tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
         tensors |= self.motion.tensors()
+        if self.identity is not None:
+            tensors |= self.identity.tensors(self.gaussians)
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
@@ -319,6 +363,8 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
+        if state.representation == field.FieldRepresentation.name and isinstance(self.motion, TracksRepresentation):
+            self.motion = field.FieldRepresentation(self.motion.tracks, self.first_time, self.config)
         if state.representation != self.motion.name:
             raise CheckpointError(
                 f"the checkpoint was trained with representation '{state.representation}', "
@@ -328,6 +374,8 @@ class Trainer:
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
         self.motion.restore(tensors)
+        if self.identity is not None:
+            self.identity.restore(tensors, self.gaussians)
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
         self.object_ids = tensors["object_ids"].numpy()
         self.generator.set_state(tensors["generator"])
