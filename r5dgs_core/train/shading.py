@@ -1,7 +1,7 @@
 """Colours of bodies that turn in fixed light, taken over from one state of a body to another.
 
-With shading vectors g and light l the colour is c (1 + (R^T l - l) . g) for a rotation R since the first state. Seen from
-a state that is turned by Q, with b = 1 + (Q^T l - l) . g, the same colours are those of c b and Q g / b.
+With shading vectors g and light l the colour is c (1 + (R^T l - l) . g) for a rotation R since the first state. Seen
+from a state that is turned by Q, with b = 1 + (Q^T l - l) . g, the same colours are those of c b and Q g / b.
 """
 
 from __future__ import annotations

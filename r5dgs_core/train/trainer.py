@@ -131,7 +131,6 @@ class Trainer:
         return spherical_harmonics.rgb_to_dc(color)[None]
 
     def _make_optimizer(self) -> torch.optim.Adam:
-        rates = self.config.rates
         classifier = {} if self.identity is None else self.identity.params
         groups = [
             {"params": [p], "lr": self._base_rate(name), "name": name, "eps": 1e-15}
