@@ -55,13 +55,12 @@ class Found:
 
 @dataclass(frozen=True)
 class _Frame:
-    """An image, whose pose it has, when it was taken, and its number where its name gives the time."""
+    """An image, whose pose it has, and when it was taken."""
 
     name: str
     pose: Registered
     camera: str
     t: float = 0.0
-    number: float | None = None
 
 
 def folder(root: Path) -> Path | None:
@@ -94,7 +93,9 @@ def read(root: Path) -> Found:
         header |= more
         frames = _timed(root, model.images, times, path)
     else:
-        frames = _videos(root, model.images)
+        frames, numbers = _videos(root, model.images)
+        if numbers:
+            header["frames_per_unit"] = float(numbers)
         frames = frames or [_Frame(image.name, image, _stem(image.name)) for image in model.images]
     splits = _split(frames, header.get("t_max", math.inf))
     entries = {
@@ -145,8 +146,11 @@ def _timed(root: Path, registered: tuple[Registered, ...], times: dict[str, floa
     return frames
 
 
-def _videos(root: Path, registered: tuple[Registered, ...]) -> list[_Frame]:
-    """The frames of cameras that stand still; empty where there are none with more than one frame."""
+def _videos(root: Path, registered: tuple[Registered, ...]) -> tuple[list[_Frame], int]:
+    """The frames of cameras that stand still, none where no camera has more than one, and the last of their numbers.
+
+    The first number is 0.
+    """
     found: list[tuple[str, Registered, str]] = []
     moving = False
     for camera, pose in _standing(registered).items():
@@ -154,7 +158,7 @@ def _videos(root: Path, registered: tuple[Registered, ...]) -> list[_Frame]:
         moving = moving or len(names) > 1
         found += [(name, pose, camera) for name in names]
     if not moving:
-        return []
+        return [], 0
     numbers = []
     for name, _, _ in found:
         match = re.search(r"(\d+)$", _stem(name))
@@ -164,15 +168,16 @@ def _videos(root: Path, registered: tuple[Registered, ...]) -> list[_Frame]:
                 f"in {root / 'times.json'}"
             )
         numbers.append(int(match[1]))
-    first, span = min(numbers), max(max(numbers) - min(numbers), 1)
+    first, span = min(numbers), max(numbers) - min(numbers)
     used = {pose.name for _, pose, _ in found}
     for image in registered:
         if image.name not in used:
             _log.warning("%s: left out, as nothing says its time; give times.json", image.name)
-    return [
-        _Frame(name, pose, camera, (number - first) / span, float(number))
+    frames = [
+        _Frame(name, pose, camera, (number - first) / max(span, 1))
         for (name, pose, camera), number in zip(found, numbers, strict=True)
     ]
+    return frames, span
 
 
 def _standing(registered: tuple[Registered, ...]) -> dict[str, Registered]:
@@ -223,7 +228,7 @@ def _entry(sparse: Path, frame: _Frame) -> Entry:
         matrix=cameras.cam_world_to_opengl(frame.pose.T_cam_world),
         camera=frame.camera,
         lens={"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width, "h": lens.height},
-        frame=frame.number,
+        frame=None,
     )
 
 

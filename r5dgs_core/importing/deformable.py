@@ -54,8 +54,11 @@ def principal_axes(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
     inner = np.swapaxes(axes, -1, -2) @ linear
     covariance = inner @ np.swapaxes(inner, -1, -2)
     for _ in range(_SWEEPS):
+        before = axes
         for p, q in ((0, 1), (0, 2), (1, 2)):
             covariance, axes = _rotate_pair(covariance, axes, p, q)
+        if axes is before:
+            break
     variances = np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), _SMALLEST**2)
     return rotations.rotmats_to_quats(axes), 0.5 * np.log(variances)
 
@@ -72,6 +75,8 @@ def _rotate_pair(covariance: np.ndarray, axes: np.ndarray, p: int, q: int) -> tu
     """One Jacobi rotation by at most 45 degrees that makes element (p, q) zero. [n, 3, 3] each"""
     off = covariance[:, p, q]
     wanted = np.abs(off) > _ROUNDING * np.trace(covariance, axis1=-2, axis2=-1)
+    if not wanted.any():
+        return covariance, axes
     with np.errstate(over="ignore"):  # an infinite ratio gives no rotation
         ratio = np.divide(covariance[:, q, q] - covariance[:, p, p], 2 * off, out=np.zeros_like(off), where=wanted)
         tangent = np.where(wanted, np.copysign(1, ratio) / (np.abs(ratio) + np.sqrt(1 + ratio * ratio)), 0)
