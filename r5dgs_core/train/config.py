@@ -105,6 +105,7 @@ class RatesSection:
         slope: How shadows follow their casters.
         field: Weights of the deformation field.
         trd: Weights of the TRD network.
+        residual: Residual motion of bodies that bend or breathe.
         background: Harmonics of the sky.
         decay: Factor by which rates have fallen at the end of the run.
         decay_networks: The same for the networks of ``field``.
@@ -125,6 +126,7 @@ class RatesSection:
     slope: float = 1e-2
     field: float = 8e-4
     trd: float = 8e-4
+    residual: float = 6e-3
     background: float = 2e-3
     decay: float = 0.02
     decay_networks: float = 0.02
@@ -293,6 +295,27 @@ class DensifyMcmcSection:
 
 
 @dataclass(frozen=True)
+class ResidualSection:
+    """Residual motion of bodies that bend or breathe (`residual.py`).
+
+    Attributes:
+        start: Share of the run after which all bodies are tried; not before every time takes part.
+        trial_steps: Steps of the trial, in runs of 2000 steps or more.
+        threshold: Bodies on which the error grows by more without them keep their residuals, dB.
+        nodes: Places on a body that carry its residuals.
+        size: Weight of the mean squared residual, per length of the body.
+        roughness: Weight of its mean squared second difference over the knots.
+    """
+
+    start: float = 0.4
+    trial_steps: int = 200
+    threshold: float = 0.5
+    nodes: int = 40
+    size: float = 1e-3
+    roughness: float = 0.01
+
+
+@dataclass(frozen=True)
 class IdentitySection:
     """Identity encodings (Gaussian Grouping).
 
@@ -336,6 +359,7 @@ class NeedsSection:
         view_dependent_colour: Harmonics of the colour, to ``train.sh_degree`` (at least 1 where this is on).
         sky_gradient: Harmonics of the sky; without them it has one colour.
         classifier: Identity encodings and their classifier.
+        residuals: Motion of objects that bend or breathe.
     """
 
     tracks: str = "auto"
@@ -345,6 +369,7 @@ class NeedsSection:
     view_dependent_colour: str = "auto"
     sky_gradient: str = "auto"
     classifier: str = "auto"
+    residuals: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -360,6 +385,7 @@ class Config:
     densify: DensifySection = dataclasses.field(default_factory=DensifySection)
     densify_default: DensifyDefaultSection = dataclasses.field(default_factory=DensifyDefaultSection)
     densify_mcmc: DensifyMcmcSection = dataclasses.field(default_factory=DensifyMcmcSection)
+    residual: ResidualSection = dataclasses.field(default_factory=ResidualSection)
     identity: IdentitySection = dataclasses.field(default_factory=IdentitySection)
     needs: NeedsSection = dataclasses.field(default_factory=NeedsSection)
 
@@ -531,6 +557,9 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("losses.ssim", *_SHARE),
     ("curriculum.newest", *_SHARE),
     ("densify.strategy", lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
+    ("residual.start", *_SHARE),
+    ("residual.trial_steps", *_AT_LEAST_1),
+    ("residual.nodes", *_AT_LEAST_1),
     ("densify.stop", *_SHARE),
     ("densify.every", *_AT_LEAST_1),
     ("densify.share", *_SHARE),

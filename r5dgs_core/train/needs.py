@@ -83,6 +83,7 @@ def decide(
     bases: int,
     classified: bool,
     wanted: NeedsSection | None = None,
+    residuals: tuple[float, float, bool, str] = (0.0, 0.0, False, "none was tried"),
 ) -> tuple[dict[str, Any], ...]:
     """The needs table of a baked scene.
 
@@ -96,6 +97,7 @@ def decide(
         bases: Spherical harmonics bases of the colours.
         classified: Whether identities and their classifier were trained.
         wanted: The user's word on each row; by default everything is measured.
+        residuals: Value and threshold of the residuals of single Gaussians, whether there are any, what the value is.
 
     Returns:
         Rows with name, value, threshold, decision ("on" or "off") and reason, which says where the user decided. What
@@ -121,6 +123,7 @@ def decide(
         ("view_dependent_colour", bases, 2, bases > 1, bases > 1, "spherical harmonics bases"),
         ("sky_gradient", sky, 2, sky > 1, sky > 1, "spherical harmonics bases of the sky"),
         ("classifier", len(bodies), 1, classified, classified, "objects with masks"),
+        ("residuals", residuals[0], residuals[1], residuals[2], residuals[2], residuals[3]),
     ]
     return tuple(
         _row(name, value, threshold, on, there, reason, getattr(wanted, name))

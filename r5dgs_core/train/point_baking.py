@@ -6,11 +6,14 @@ Q_s (x_T - p) + p + D_s; a residual is the change of the bind state that its gro
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..motion import rotations
+from ..scene.scene import MotionGroup
 from .groups import PointMotion
 from .normalization import Normalization
 
@@ -71,4 +74,24 @@ def members(
     result["residual_offsets"] = offsets[kept].astype(np.float32)
     result["residual_quats"] = np.ascontiguousarray(flat).astype(np.float32)
     result["residual_log_scales"] = growths[kept].astype(np.float32)
+    return result
+
+
+def departures(
+    groups: Sequence[MotionGroup], motion_ids: np.ndarray, rows: np.ndarray, offsets: np.ndarray
+) -> list[MotionGroup]:
+    """The groups with the distance that their members keep from rigid motion in the observed time.
+
+    Args:
+        groups: Motion groups.
+        motion_ids: Group of each Gaussian of the scene. [N]
+        rows: Those with residuals. [R]
+        offsets: Their residual offsets. [R, S, 3]
+    """
+    squares, result = (offsets.astype(np.float64) ** 2).sum(-1), []
+    for group in groups:
+        mine = squares[motion_ids[rows] == group.id]
+        count = max(1, int((motion_ids == group.id).sum()) * squares.shape[1])
+        rms, largest = float(np.sqrt(mine.sum() / count)), float(np.sqrt(mine.max(initial=0.0)))
+        result.append(dataclasses.replace(group, rigid_rms=rms, rigid_max=largest))
     return result

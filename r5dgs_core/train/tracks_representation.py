@@ -10,11 +10,12 @@ from torch import Tensor
 
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
+from ..model.residual_field import ResidualField
 from ..model.tracks import Tracks
 from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import initialization, posing
+from . import initialization, posing, residual
 from .config import Config
 from .groups import GroupTrack, ObservedMotion
 
@@ -36,6 +37,8 @@ class TracksRepresentation:
         self.tracks = tracks = start.tracks
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._places = start.places
+        self.residuals: ResidualField | None = None
+        self._gains: Tensor | None = None  # of the residuals by body, once they were tried
         self._config = config
         self._moves = config.needs.tracks != "off"
         if not self._moves:
@@ -44,8 +47,9 @@ class TracksRepresentation:
 
     @property
     def params(self) -> dict[str, Tensor]:
-        """Tracks and light direction."""
-        return {**self.tracks.params, "light": self.light}
+        """Tracks, light direction, and residuals where bodies have any."""
+        residuals = {} if self.residuals is None else {"residual": self.residuals.values}
+        return {**self.tracks.params, "light": self.light, **residuals}
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
         """Nothing: the tracks start where the masks put them."""
@@ -71,10 +75,17 @@ class TracksRepresentation:
                 rest=params["sh_rest"],
                 pose_ids=gaussians.motion_ids,
             )
+        means, quats, log_scales = params["means"], params["quats"], params["log_scales"]
+        if self.residuals is not None:
+            weights, opacities = self.tracks.knot_weights(t), torch.sigmoid(params["opacity_logits"])
+            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, weights)
+            means = means.index_add(0, change.rows, change.offsets)
+            log_scales = log_scales.index_add(0, change.rows, change.log_scales)
+            quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
         return posing.pose(
-            params["means"],
-            params["quats"],
-            params["log_scales"],
+            means,
+            quats,
+            log_scales,
             params["opacity_logits"],
             colors,
             params["shading"],
@@ -86,10 +97,13 @@ class TracksRepresentation:
 
     def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
         """Roughness of the tracks, now and then with the weight of the steps in between."""
-        weight = self._config.losses.roughness
-        if weight <= 0 or iteration % ROUGHNESS_EVERY:
+        weight, section = self._config.losses.roughness, self._config.residual
+        if iteration % ROUGHNESS_EVERY or (weight <= 0 and self.residuals is None):
             return None
-        return ROUGHNESS_EVERY * weight * self.tracks.roughness()
+        total = weight * self.tracks.roughness()
+        if self.residuals is not None:
+            total = total + self.residuals.penalty(section.size, section.roughness)
+        return ROUGHNESS_EVERY * total
 
     @torch.no_grad()
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
@@ -122,12 +136,16 @@ class TracksRepresentation:
         for name in ("centers", "base_quats", "casters", "plane_normal"):
             named[f"tracks.{name}"] = getattr(tracks, name)
         named["light"] = self.light.detach()
-        return named
+        if self._gains is not None:
+            named["residual.gains"] = self._gains
+        return named if self.residuals is None else named | residual.tensors_of(self.residuals)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
         self.tracks = tracks_of(tensors)
         self.light = tensors["light"].clone().requires_grad_(True)
+        self._gains = tensors.get("residual.gains")
+        self.residuals = residual.residual_of(tensors)
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
@@ -171,7 +189,11 @@ class TracksRepresentation:
                     follow,
                 )
             )
-        return ObservedMotion(tracks.times, tuple(groups), tensors["light"].numpy().astype(np.float64))
+        light, field = tensors["light"].numpy().astype(np.float64), residual.residual_of(tensors)
+        if field is None:
+            return ObservedMotion(tracks.times, tuple(groups), light)
+        points, bind = residual.point_motion(field, tracks, tensors)
+        return ObservedMotion(tracks.times, tuple(groups), light, bind, points=points)
 
 
 def tracks_of(tensors: dict[str, Tensor]) -> Tracks:

@@ -31,6 +31,7 @@ from . import (
     normalization,
     posing,
     representation,
+    residual,
     sky,
     strategies,
     sweep,
@@ -45,7 +46,7 @@ log = logging.getLogger(__name__)
 
 TARGET_BYTES = 1 << 30
 FLOATER_CAMERAS = 256  # cameras that are asked whether they see what floats before another
-GEOMETRY = ("means", "translations", "rotvecs", "light", "slope")
+GEOMETRY = ("means", "translations", "rotvecs", "light", "slope", "residual")
 NETWORKS = ("field", "trd")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
@@ -315,6 +316,8 @@ class Trainer:
                 f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
                 "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
             )
+        if self.iteration == residual.decision_step(self.config, self._curriculum()[1]):
+            residual.decide(self)
 
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""

@@ -17,7 +17,9 @@ from tests import datasets as tiny_datasets
 RADIUS = 0.4
 
 
-def table(travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bodies=1, classified=True, wanted=None):
+def table(
+    travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bodies=1, classified=True, wanted=None, bent=0
+):
     """The decisions for bodies of which the first moves by ``travel`` diameters and turns by ``turn`` radians."""
     poses = [np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1)) for _ in range(bodies + 2)]
     if bodies:
@@ -30,7 +32,8 @@ def table(travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bo
     ids = np.array([0] * 5 + [1] * 5 * (bodies > 0) + [bodies + 1] * 5 * shadow)
     gradients = np.full((len(ids), 3), shading)
     light, behind, given = np.array([0, 0, 1.0]), np.zeros((sky, 3)), config.NeedsSection(**(wanted or {}))
-    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given)
+    bending = (float(bent), 0.5, bent > 0, "gain")
+    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given, bending)
     return {row["name"]: row for row in rows}
 
 
@@ -54,6 +57,7 @@ def test_a_scene_at_rest_needs_nothing_that_moves():
         ({"shadow": True}, "shadows"),
         ({"bases": 4}, "view_dependent_colour"),
         ({"sky": 4}, "sky_gradient"),
+        ({"bent": 3}, "residuals"),
     ],
 )
 def test_each_need_follows_its_own_cause(given, name):
@@ -105,7 +109,7 @@ def test_the_tiny_scene_is_judged_by_what_it_shows(baked):
     assert found["view_dependent_colour"] == "off"
 
 
-EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True}
+EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
 NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
 
 
@@ -128,7 +132,9 @@ def test_an_object_at_rest_may_be_said_to_move(name):
     assert row["decision"] == "on" and row["reason"].startswith("set on by you;")
 
 
-@pytest.mark.parametrize("name", ["shading", "shadows", "view_dependent_colour", "sky_gradient", "classifier"])
+@pytest.mark.parametrize(
+    "name", ["shading", "shadows", "view_dependent_colour", "sky_gradient", "classifier", "residuals"]
+)
 def test_what_was_not_learned_cannot_be_switched_on_and_the_table_says_so(name):
     row = table(classified=False, wanted={name: "on"})[name]
     assert row["decision"] == "off" and "set on by you, but this run has none" in row["reason"]
