@@ -67,7 +67,9 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
     chosen = importer.Options(**{name: value for name, value in options.items() if value is not None})
     with make(progress_kind) as progress:
         scene = importer.import_run(
-            run_folder, chosen, lambda done, total: progress({"event": "import", "done": done, "total": total})
+            run_folder,
+            chosen,
+            lambda done, total: progress({"event": "import", "done": done, "total": total, "unit": "Gaussians"}),
         )
         scene_file.write(scene, out)
         if progress_kind == "json":

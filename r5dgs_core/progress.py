@@ -125,5 +125,5 @@ def describe(event: Event) -> str:
     if event.get("from"):
         parts.append(f"going on at step {event['from']}")
     if "total" in event:
-        parts.append(f"of {event['total']} images")
+        parts.append(f"of {event['total']} {event.get('unit', 'images')}")
     return ", ".join(parts)

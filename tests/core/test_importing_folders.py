@@ -290,12 +290,14 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
     assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "none"]) == 0
     assert f"{out}: 24 Gaussians, 0 objects, t_max 1" in capsys.readouterr().out
+    assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
+    assert "import 24: of 24 Gaussians" in capsys.readouterr().out
     scene = scene_file.read(out)
     assert scene.name == "run" and len(scene.track_times) == 3
     assert scene.provenance["imported"]["settings"]["is_blender"] is True
     assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert events[0] == {"event": "import", "done": 24, "total": 24}
+    assert events[0] == {"event": "import", "done": 24, "total": 24, "unit": "Gaussians"}
     assert events[-1] == {"event": "imported", "path": str(out), "gaussians": 24}
 
 
