@@ -139,22 +139,44 @@ class Tracks:
         self.base_quats = rotations.normalize(self.knot_quats()).detach()
         self.params["rotvecs"].zero_()
 
-    def roughness(self) -> Tensor:
+    def roughness(
+        self,
+        entered: tuple[int, int] | None = None,
+        shift_stiffness: Tensor | None = None,
+        turn_stiffness: Tensor | None = None,
+    ) -> Tensor:
         """Mean squared second difference of displacements and rotations over the knots (0 for steady motion).
 
         Knots may be unevenly spaced: divided differences are scaled by the squared mean spacing, so that even spacing
         gives plain second differences.
+
+        Args:
+            entered: First and last knot that count; all where None. The mean stays that over all knots.
+            shift_stiffness: Weight of each body's displacement at each knot; 1 where None. [B - 1, S]
+            turn_stiffness: Weight of its rotation about each axis, world; the identity where None. [B - 1, S, 3, 3]
         """
-        if len(self.times) < 3 or self.bodies < 2:
+        first, last = (0, len(self.times) - 1) if entered is None else entered
+        if last - first < 2 or self.bodies < 2:
             return torch.zeros(())
-        step = torch.from_numpy(np.diff(self.times)).float()[None, :, None]
-        quats = self.knot_quats()[1:]
-        turns = rotations.quats_to_rotvecs(rotations.multiply(quats[:, 1:], rotations.conjugate(quats[:, :-1])))
-        shifts = self.params["translations"][1:, 1:] - self.params["translations"][1:, :-1]
+        step = torch.from_numpy(np.diff(self.times)).float()
         mean_step = step.mean()
-        total = torch.zeros(())
-        for change in (shifts, turns):
+        step = step[first:last][None, :, None]
+        here = slice(first, last + 1)
+        quats = rotations.multiply(
+            rotations.rotvecs_to_quats(self.params["rotvecs"][1:, here]), self.base_quats[1:, here]
+        )
+        turns = rotations.quats_to_rotvecs(rotations.multiply(quats[:, 1:], rotations.conjugate(quats[:, :-1])))
+        shifts = self.params["translations"][1:, here]
+        squares = []
+        for change, stiffness in ((shifts[:, 1:] - shifts[:, :-1], shift_stiffness), (turns, turn_stiffness)):
             rate = change / step
             second = 2 * (rate[:, 1:] - rate[:, :-1]) / (step[:, 1:] + step[:, :-1]) * mean_step**2
-            total = total + (second**2).mean()
-        return total
+            if stiffness is None:
+                weighted = second
+            else:
+                stiffness = stiffness[:, here]
+                middle = (stiffness[:, :-2] + stiffness[:, 1:-1] + stiffness[:, 2:]) / 3
+                flat = middle.dim() == 2
+                weighted = middle[..., None] * second if flat else (middle @ second[..., None])[..., 0]
+            squares.append((second * weighted).sum())
+        return sum(squares, torch.zeros(())) / (3 * (self.bodies - 1) * (len(self.times) - 2))

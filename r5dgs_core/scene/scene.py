@@ -58,8 +58,8 @@ class MotionGroup:
         follow_matrix: Linear map from that group's displacement to this one's. [3, 3]
         rigid_rms: Root mean square of the distance that members keep from this rigid motion in the observed time.
         rigid_max: The same, largest.
-        seen: First and last time at which the object was placed by its masks; before it, the track holds its first
-            pose. None where nothing was observed.
+        seen: First and last time at which the object was placed by its masks; before it, the track goes on steadily or
+            holds its first pose. None where nothing was observed.
     """
 
     id: int

@@ -89,7 +89,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         sh[members], shading[members] = shading_vectors.rebind(sh[members], shading[members], q, light)
         pivot = _pivot(means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
-        if group.observed.any():  # nothing is known of an object before it is seen
+        if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen
             first = int(np.argmax(group.observed))
             poses[:first] = poses[first]
         radius = _radius(means[members], opacities[members], pivot)

@@ -73,6 +73,7 @@ class ObservedMotion:
         gaussians: Parameters by name that the groups' tracks start from, where they are not the canonical ones.
         motion_ids: Group of each Gaussian, where it is not that of the training. [N]
         points: Motion of single Gaussians, or None where all move with their groups.
+        smooth: Whether the tracks go on smoothly before their objects are seen; else they hold the first observed pose.
     """
 
     times: np.ndarray
@@ -81,3 +82,4 @@ class ObservedMotion:
     gaussians: dict[str, np.ndarray] | None = None
     motion_ids: np.ndarray | None = None
     points: PointMotion | None = None
+    smooth: bool = False

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
-from . import hull, shadows, sweep, triangulation
+from . import evidence, hull, shadows, sweep, triangulation
 from .config import Config
 from .views import TrainView, nearest_knot
 
@@ -37,6 +37,7 @@ class Start:
         first_time: Index of the time at which training begins.
         plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
         sky: Coefficients of the sky, or None where none was found. [9, 3]
+        evidence: What the images can tell of the objects' motion.
     """
 
     gaussians: Gaussians
@@ -46,6 +47,7 @@ class Start:
     first_time: int
     plane: tuple[np.ndarray, float] | None
     sky: np.ndarray | None
+    evidence: evidence.Evidence
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
@@ -151,7 +153,9 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
     )
     with torch.no_grad():
         tracks.params["slope"].copy_(torch.from_numpy(shadow_slope))
-    return Start(gaussians, tracks, np.concatenate([[0], places.object_ids]), places, first, plane, placed.sky)
+    known = evidence.gather(views, scenes, places, times)
+    ids = np.concatenate([[0], places.object_ids])
+    return Start(gaussians, tracks, ids, places, first, plane, placed.sky, known)
 
 
 def supporting_plane(

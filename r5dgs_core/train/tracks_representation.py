@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..scene.cameras import Camera
 from . import initialization, posing, residual
 from .config import Config
 from .groups import GroupTrack, ObservedMotion
+from .views import nearest_knot
 
 ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
 REBASE_EVERY = 100
@@ -37,6 +39,11 @@ class TracksRepresentation:
         self.tracks = tracks = start.tracks
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._places = start.places
+        self._absent = start.evidence.absent
+        self._stiffness = tuple(
+            torch.from_numpy(a).float() for a in (start.evidence.shift_stiffness, start.evidence.turn_stiffness)
+        )
+        self._entered = (start.first_time, start.first_time)
         self.residuals: ResidualField | None = None
         self._gains: Tensor | None = None  # of the residuals by body, once they were tried
         self._config = config
@@ -82,7 +89,7 @@ class TracksRepresentation:
             means = means.index_add(0, change.rows, change.offsets)
             log_scales = log_scales.index_add(0, change.rows, change.log_scales)
             quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
-        return posing.pose(
+        splats = posing.pose(
             means,
             quats,
             log_scales,
@@ -94,34 +101,53 @@ class TracksRepresentation:
             poses,
             centers,
         )
+        gone = self._absent[:, nearest_knot(self.tracks.times, t)]
+        if not gone.any():
+            return splats
+        there = torch.from_numpy(np.concatenate([[1.0], ~gone])).float()
+        there = torch.cat([there, there[self.tracks.casters]])
+        return dataclasses.replace(splats, opacities=splats.opacities * there[gaussians.motion_ids])
 
     def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
-        """Roughness of the tracks, now and then with the weight of the steps in between."""
+        """Roughness of the tracks, most where little is seen; now and then, with the weight of the steps in between."""
         weight, section = self._config.losses.roughness, self._config.residual
         if iteration % ROUGHNESS_EVERY or (weight <= 0 and self.residuals is None):
             return None
-        total = weight * self.tracks.roughness()
+        total = weight * self.tracks.roughness(self._entered, *self._stiffness)
         if self.residuals is not None:
             total = total + self.residuals.penalty(section.size, section.roughness)
         return ROUGHNESS_EVERY * total
 
     @torch.no_grad()
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """Start a knot's poses from its entered neighbours: steady rotation, triangulated translation."""
+        """Start a knot's poses: rotations go on steadily, displacements along the path that the masks tell.
+
+        Beyond the last mask of an object its displacement goes on steadily too: the images may show it all the same.
+        """
         self.tracks.rebase()
+        self._entered = (min(entered[0], knot), max(entered[1], knot))
         if not self._moves:
             return
         near, next_near = knot + towards, knot + 2 * towards
         quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
         steady = entered[0] <= next_near <= entered[1]
-        turn = rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near])) if steady else None
-        quats[:, knot] = quats[:, near] if turn is None else rotations.multiply(turn, quats[:, near])
-        for row in range(1, self.tracks.bodies):
-            if self._places.measured[row - 1, knot] and self._places.measured[row - 1, near]:
-                here, there = (self._places.centers[row - 1, k] for k in (knot, near))
-                shifts[row, knot] = shifts[row, near] + torch.from_numpy(here - there).float()
-            elif steady:
-                shifts[row, knot] = 2 * shifts[row, near] - shifts[row, next_near]
+        ratio, turns = 0.0, torch.zeros(self.tracks.bodies, 3)
+        if steady:
+            ratio = (self.tracks.times[knot] - self.tracks.times[near]) / (
+                self.tracks.times[near] - self.tracks.times[next_near]
+            )
+            turns = rotations.quats_to_rotvecs(
+                rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near]))
+            )
+        quats[:, knot] = rotations.multiply(rotations.rotvecs_to_quats(ratio * turns), quats[:, near])
+        for row, (path, measured, gone) in enumerate(
+            zip(self._places.centers, self._places.measured, self._absent, strict=True), start=1
+        ):
+            beyond = not (measured[: knot + 1] if towards > 0 else measured[knot:]).any()
+            if beyond and steady and not gone[[knot, near]].any():
+                shifts[row, knot] = shifts[row, near] + ratio * (shifts[row, near] - shifts[row, next_near])
+            else:
+                shifts[row, knot] = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float()
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Fold learned rotations into the base."""
@@ -135,6 +161,7 @@ class TracksRepresentation:
         named["tracks.times"] = torch.from_numpy(tracks.times)
         for name in ("centers", "base_quats", "casters", "plane_normal"):
             named[f"tracks.{name}"] = getattr(tracks, name)
+        named["tracks.entered"] = torch.tensor(self._entered)
         named["light"] = self.light.detach()
         if self._gains is not None:
             named["residual.gains"] = self._gains
@@ -143,6 +170,8 @@ class TracksRepresentation:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
         self.tracks = tracks_of(tensors)
+        first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
+        self._entered = (first, last)
         self.light = tensors["light"].clone().requires_grad_(True)
         self._gains = tensors.get("residual.gains")
         self.residuals = residual.residual_of(tensors)
@@ -191,9 +220,9 @@ class TracksRepresentation:
             )
         light, field = tensors["light"].numpy().astype(np.float64), residual.residual_of(tensors)
         if field is None:
-            return ObservedMotion(tracks.times, tuple(groups), light)
+            return ObservedMotion(tracks.times, tuple(groups), light, smooth=True)
         points, bind = residual.point_motion(field, tracks, tensors)
-        return ObservedMotion(tracks.times, tuple(groups), light, bind, points=points)
+        return ObservedMotion(tracks.times, tuple(groups), light, bind, points=points, smooth=True)
 
 
 def tracks_of(tensors: dict[str, Tensor]) -> Tracks:

@@ -32,14 +32,14 @@ def trainer_of(run_made):
     return trainer
 
 
-def assert_shows_what_was_trained(run_made, scene):
+def assert_shows_what_was_trained(run_made, scene, bar=50.0):
     """Every seventh training view, drawn from the scene and by the trainer."""
     trainer = trainer_of(run_made)
     for view, trained_view in list(zip(trainer.dataset.train, trainer.views, strict=True))[::7]:
         with torch.no_grad():
             expected = trainer.render(trained_view.camera, trained_view.t).numpy()
         shown = scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy()
-        assert psnr(shown.clip(0, 1), expected.clip(0, 1)) > 50
+        assert psnr(shown.clip(0, 1), expected.clip(0, 1)) > bar
 
 
 def test_a_baked_scene_is_valid_and_complete(baked, trained):
@@ -69,7 +69,8 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
         checkpoint.save(made.folder, state)
     scene = bake.bake(made)
     assert not scene.provenance["train"]["finished"] and scene.identities is None
-    assert_shows_what_was_trained(made, scene)
+    # Random harmonics differ much between neighbours, so that an order changed by rounding shows.
+    assert_shows_what_was_trained(made, scene, 45.0)
 
 
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
@@ -186,28 +187,6 @@ def test_values_that_are_not_finite_are_refused(trained, tmp_path):
         bake.bake(made)
 
 
-def test_shading_at_the_bind_state_keeps_every_colour():
-    draws = np.random.default_rng(4)
-    n, light = 30, np.array([0.3, -0.5, 0.8])
-    sh, shading = draws.normal(size=(n, 4, 3)), 0.2 * draws.normal(size=(n, 3))
-    bind, later = rotations.normalize(draws.normal(size=(2, 4)))
-    baked_sh, baked_shading = bake._bind_shading(sh, shading, bind, light)
-
-    def factor(quat, g):
-        return 1 + g @ (rotations.rotate(rotations.conjugate(quat), light) - light)
-
-    total = rotations.multiply(later, bind)
-    expected = (0.5 + 0.28209479177 * sh[:, 0]) * factor(total, shading)[:, None]
-    found = (0.5 + 0.28209479177 * baked_sh[:, 0]) * factor(later, baked_shading)[:, None]
-    strong = factor(bind, shading) > bake.MIN_BIND_FACTOR
-    assert strong.mean() > 0.8
-    np.testing.assert_allclose(found[strong], expected[strong], atol=1e-9)
-    bands = sh[:, 1:] * factor(total, shading)[:, None, None]
-    np.testing.assert_allclose(
-        (baked_sh[:, 1:] * factor(later, baked_shading)[:, None, None])[strong], bands[strong], atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_a_scene_of_any_size_is_measured_alike(trained, tiny, baked, tmp_path, scale):
     data = datasets.read(tiny_datasets.make_dataset(tmp_path / "data", scale=scale).root)
@@ -229,14 +208,16 @@ def test_a_scene_of_any_size_is_measured_alike(trained, tiny, baked, tmp_path, s
         assert other["rotation_error_deg"] == pytest.approx(one["rotation_error_deg"], rel=1e-3)
 
 
-def test_an_object_that_comes_late_holds_its_first_pose_and_is_measured_where_it_was_seen(tmp_path):
+def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_where_it_was_seen(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path / "data", ball_from=0.4)
     scene = bake.bake(train_briefly(data, tmp_path / "run"))
     group = next(g for g in scene.groups if g.role == "body" and g.object_id == tiny_datasets.BALL)
     assert group.seen is not None and group.seen[0] >= 0.4 and group.seen[1] == scene.t_max
-    before = scene.track_poses[group.id][scene.track_times < group.seen[0]]
-    first = scene.track_poses[group.id][np.searchsorted(scene.track_times, group.seen[0])]
-    assert len(before) and (before == first).all()
+    path = scene.track_poses[group.id][:, 4:]
+    start = int(np.searchsorted(scene.track_times, group.seen[0]))
+    velocity = path[start + 1] - path[start]
+    bends = np.linalg.norm(np.diff(path[: start + 2], n=2, axis=0), axis=-1)
+    assert start >= 2 and np.linalg.norm(velocity) > 0.05 and bends.max() < 0.25 * np.linalg.norm(velocity)
     copy = scene_file.read(scene_file.write(scene, tmp_path / "late.r5dgs"))
     assert copy.groups[group.id].seen == group.seen
     # The offset between the frames comes from the times at which the ball was seen, so that early ones do not count.
