@@ -126,6 +126,8 @@ def test_a_run_is_opened_as_it_was_made(tmp_path):
     opened = checkpoint.open_run(tmp_path / "deep" / "run")
     assert opened == made and opened.config == settings and opened.digest == "d1"
     assert set(opened.versions) >= {"r5dgs", "torch", "numpy"}
+    text = json.loads((tmp_path / "deep" / "run" / checkpoint.RUN_FILE).read_text())
+    assert text["platform"]["processors"] >= 1 and text["platform"]["system"] and text["begun"].startswith("2")
 
 
 def test_a_new_run_in_an_old_run_folder_starts_clean(tmp_path):

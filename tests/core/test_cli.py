@@ -14,7 +14,8 @@ import pytest
 from r5dgs_core import __version__, cli, demo, progress
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
-from r5dgs_core.scene import files
+from r5dgs_core.scene import files, scene_file
+from r5dgs_core.train import checkpoint
 from tests import datasets as tiny_datasets
 
 OPTIONS = [
@@ -113,6 +114,26 @@ def test_a_resumed_run_keeps_its_own_configuration(made, tiny, capsys):
     line = complaint(capsys, "train", tiny.root, "--out", made[0], "--resume", "--set", "train.seed=1")
     assert "--resume" in line
     assert cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
+
+
+def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
+    run, given = tmp_path / "run", ["train", str(tiny.root), "--progress", "none", *OPTIONS]
+    assert cli.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
+    kept = checkpoint.load(run)
+    assert len(kept.tensors["gaussians.means"]) <= 120 and kept.iteration == 20  # --set wins over the preset
+    assert checkpoint.open_run(run).config.densify.max_gaussians == 120
+    line = complaint(capsys, "train", tiny.root, "--out", tmp_path / "no", "--max-gaussians", "many")
+    assert "densify.max_gaussians: expected int, got 'many'" in line
+    assert "--preset slow: unknown preset" in complaint(
+        capsys, "train", tiny.root, "--out", tmp_path / "no", "--preset", "slow"
+    )
+
+
+def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
+    bare = tmp_path / "bare.r5dgs"
+    assert cli.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
+    assert scene_file.read(bare).identities is None and scene_file.read(made[1]).identities is not None
+    assert "bake takes needs" in complaint(capsys, "bake", made[0], "--out", bare, "--set", "train.seed=1")
 
 
 def test_an_unknown_mode_is_an_error_that_names_the_known_ones(made, capsys):

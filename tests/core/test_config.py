@@ -133,3 +133,38 @@ def test_every_rule_is_about_a_key_and_lets_its_default_pass():
 def test_a_missing_file_is_said(tmp_path):
     with pytest.raises(ConfigError, match="c.toml: no such configuration file"):
         config.load(tmp_path / "c.toml")
+
+
+def test_a_preset_wins_over_defaults_and_loses_to_file_and_overrides(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("[identity]\niterations = 7\n")
+    fast = config.load(None, preset="fast")
+    assert 0 < fast.train.iterations < config.Config().train.iterations
+    mixed = config.load(path, ["train.seed=3"], "fast")
+    assert (mixed.train.iterations, mixed.identity.iterations) == (fast.train.iterations, 7)
+    assert config.load(path, ["train.iterations=9"], "fast").train.iterations == 9
+
+
+@pytest.mark.parametrize("name", config.PRESETS)
+def test_every_preset_can_be_used(name):
+    made = config.load(None, preset=name)
+    for key, value in config.PRESETS[name].items():
+        section, _, field = key.partition(".")
+        assert getattr(getattr(made, section), field) == value
+
+
+def test_an_unknown_preset_is_refused_with_the_nearest_name():
+    with pytest.raises(ConfigError, match=r"--preset fats: unknown preset; did you mean 'fast'\?"):
+        config.load(None, preset="fats")
+
+
+def test_a_file_with_faults_is_named_beside_a_preset_too(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("train = 3")
+    with pytest.raises(ConfigError, match="train: expected a section with keys, got 3"):
+        config.load(path, preset="fast")
+
+
+def test_overrides_change_a_configuration_that_is_there():
+    made = config.load(None, ["train.seed=3"]).override(["losses.ssim=0.5", "needs.shadows=off"])
+    assert (made.train.seed, made.losses.ssim, made.needs.shadows) == (3, 0.5, "off")

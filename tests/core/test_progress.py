@@ -77,7 +77,19 @@ def test_a_terminal_gets_bars(capsys, monkeypatch):
         ({"event": "x", "done": 3, "total": 9}, "of 9 images"),
         ({"event": "x", "iterations": 7}, "7 steps"),
         ({"event": "x", "loss": 0.25, "iterations": 7}, "loss 0.2500"),
+        ({"event": "x", "loss": 0.25, "val_psnr": 31.23, "gaussians": 5}, "loss 0.2500, held-out 31.2 dB, 5 Gaussians"),
     ],
 )
 def test_events_in_words(event, words):
     assert progress.describe(event) == words
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_steps_keep_showing_what_the_last_look_at_held_out_views_found(capsys, monkeypatch, terminal):
+    monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: terminal, raising=False)
+    monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
+    with progress.make("auto") as report:
+        report({"event": "start", "iterations": 2})
+        report({"event": "step", "iteration": 1, "loss": 0.5, "val_psnr": 31.23})
+        report({"event": "step", "iteration": 2, "loss": 0.4})
+    assert "loss 0.4000, held-out 31.2 dB" in " ".join(capsys.readouterr().out.split())

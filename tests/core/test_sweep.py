@@ -147,3 +147,26 @@ def test_the_support_is_what_its_points_outline():
 def test_too_few_points_support_nothing():
     support = sweep._Support(np.zeros((5, 3)), (np.array([0.0, 0, 1]), 0.0))
     assert not support(np.zeros((2, 3))).any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+def test_the_backdrop_is_the_median_of_the_free_pixels_however_it_is_cut_into_bands(monkeypatch, count):
+    rng = np.random.default_rng(count)
+    images = rng.integers(0, 256, (count, 11, 7, 3)).astype(np.uint8)
+    free = rng.random((count, 11, 7)) < 0.6
+    found = sweep._median(list(images), free)
+    for y, x in np.ndindex(11, 7):
+        seen = images[free[:, y, x], y, x]
+        expected = np.median(seen, axis=0) / 255 if len(seen) else np.zeros(3)
+        np.testing.assert_allclose(found[y, x], expected, atol=1e-7)
+    monkeypatch.setattr(sweep, "MEDIAN_VALUES", 1)
+    assert (sweep._median(list(images), free) == found).all()
+
+
+def test_depths_are_found_the_same_however_rays_are_cut_into_bands(floor, monkeypatch):
+    whole = sweep.Sweep(sweep.backdrops(floor), 150, 48)
+    monkeypatch.setattr(sweep, "COST_VALUES", 1)
+    cut = sweep.Sweep(sweep.backdrops(floor), 150, 48)
+    for ours, theirs in zip(cut.rays, whole.rays, strict=True):
+        np.testing.assert_allclose(ours.costs, theirs.costs, rtol=1e-5)
+        assert (ours.depths == theirs.depths).mean() > 0.99
