@@ -176,7 +176,9 @@ def _optimise(
 
 
 def _identity_steps(trainer: Trainer) -> int:
-    """Steps that the identity encodings will take; each costs about what one of training does."""
+    """Steps that the identity encodings will take after the run; each costs about what one of training does."""
+    if trainer.config.identity.training != "after":
+        return 0
     masked = any(view.mask is not None for view in trainer.views)
     return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
 
