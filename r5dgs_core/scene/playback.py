@@ -158,15 +158,27 @@ def frame(scene: Scene, t: float, mode: str = "rigid") -> Frame:
         raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
     if mode == "rigid" or t <= scene.t_max:
         group_quats, group_displacements = group_poses(scene, t)
-        return pose(residuals.deformed(scene, t), group_quats, group_displacements, t)
+        bind, turns = residuals.deformed(scene, t)
+        posed = pose(bind, group_quats, group_displacements, t)
+        if turns is None or scene.residual_rows is None:
+            return posed
+        rows = scene.residual_rows
+        return _relight(scene, posed, rows, rotations.multiply(group_quats[scene.motion_ids[rows]], turns))
     move = residuals.standard if mode == "standard" else residuals.literal
     means, quats, turns = move(scene, t - scene.t_max)
     bind = pose(scene, rotations.identity(len(scene.groups)), np.zeros((len(scene.groups), 3)), t)
-    shading = bind.shading_factor
-    if shading is not None and scene.shading is not None and scene.light_direction is not None:
-        change = rotations.rotate(rotations.conjugate(turns), scene.light_direction) - scene.light_direction
-        shading = np.maximum(1 + (scene.shading * change).sum(-1), 0).astype(np.float32)
-    return dataclasses.replace(bind, means=means, quats=quats, shading_factor=shading)
+    return _relight(scene, dataclasses.replace(bind, means=means, quats=quats), np.arange(len(means)), turns)
+
+
+def _relight(scene: Scene, posed: Frame, rows: np.ndarray, turns: np.ndarray) -> Frame:
+    """The frame with the shading of Gaussians that turned on their own. rows [R], turns since t_max [R, 4]"""
+    vectors, light = scene.shading, scene.light_direction
+    if posed.shading_factor is None or vectors is None or light is None:
+        return posed
+    change = rotations.rotate(rotations.conjugate(turns), light) - light
+    factor = posed.shading_factor.copy()
+    factor[rows] = np.maximum(1 + (vectors[rows] * change).sum(-1), 0)
+    return dataclasses.replace(posed, shading_factor=factor)
 
 
 def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:

@@ -18,18 +18,23 @@ TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
 TRACE_STEP = 1 / 60  # TRACE's step at playback
 
 
-def deformed(scene: Scene, t: float) -> Scene:
-    """The scene with its bind state as the residuals have it at a time up to t_max; the scene itself without any."""
+def deformed(scene: Scene, t: float) -> tuple[Scene, np.ndarray | None]:
+    """The scene with its bind state as the residuals have it at a time up to t_max.
+
+    Returns:
+        The scene, itself where it has no residuals then, and their rotations, unit wxyz [R, 4], or None.
+    """
     rows = scene.residual_rows
     parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
     if rows is None or len(rows) == 0 or t >= scene.t_max or any(part is None for part in parts):
-        return scene
+        return scene, None
     offsets, turns, growths = (_at(scene.track_times, part, t) for part in parts if part is not None)
     means, quats, log_scales = scene.means.copy(), scene.quats.copy(), scene.log_scales.copy()
     means[rows] += offsets
-    quats[rows] = rotations.normalize(rotations.multiply(turns, quats[rows].astype(np.float64)))
+    turns = rotations.normalize(turns)
+    quats[rows] = rotations.multiply(turns, quats[rows].astype(np.float64))
     log_scales[rows] += growths
-    return dataclasses.replace(scene, means=means, quats=quats, log_scales=log_scales)
+    return dataclasses.replace(scene, means=means, quats=quats, log_scales=log_scales), turns
 
 
 def _at(times: np.ndarray, values: np.ndarray, t: float) -> np.ndarray:

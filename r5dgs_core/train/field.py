@@ -34,7 +34,6 @@ from .groups import ObservedMotion
 from .tracks_representation import TracksRepresentation
 
 QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
-ANCHORS_EVERY = 200  # steps between two elections of the representatives
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
 
 
@@ -76,7 +75,6 @@ class FieldRepresentation:
         self._tracks = tracks
         self._first = first
         self._last: Moved | None = None
-        self._anchors: tuple[Tensor, Tensor] | None = None
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -161,18 +159,10 @@ class FieldRepresentation:
         losses = self._config.losses
         started = iteration >= losses.rigid_start * self._config.train.iterations
         if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
-            anchors = self._anchors_of(gaussians, moved, groups, iteration)
+            bodies = torch.where(groups < self._tracks.bodies, groups, 0)
+            anchors = rigidity.anchors(moved.before, bodies, gaussians.opacity_logits.detach()[moved.rows].sigmoid())
             terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
         return sum(terms[1:], terms[0]) if terms else None
-
-    def _anchors_of(self, gaussians: Gaussians, moved: Moved, groups: Tensor, iteration: int) -> Tensor:
-        """Representative of each mover's object among the movers; taken anew now and then and when rows change. [R]"""
-        means = gaussians.means
-        if self._anchors is None or self._anchors[0] is not means or iteration % ANCHORS_EVERY == 0:
-            bodies = torch.where(groups < self._tracks.bodies, groups, 0)
-            opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
-            self._anchors = means, rigidity.anchors(moved.before, bodies, opacities)
-        return self._anchors[1]
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
         """A field reaches all times already."""
@@ -191,10 +181,7 @@ class FieldRepresentation:
         named = {n: p.detach() for n, p in self.params.items()}
         tracks = self._tracks
         named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
-        named |= {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
-        if self._anchors is not None:
-            named["field.anchors"] = self._anchors[1]
-        return named
+        return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""

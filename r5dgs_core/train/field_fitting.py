@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..model.tracks import Tracks
+from ..model.trd import MotionState
 from ..motion import rotations
 from .field_motion import Motion
 
@@ -114,12 +115,35 @@ def fit_trd(
         total = (there - goal).square().sum(-1).mean()
         total = total + QUAT_WEIGHT * (turned - sign_q * turn).square().sum(-1).mean()
         if twist > 0:
-            partner = _partners(groups[rows], generator)
-            crossed, _ = motion.carry(begin[partner], state, end - start, motion.step)
-            total = total + twist * (crossed - goal[partner]).square().sum(-1).mean()
+            total = total + twist * cross_twist(motion, begin, goal, state, end - start, groups[rows], generator)
         return total
 
     _optimise(motion.trd.parameters(), steps, loss)
+
+
+def cross_twist(
+    motion: Motion,
+    begin: Tensor,
+    goal: Tensor,
+    state: MotionState,
+    span: float,
+    groups: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Mean squared distance by which the twist of each Gaussian misses where another of its group went.
+
+    Args:
+        motion: Integrates.
+        begin: Where the Gaussians were. [R, 3]
+        goal: Where they went. [R, 3]
+        state: Their twists.
+        span: Scene time between the two.
+        groups: Their motion groups. [R]
+        generator: Draws the partners.
+    """
+    partner = _partners(groups, generator)
+    crossed, _ = motion.carry(begin[partner], state, span, motion.step)
+    return (crossed - goal[partner]).square().sum(-1).mean()
 
 
 def _partners(groups: Tensor, generator: torch.Generator) -> Tensor:

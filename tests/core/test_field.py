@@ -1,0 +1,246 @@
+"""The representation `field`: its motion, its fits, its training and its scene."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.model.trd import MotionState
+from r5dgs_core.motion import rotations
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import playback, validation
+from r5dgs_core.train import bake, checkpoint, field, field_fitting, run
+from r5dgs_core.train.field_motion import Clock
+from r5dgs_core.train.trainer import Trainer
+from tests import datasets as tiny_datasets
+
+FIELD = (
+    "train.representation='field'",
+    "field.place_steps=60",
+    "field.trd_steps=60",
+    "train.iterations=120",
+)
+
+
+def make(data, *overrides) -> Trainer:
+    return Trainer(datasets.read(data.root), tiny_datasets.settings(*FIELD, *overrides))
+
+
+def mean_loss(trainer: Trainer) -> float:
+    with torch.no_grad():
+        errors = [
+            (trainer.render(view.camera, view.t) - torch.from_numpy(view.image) / 255).abs().mean()
+            for view in trainer.views
+        ]
+    return float(torch.stack(errors).mean())
+
+
+@pytest.fixture(scope="module")
+def made(tiny, tmp_path_factory):
+    """A finished run of the field."""
+    folder = tmp_path_factory.mktemp("runs") / "field"
+    return run.train(tiny.root, folder, tiny_datasets.settings(*FIELD))
+
+
+@pytest.fixture(scope="module")
+def scene(made, tiny):
+    return bake.bake(made, datasets.read(tiny.root))
+
+
+def test_times_in_the_unit_interval_are_used_as_they_are_and_others_brought_there():
+    assert Clock.of(np.linspace(0, 0.75, 5))(0.3) == 0.3
+    seconds = Clock.of(np.array([12.0, 15.0, 20.0]))
+    assert seconds(12.0) == 0 and seconds(20.0) == 1
+
+
+def test_training_brings_the_images_closer(tiny):
+    trainer = make(tiny)
+    before = mean_loss(trainer)
+    while not trainer.done:
+        trainer.step()
+    assert mean_loss(trainer) < 0.8 * before
+
+
+def test_what_the_masks_put_on_no_object_stays_still_to_the_bit(tiny):
+    trainer = make(tiny)
+    for _ in range(5):
+        trainer.step()
+    pinned = trainer.gaussians.motion_ids == 0
+    camera = trainer.views[0].camera
+    with torch.no_grad():
+        for t in (0.0, 0.31, 1.0):
+            splats = trainer.splats(camera, t)
+            assert torch.equal(splats.means[pinned], trainer.gaussians.means[pinned])
+    everything = make(tiny, "field.movers='all'")
+    assert len(everything.motion.movers(everything.gaussians)) == len(everything.gaussians)
+
+
+def test_places_of_the_masks_are_learned_before_the_first_image(tiny):
+    trainer = make(tiny, "field.place_steps=300")
+    motion = trainer.motion
+    motion.begin(trainer.gaussians, trainer.generator)
+    rows = (trainer.gaussians.motion_ids == tiny_datasets.BALL).nonzero()[:, 0]
+    means = trainer.gaussians.means.detach()[rows]
+    with torch.no_grad():
+        moved = (motion.motion.at(means, 0.6).offsets - motion.motion.at(means, 0.15).offsets).mean(0)
+    scale = trainer.normalization.scale
+    expected = (tiny.center(tiny_datasets.BALL, 0.6) - tiny.center(tiny_datasets.BALL, 0.15)) / scale
+    np.testing.assert_allclose(moved.numpy(), expected, atol=0.12)
+
+
+def test_only_the_true_twist_carries_the_other_gaussians_of_a_body_too():
+    """Velocities of a spinning body can be put into translations that depend on the place; the cross loss sees that."""
+    draw = torch.Generator().manual_seed(0)
+    motion = field._motion_of(np.linspace(0, 0.75, 6), tiny_datasets.settings(*FIELD))
+    spin, span = torch.tensor([0.0, 0.0, 1.5]), 0.02
+    begin = torch.randn(200, 3, generator=draw) * 0.3 + torch.tensor([1.0, 0.5, 0.2])
+    goal = rotations.rotate(rotations.rotvecs_to_quats(spin * span), begin)
+    nothing = torch.zeros_like(begin)
+    true = MotionState(nothing, spin.expand_as(begin), nothing, nothing)
+    gauge = MotionState((goal - begin) / span, nothing, nothing, nothing)
+    groups = torch.arange(200) % 2
+    for state in (true, gauge):
+        own, _ = motion.carry(begin, state, span, motion.step)
+        torch.testing.assert_close(own, goal, atol=1e-4, rtol=0)
+    crossed = [
+        float(field_fitting.cross_twist(motion, begin, goal, state, span, groups, draw)) for state in (true, gauge)
+    ]
+    assert crossed[0] < 1e-8 and crossed[1] > 1e-5
+
+
+def test_a_rigid_motion_of_each_group_costs_no_stiffness_and_anything_else_does():
+    generator = torch.Generator().manual_seed(0)
+    before = torch.randn(40, 3, generator=generator)
+    groups = torch.arange(40) % 3
+    turns = rotations.normalize(torch.randn(3, 4, generator=generator))
+    quats = turns[groups]
+    offsets = rotations.rotate(quats, before) + groups[:, None] * 0.3 - before
+    moved = field.Moved(torch.arange(40), before, offsets, quats, torch.zeros(40, 3))
+    assert float(field.stiffness(moved, groups)) < 1e-10
+    bent = dataclasses.replace(moved, offsets=offsets + 0.1 * before.square())
+    assert float(field.stiffness(bent, groups)) > 1e-4
+    found, shift, known = field.rigid_fits(before, before + offsets, groups)
+    assert known.all()
+    assert rotations.angle_between(found.numpy(), turns.numpy()).max() < 1e-3
+    torch.testing.assert_close(shift, torch.arange(3)[:, None].expand(3, 3) * 0.3, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("overrides", [(), ("field.tracks_steps=12", "field.distill_steps=20", "train.iterations=40")])
+def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
+    extra = ("field.variant='r5dgs_extra'", "identity.training='joint'", "losses.rigid_start=0.1", *overrides)
+    reference = make(tiny, *extra)
+    states = {}
+    for k in range(30):
+        if k in (7, 16):
+            states[k] = reference.state()
+        reference.step()
+    expected = reference.state()
+    for k, state in states.items():
+        checkpoint.save(tmp_path, state)
+        trainer = make(tiny, *extra)
+        trainer.restore(checkpoint.load(tmp_path))
+        while trainer.iteration < 30:
+            trainer.step()
+        for name, tensor in trainer.state().tensors.items():
+            assert torch.equal(tensor, expected.tensors[name]), (k, name)
+
+
+def test_a_field_may_start_from_tracks_and_moves_as_they_did(tiny):
+    trainer = make(
+        tiny, "field.tracks_steps=60", "field.distill_steps=500", "train.iterations=61", "densify.start=1000"
+    )
+    while trainer.iteration < 60:
+        trainer.step()
+    tracks, view = trainer.motion.tracks, trainer.views[3]
+    before = trainer.render(view.camera, view.t).detach()
+    trainer.step()
+    assert trainer.motion.name == "field"
+    rows = (trainer.gaussians.motion_ids == tiny_datasets.BRICK).nonzero()[:, 0]
+    means = trainer.gaussians.means.detach()[rows]
+    home, there = tracks.poses(float(tracks.times[trainer.first_time])), tracks.poses(0.6)
+    with torch.no_grad():
+        moved = (means + trainer.motion.motion.at(means, 0.6).offsets).mean(0)
+        center = tracks.group_centers()[tiny_datasets.BRICK]
+        g = tiny_datasets.BRICK
+        turn = rotations.multiply(there.quats[g], rotations.conjugate(home.quats[g]))
+        goal = rotations.rotate(turn, means - center - home.displacements[g]).mean(0) + center + there.displacements[g]
+    torch.testing.assert_close(moved, goal, atol=0.05, rtol=0)
+    after = trainer.render(view.camera, view.t).detach()
+    assert float((after - before).abs().mean()) < 0.03
+
+
+def test_the_baked_scene_is_valid_and_shows_what_was_trained(made, scene):
+    validation.check(scene, "field")
+    trainer = Trainer(datasets.read(made.dataset_root), made.config)
+    trainer.restore(checkpoint.load(made.folder))
+    assert scene.t_max == pytest.approx(0.7) and playback.modes(scene) == playback.MODES
+    assert [g.role for g in scene.groups][:3] == ["pinned", "body", "body"] and scene.residual_rows is not None
+    pairs = zip(trainer.dataset.train, trainer.views, strict=True)
+    for view, trained_view in [pair for pair in pairs if pair[0].t < scene.t_max][::5]:
+        with torch.no_grad():
+            expected = trainer.render(trained_view.camera, trained_view.t).numpy()
+        shown = scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy()
+        assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
+
+
+def test_mode_standard_goes_on_as_the_trained_dynamics_do(made, scene):
+    trainer = Trainer(datasets.read(made.dataset_root), made.config)
+    trainer.restore(checkpoint.load(made.folder))
+    for t in (0.75, 0.9):
+        camera = trainer.views[0].camera
+        with torch.no_grad():
+            splats = trainer.splats(camera, t)
+        world = np.sort(trainer.normalization.points_to_world(splats.means.numpy()), axis=0)
+        played = np.sort(playback.frame(scene, t, "standard").means, axis=0)
+        np.testing.assert_allclose(played, world, atol=2e-3)
+
+
+def test_without_masks_the_networks_move_everything(tmp_path):
+    data = tiny_datasets.make_dataset(tmp_path, masks=False)
+    trainer = make(data, "train.iterations=30")
+    assert len(trainer.motion.movers(trainer.gaussians)) == len(trainer.gaussians)
+    before = mean_loss(trainer)
+    while not trainer.done:
+        trainer.step()
+    assert mean_loss(trainer) < before
+
+
+@pytest.mark.parametrize(
+    ("off", "still"),
+    [("losses.rigid=0", "rigid"), ("identity.spatial=0.0", "spatial"), ("identity.majority=0.0", "majority")],
+)
+def test_each_loss_of_the_paper_changes_the_run_that_has_it(tiny, off, still):
+    paper = (
+        "field.variant='r5dgs_extra'",
+        "identity.training='joint'",
+        "identity.spatial=2.0",
+        "identity.majority=0.5",
+        "losses.rigid_start=0",
+        "train.iterations=100",
+    )
+    with_all, without = make(tiny, *paper), make(tiny, *paper, off)
+    for _ in range(6):
+        with_all.step()
+        without.step()
+    a, b = with_all.state().tensors, without.state().tensors
+    geometry = ("gaussians.means", "field.layers.0.weight")
+    semantics = ("gaussians.identities", "identity.classifier.weight")
+    changed = geometry if still == "rigid" else semantics
+    assert all(not torch.equal(a[name], b[name]) for name in changed)
+
+
+def test_variants_differ_by_one_key(tiny):
+    plain, extra = (
+        make(tiny, f"field.variant='{name}'", "losses.rigid_start=0", "train.iterations=50")
+        for name in ("r5dgs", "r5dgs_extra")
+    )
+    for _ in range(4):
+        plain.step()
+        extra.step()
+    assert not torch.equal(
+        plain.state().tensors["field.layers.0.weight"], extra.state().tensors["field.layers.0.weight"]
+    )
