@@ -16,21 +16,19 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from ..errors import ConfigError
+from .presets import PRESETS
 
 REPRESENTATIONS = ("tracks", "field")
 VARIANTS = ("5dgs", "r5dgs", "r5dgs_extra")
 FIELD_SIZES = ("complex", "light", "small")
 MOVERS = ("all", "labelled")
+CURRICULA = ("best", "first")
+PLACEMENTS = ("scene", "random")
 IDENTITY_TRAINING = ("after", "joint", "detached", "off")
 BACKGROUNDS = ("auto", "learned", "white", "black")
 STRATEGIES = ("share", "default", "mcmc")
 NEEDS = ("auto", "on", "off")
 # What `--preset` changes; a configuration file and `--set` win over it.
-PRESETS: dict[str, dict[str, Any]] = {
-    "fast": {"train.iterations": 2000, "identity.iterations": 200},
-}
-
-
 @dataclass(frozen=True)
 class TrainSection:
     """What is trained and for how long.
@@ -71,6 +69,8 @@ class InitSection:
     """How Gaussians are placed before training.
 
     Attributes:
+        placement: ``scene``: objects in the hulls of their masks, background by a plane sweep; ``random``: everything
+            at random where cameras look, as the paper's data comes.
         object_points: Gaussians of each object.
         background_points: Gaussians of the background.
         shadow_points: Gaussians of each shadow.
@@ -79,6 +79,7 @@ class InitSection:
         min_mask_pixels: Smaller masks do not vote on an object's place, as a share of the image.
     """
 
+    placement: str = "scene"
     object_points: int = 500
     background_points: int = 5000
     shadow_points: int = 60
@@ -197,13 +198,17 @@ class CurriculumSection:
     """When observed times enter training, as steps.
 
     Attributes:
-        first: Steps on the first time alone.
-        grow: Steps over which the other times enter, from the first one outwards.
+        start: Time that training begins with: ``best``, at which most objects are well seen, or ``first``.
+        first: Steps on that time alone.
+        grow: Steps over which the other times enter, from there outwards.
+        stages: Steps in which they enter; 0 for one knot after the other.
         newest: Share of draws on the newest times while they enter.
     """
 
+    start: str = "best"
     first: int = 200
     grow: int = 400
+    stages: int = 0
     newest: float = 0.4
 
 
@@ -504,6 +509,11 @@ def _check(name: str, value: Any, kind: type) -> Any:
 
 def _validate(config: Config) -> None:
     """Raise ConfigError naming the first key whose value no run can use."""
+    if config.init.placement == "random" and (config.train.representation, config.field.movers) != ("field", "all"):
+        raise ConfigError(
+            "init.placement: random places nothing on objects, so it needs train.representation='field' and "
+            "field.movers='all'"
+        )
     for name, good, expected in _RULES:
         section, key = name.split(".")
         value = getattr(getattr(config, section), key)
@@ -555,7 +565,9 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("rates.decay_floor_appearance", *_SHARE),
     ("rates.decay_from", *_SHARE),
     ("losses.ssim", *_SHARE),
+    ("curriculum.start", lambda value: value in CURRICULA, " or ".join(CURRICULA)),
     ("curriculum.newest", *_SHARE),
+    ("init.placement", lambda value: value in PLACEMENTS, " or ".join(PLACEMENTS)),
     ("densify.strategy", lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
     ("residual.start", *_SHARE),
     ("residual.trial_steps", *_AT_LEAST_1),

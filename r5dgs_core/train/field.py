@@ -13,6 +13,7 @@ loss are ours.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,7 +149,7 @@ class FieldRepresentation:
         start = min(max(t - h if sign < 0.5 else t + h, 0.0), motion.horizon)
         return motion.through(means, start, t, h)
 
-    def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
         """Stiffness of the groups, and L_rigid in the variant that has it."""
         moved, self._last = self._last, None
         if moved is None or self._tracks.bodies < 2:
@@ -159,8 +160,8 @@ class FieldRepresentation:
         losses = self._config.losses
         started = iteration >= losses.rigid_start * self._config.train.iterations
         if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
-            bodies = torch.where(groups < self._tracks.bodies, groups, 0)
-            anchors = rigidity.anchors(moved.before, bodies, gaussians.opacity_logits.detach()[moved.rows].sigmoid())
+            opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
+            anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities)
             terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
         return sum(terms[1:], terms[0]) if terms else None
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
-from . import evidence, hull, shadows, sweep, triangulation
+from . import evidence, hull, scatter, shadows, sweep, triangulation
 from .config import Config
 from .views import TrainView, nearest_knot
 
@@ -75,17 +75,19 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
         log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/train/IMAGE.png files")
     elif len(times) == 1:
         log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
-    first = _first_time(places, len(times))
+    first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))
     translations = np.zeros((bodies, len(times), 3))
     points, colors, labels = [], [], []
+    at_random = init.placement == "random"
     for row, object_id in enumerate(places.object_ids):
         reference = _reference_time(places.visibility[row], places.measured[row], first)
         centers[row + 1] = places.centers[row, reference]
         translations[row + 1] = places.centers[row] - centers[row + 1]
         then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
-        where, shade = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], init.object_points, rng)
+        count = 0 if at_random else init.object_points
+        where, shade = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         points.append(where)
         colors.append(shade)
         labels.append(np.full(len(where), row + 1))
@@ -95,6 +97,8 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
     placed = search.place(init.background_points, plane, find_sky, rng)
     where, shade = placed.points, placed.colors
+    if at_random:
+        where, shade = scatter.everywhere(scenes, init.background_points, rng)
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
     opacities = [np.full(sum(map(len, points)) + len(where), init.opacity)]
     scales = [_neighbour_scales(np.concatenate([*points, where]))] if points or len(where) else []

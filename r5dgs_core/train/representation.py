@@ -7,6 +7,7 @@ same face.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -54,8 +55,14 @@ class Representation(Protocol):
         """
         ...
 
-    def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
-        """What is added to the loss of the step whose `splats` were asked for last, or None."""
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
+        """What is added to the loss of the step whose `splats` were asked for last, or None.
+
+        Args:
+            gaussians: The canonical Gaussians.
+            iteration: The step.
+            labels: Gives the class of each Gaussian. [N]
+        """
         ...
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:

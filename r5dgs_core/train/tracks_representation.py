@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ class TracksRepresentation:
         there = torch.cat([there, there[self.tracks.casters]])
         return dataclasses.replace(splats, opacities=splats.opacities * there[gaussians.motion_ids])
 
-    def penalty(self, gaussians: Gaussians, iteration: int) -> Tensor | None:
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
         """Roughness of the tracks, most where little is seen; now and then, with the weight of the steps in between."""
         weight, section = self._config.losses.roughness, self._config.residual
         if iteration % ROUGHNESS_EVERY or (weight <= 0 and self.residuals is None):

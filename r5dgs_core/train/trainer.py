@@ -174,7 +174,7 @@ class Trainer:
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        penalties = [self.motion.penalty(self.gaussians, self.iteration), self.growth.penalty(self.gaussians)]
+        penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels), self.growth.penalty(self.gaussians)]
         if self.identity is not None:
             penalties.append(self.identity.loss(self.gaussians, splats, view, self.iteration, features))
         total = loss
@@ -231,6 +231,12 @@ class Trainer:
         """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
         return self.motion.splats(self.gaussians, camera, t, draw)
 
+    def _labels(self) -> Tensor:
+        """Class of each Gaussian: the classifier's answer where it is trained already, else that of its group. [N]"""
+        if self.identity is not None:
+            return self.identity.labels(self.gaussians)
+        return torch.from_numpy(self.motion.group_classes(self.motion.tensors()))[self.gaussians.motion_ids]
+
     def _leave_tracks(self, tracks: TracksRepresentation) -> None:
         """Go on with a field where the configuration asks for one that starts from tracks."""
         if self.config.train.representation == field.FieldRepresentation.name:
@@ -278,7 +284,14 @@ class Trainer:
         reach = max(self.first_time, count - 1 - self.first_time)
         if self.iteration < first or reach == 0:
             return
-        stage = reach if self.iteration >= full else 1 + (self.iteration - first) * reach // max(1, full - first)
+        stages = self.config.curriculum.stages
+        if self.iteration >= full:
+            stage = reach
+        elif stages > 1:
+            entered = 1 + (self.iteration - first) * (stages - 1) // max(1, full - first)
+            stage = math.ceil(reach * entered / stages)
+        else:
+            stage = 1 + (self.iteration - first) * reach // max(1, full - first)
         stage = min(stage, reach)
         while self.entered[0] > max(0, self.first_time - stage):
             self.motion.enter(self.entered[0] - 1, +1, self.entered)

@@ -1,0 +1,43 @@
+"""Points at random where cameras look: the start that needs neither masks nor matching."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..scene import cameras
+from .normalization import TARGET_DISTANCE
+from .sweep import Backdrop
+
+REACH = 1.5  # half the side of the cube that points are drawn from, in distances of the cameras from their focus
+BATCHES = 64
+
+
+def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw points that at least two cameras see, or one where there is only one.
+
+    Args:
+        scenes: What each camera sees; normalised coordinates.
+        count: Points wanted; fewer where the cameras see hardly any of the space about their focus.
+        rng: Source of the draws.
+
+    Returns:
+        Points [P, 3] and colours near middle grey [P, 3].
+    """
+    needed = min(2, len(scenes))
+    kept, found = [np.zeros((0, 3))], 0
+    for _ in range(BATCHES):
+        points = rng.uniform(-REACH * TARGET_DISTANCE, REACH * TARGET_DISTANCE, (count, 3))
+        seen = np.zeros(len(points), np.int64)
+        for scene in scenes:
+            pixels, depth = cameras.project(scene.camera, points)
+            with np.errstate(invalid="ignore"):
+                inside = (pixels >= 0).all(1) & (pixels < [scene.camera.width, scene.camera.height]).all(1)
+            seen += inside & (depth > 0)
+        kept.append(points[seen >= needed])
+        found += len(kept[-1])
+        if found >= count:
+            break
+    where = np.concatenate(kept)[:count]
+    return where, np.clip(0.5 + 0.1 * rng.standard_normal(where.shape), 0, 1)
