@@ -174,7 +174,8 @@ class Trainer:
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
-        penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels), self.growth.penalty(self.gaussians)]
+        penalties = [self.motion.penalty(self.gaussians, self.iteration, self._labels)]
+        penalties.append(self.growth.penalty(self.gaussians))
         if self.identity is not None:
             penalties.append(self.identity.loss(self.gaussians, splats, view, self.iteration, features))
         total = loss
