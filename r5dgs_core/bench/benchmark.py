@@ -157,11 +157,9 @@ def _measure(
         splits=SPLITS,
         progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
     )
+    played = playing.measure(scene, dataset.test or dataset.val, modes)
     found = {
-        mode: {
-            "splits": {split: evaluation["splits"][split][mode] for split in SPLITS},
-            "playback": playing.measure(scene, dataset.test or dataset.val, mode),
-        }
+        mode: {"splits": {split: evaluation["splits"][split][mode] for split in SPLITS}, "playback": played[mode]}
         for mode in modes
     }
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -14,36 +15,51 @@ from ..scene import playback
 from ..scene.scene import Scene
 
 LEAST_FRAMES = 60
-PATIENCE_S = 20.0  # after which what was measured is enough
+PATIENCE_S = 20.0  # per mode, after which what was measured is enough
 
 
-def measure(scene: Scene, views: Sequence[View], mode: str, *, backend: str = "auto") -> dict[str, Any]:
+def measure(
+    scene: Scene, views: Sequence[View], modes: Sequence[str], *, backend: str = "auto"
+) -> dict[str, dict[str, Any]]:
     """Time frames of a scene, from the time t to the picture on the host: colours alone, no identity encodings.
 
     The views are played camera by camera in the order of their times, again and again until there are enough frames.
-    One round goes ahead that does not count: it loads kernels and fills what the mode computes once.
+    The modes take turns, a round each, so that what else the machine does meets all of them alike. A first round of
+    each does not count: it loads kernels and fills what the mode computes once.
 
     Args:
         scene: The scene.
         views: Cameras and times.
-        mode: Of `playback.modes`.
+        modes: Of `playback.modes`.
         backend: Rasterizer.
 
     Returns:
-        ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``, ``ms_cpu``
-        (processor time of a frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
+        By mode ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,
+        ``ms_cpu`` (processor time of a frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
         percentile), ``frames``; all but the last None without views.
     """
-    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_cpu", "ms_frame_low", "ms_frame_high")
-    if not views:
-        return {**dict.fromkeys(names), "frames": 0}
     ordered = sorted(views, key=lambda view: (view.camera.name, view.t))
-    for view in ordered:
-        _draw(scene, view, mode, backend)
-    times: list[tuple[float, float, float]] = []
+    times: dict[str, list[tuple[float, float, float]]] = {mode: [] for mode in modes}
+    if not ordered:
+        return {mode: _summary(found) for mode, found in times.items()}
+    for mode in modes:
+        for view in ordered:
+            _draw(scene, view, mode, backend)
     began = time.monotonic()
-    while len(times) < LEAST_FRAMES and (not times or time.monotonic() - began < PATIENCE_S):
-        times += [_draw(scene, view, mode, backend) for view in ordered]
+    for taken in itertools.count():
+        patient = time.monotonic() - began < PATIENCE_S * len(modes)
+        if taken * len(ordered) >= LEAST_FRAMES or (taken and not patient):
+            break
+        for mode, found in times.items():
+            found += [_draw(scene, view, mode, backend) for view in ordered]
+    return {mode: _summary(found) for mode, found in times.items()}
+
+
+def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    """What `measure` says of a mode, from the motion, rasterization and processor time of its frames."""
+    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_cpu", "ms_frame_low", "ms_frame_high")
+    if not times:
+        return {**dict.fromkeys(names), "frames": 0}
     motion, raster, cpu = np.array(times).T
     low, middle, high = np.percentile(motion + raster, (10, 50, 90))
     medians = (np.median(motion), np.median(raster), np.median(cpu))

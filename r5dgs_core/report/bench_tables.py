@@ -30,7 +30,7 @@ _PLAYED = (("FPS", "fps", "{:.1f}"), ("motion ms", "ms_motion", "{:.2f}"), ("ras
 _PLAYED = (*_PLAYED, ("CPU ms", "ms_cpu", "{:.2f}"))
 
 _AGAINST = (("PSNR dB", "psnr", "{:+.2f}"), ("objects dB", "psnr_objects", "{:+.2f}"), ("FPS x", "fps", "{:.2f}"))
-_AGAINST = (*_AGAINST, ("motion x", "ms_motion", "{:.2f}"))
+_AGAINST = (*_AGAINST, ("CPU x", "ms_cpu", "{:.2f}"))
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def report_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
 
 def against_standard(records: Sequence[Record]) -> list[Record]:
     """Records of the other modes of runs that were played in mode "standard", with ``against``: differences of PSNR on
-    test, of all pixels and those of objects (dB), and ratios of frames per second and milliseconds of motion."""
+    test, of all pixels and those of objects (dB), and ratios of frames per second and of processor time."""
     runs = {(r["scene"], r["variant"], r["seed"]): r for r in records if r["mode"] == "standard"}
     found = []
     for record in records:
@@ -184,7 +184,7 @@ def against_standard(records: Sequence[Record]) -> list[Record]:
         for key in ("psnr", "psnr_objects"):
             ours, theirs = record["splits"]["test"][key], base["splits"]["test"][key]
             against[key] = None if ours is None or theirs is None else ours - theirs
-        for key in ("fps", "ms_motion"):
+        for key in ("fps", "ms_cpu"):
             ours, theirs = record["playback"][key], base["playback"][key]
             against[key] = None if ours is None or not theirs else ours / theirs
         found.append({**record, "against": against})

@@ -98,7 +98,7 @@ def test_what_is_finished_is_neither_trained_nor_measured_again(made, monkeypatc
 def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     plan, case, _, result = made
     monkeypatch.setattr(process, "train", None)
-    monkeypatch.setattr(playing, "measure", lambda *_: {**result["results"][0]["playback"], "fps": 123.0})
+    monkeypatch.setattr(playing, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}})
     again = benchmark.run_bench(plan, remeasure=True, progress_kind="none")
     assert again["results"][0]["playback"]["fps"] == 123.0
     (one,), (other,) = again["results"], result["results"]
@@ -253,9 +253,25 @@ def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch
 
     monkeypatch.setattr(playback, "frame", watch)
     views = datasets.read(tiny.root).test
-    found = playing.measure(baked, views[::-1], "rigid")
+    found = playing.measure(baked, views[::-1], ["rigid"])["rigid"]
     round_ = drawn[: len(views)]
     assert sorted(round_) == sorted(view.t for view in views) and round_ == [*tiny_datasets.LATER] * 2
     assert drawn == round_ * (len(drawn) // len(round_)) and found["frames"] == len(drawn) - len(views)
     assert found["ms_frame_low"] <= found["ms_frame"] <= found["ms_frame_high"]
-    assert playing.measure(baked, [], "rigid") == {**dict.fromkeys(found), "frames": 0}
+    assert playing.measure(baked, [], ["rigid"]) == {"rigid": {**dict.fromkeys(found), "frames": 0}}
+
+
+def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
+    still = dataclasses.replace(baked, dynamics=np.zeros((len(baked.means), 12), np.float32))
+    drawn, frame = [], playback.frame
+
+    def watch(scene, t, mode="rigid"):
+        drawn.append(mode)
+        return frame(scene, t, mode)
+
+    monkeypatch.setattr(playback, "frame", watch)
+    views = datasets.read(tiny.root).test
+    found = playing.measure(still, views, ["rigid", "standard"])
+    turn = ["rigid"] * len(views) + ["standard"] * len(views)
+    assert drawn == turn * (len(drawn) // len(turn))
+    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playing.LEAST_FRAMES
