@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+from torch.utils import checkpoint as checkpointing
 
 
 def encode(x: Tensor, bands: int) -> Tensor:
@@ -43,7 +44,16 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 def in_chunks(function: Callable[[Tensor], Tensor], rows: Tensor, chunk: int) -> Tensor:
-    """``function`` of the rows, at most ``chunk`` at a time; without gradient only one chunk is in memory."""
+    """``function`` of the rows, at most ``chunk`` at a time, so that one chunk's intermediate values are in memory.
+
+    With gradients a chunk is evaluated again on the way back, where there is more than one.
+    """
     if len(rows) <= chunk:
         return function(rows)
-    return torch.cat([function(part) for part in rows.split(chunk)])
+    if not torch.is_grad_enabled():
+        return torch.cat([function(part) for part in rows.split(chunk)])
+    parts = [
+        checkpointing.checkpoint(function, part, use_reentrant=False, preserve_rng_state=False)
+        for part in rows.split(chunk)
+    ]
+    return torch.cat(parts)
