@@ -83,6 +83,7 @@ def make_dataset(
     masks: bool = True,
     alpha: bool = False,
     ball_from: float = 0.0,
+    breath: float = 0.0,
     scale: float = 1.0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> TinyData:
@@ -96,6 +97,7 @@ def make_dataset(
         masks: Write object masks.
         alpha: Write RGBA images without sky and floor.
         ball_from: Time before which the ball is not there.
+        breath: Share of its radius by which the ball swells and shrinks in the observed time.
         scale: World units of the data set per unit of the truth.
         shift: Where the truth's origin lies in the data set's world.
 
@@ -103,6 +105,7 @@ def make_dataset(
         The folder and its truth.
     """
     truth = make_truth(floor=not alpha)
+    truth = breathing(truth, breath) if breath else truth
     offset = np.asarray(shift, np.float64)
     novel = views
     plan = {
@@ -183,6 +186,20 @@ def make_truth(*, floor: bool = True) -> Scene:
         world_convention="blender",
         cameras=(orbit_camera(0.0, 48, 36),),
         background_sh=((SKY - 0.5) / 0.28209479)[None].astype(np.float32),
+    )
+
+
+def breathing(scene: Scene, share: float) -> Scene:
+    """The scene with a ball that swells and shrinks by a share of its radius, at rest at `T_MAX`."""
+    rows = np.flatnonzero(scene.object_ids == BALL)
+    growth = 1 + share * np.sin(2 * np.pi * (T_MAX - OBSERVED) / 0.6)  # [S]
+    arms = scene.means[rows].astype(np.float64) - CENTERS[BALL]
+    return dataclasses.replace(
+        scene,
+        residual_rows=rows.astype(np.int32),
+        residual_offsets=(arms[:, None] * (growth - 1)[:, None]).astype(np.float32),
+        residual_quats=np.tile(np.float32([1, 0, 0, 0]), (len(rows), len(OBSERVED), 1)),
+        residual_log_scales=np.tile(np.log(growth)[:, None], (len(rows), 1, 3)).astype(np.float32),
     )
 
 

@@ -102,7 +102,7 @@ class ResidualField:
         if not rows:
             none = means.new_zeros(0, 3)
             return Change(motion_ids.new_zeros(0), none, means.new_zeros(0, 4), none)
-        where, gradient = torch.cat(rows), torch.cat(gradients) + torch.eye(3)
+        where, gradient = torch.cat(rows), torch.cat(gradients) + torch.eye(3, dtype=means.dtype)
         axes = rotations.quats_to_rotmats(rotations.normalize(quats[where]))
         stretched = gradient @ axes
         growth = 0.5 * torch.log((stretched**2).sum(-2).clamp(min=1e-4))
@@ -115,7 +115,7 @@ class ResidualField:
             size: Weight of the values.
             roughness: Weight of their second differences.
         """
-        total = torch.zeros(())
+        total = self.values.new_zeros(())
         second = self.values[2:] - 2 * self.values[1:-1] + self.values[:-2]
         for _, run, length, _ in self._runs:
             total = total + size * ((self.values[:, run] / length) ** 2).mean()
@@ -135,7 +135,7 @@ def spread(means: Tensor, motion_ids: Tensor, opacities: Tensor, bodies: list[in
         count: Nodes of each body, at most.
         knots: Number of knots S.
     """
-    nodes, owners = [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
+    nodes, owners = [means.new_zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
     for body in bodies:
         members = motion_ids == body
         seen = members & (opacities > 0.3)
@@ -149,7 +149,7 @@ def spread(means: Tensor, motion_ids: Tensor, opacities: Tensor, bodies: list[in
         nodes.append(points[chosen])
         owners.append(torch.full((len(chosen),), body, dtype=torch.int64))
     place = torch.cat(nodes)
-    return ResidualField(place, torch.cat(owners), torch.zeros(knots, len(place), 4, 3))
+    return ResidualField(place, torch.cat(owners), means.new_zeros(knots, len(place), 4, 3))
 
 
 def _far_apart(points: Tensor, start: Tensor, count: int) -> Tensor:
@@ -192,14 +192,15 @@ def _rigid_part(x: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tensor, Te
     middle = x - _mean(x, weights)
     shift = _mean(offsets, weights)
     squares = (weights[:, None, None] * middle[:, :, None] * middle[:, None, :]).sum(0)
-    inertia = torch.eye(3) * squares.trace() - squares
-    inertia = inertia + 1e-4 * squares.trace().clamp(min=1e-12) * torch.eye(3)  # a line does not tell its spin
+    one = torch.eye(3, dtype=x.dtype)
+    inertia = one * squares.trace() - squares
+    inertia = inertia + 1e-6 * squares.trace().clamp(min=1e-12) * one  # a line does not tell its spin
     moment = (weights[:, None] * torch.linalg.cross(middle, offsets - shift)).sum(0)
     return shift, torch.linalg.solve(inertia, moment)
 
 
 def _cross_matrix(w: Tensor) -> Tensor:
-    zero = torch.zeros(())
+    zero = w.new_zeros(())
     return torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
 
 
