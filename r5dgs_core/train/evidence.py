@@ -16,15 +16,16 @@ import numpy as np
 from scipy import ndimage
 
 from ..scene import cameras
-from .sweep import Backdrop, camera_key
+from .sweep import camera_key
 from .triangulation import Places
-from .views import TrainView, nearest_knot
+from .views import TrainView, nearest_knot, spread
 
 TEXTURE = 0.1  # change of colour per radian (root mean square) that tells a rotation
 STIFFEST = 100.0  # how much smoother a track must be where nothing is seen
-CLEARER = 0.03  # by how much a place must look more like one thing than another, mean difference of colour
+CLEARER = 0.03  # mean difference of colour that noise may make
 DISC = 0.6  # share of a body's radius that is looked at
-FEWEST_FRAMES = 3  # of a camera, for what it usually sees
+HIDDEN = 0.1  # share of it behind other objects with which a view says nothing
+FEWEST_FRAMES, MOST_FRAMES = 2, 15  # of a camera, for what it sees without the object
 
 
 @dataclass(frozen=True)
@@ -42,17 +43,16 @@ class Evidence:
     absent: np.ndarray
 
 
-def gather(views: Sequence[TrainView], scenes: Sequence[Backdrop], places: Places, times: np.ndarray) -> Evidence:
+def gather(views: Sequence[TrainView], places: Places, times: np.ndarray) -> Evidence:
     """Look at all views.
 
     Args:
         views: Training views.
-        scenes: What each camera usually sees behind the objects.
         places: Where the objects are.
         times: The observed times. [S]
     """
     stiff = shift_stiffness(places.evidence)
-    return Evidence(stiff, turn_stiffness(views, places, times), absent(views, scenes, places, times))
+    return Evidence(stiff, turn_stiffness(views, places, times), absent(views, places, times))
 
 
 def shift_stiffness(evidence: np.ndarray) -> np.ndarray:
@@ -118,43 +118,67 @@ def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, in
     return slopes.T @ slopes / 3, int(inside.sum())
 
 
-def absent(views: Sequence[TrainView], scenes: Sequence[Backdrop], places: Places, times: np.ndarray) -> np.ndarray:
+def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.ndarray:
     """Times at which an object is not there, though cameras look at its place and nothing hides it.
 
-    No mask shows it then, and where it should be most views show what the camera usually sees there rather than the
-    object's colour.
+    No mask shows it then, and where it should be most views show what the camera sees there without the object (known
+    from the times at which the object is marked elsewhere), and not the object's colour.
 
     Args:
         views: Training views.
-        scenes: What each camera usually sees behind the objects.
         places: Where the objects are, or would be.
         times: The observed times. [S]
 
     Returns:
-        True where it is absent. [M, S] bool
+        True where it is absent; times that no view tells of are as the nearest unmarked one that is told. [M, S] bool
     """
     votes = np.zeros(places.measured.shape)
     asked = np.zeros(places.measured.shape)
-    backdrop_of = {camera_key(b.camera): b for b in scenes}
-    frames: dict[bytes, int] = {}
-    for view in views:
-        frames[camera_key(view.camera)] = frames.get(camera_key(view.camera), 0) + 1
     colors = _usual_colors(views, places)
+    of_camera: dict[bytes, list[tuple[int, TrainView]]] = {}
     for view in views:
-        backdrop = backdrop_of.get(camera_key(view.camera))
-        if view.mask is None or backdrop is None or frames[camera_key(view.camera)] < FEWEST_FRAMES:
-            continue
-        s = nearest_knot(times, view.t)
-        for row in np.flatnonzero(places.evidence[:, s] == 0):
-            columns, rows = _disc(view, places.centers[row, s], float(places.radii[row]))
-            if len(rows) == 0 or (view.mask[rows, columns] > 0).any() or not backdrop.known[rows, columns].all():
-                continue
-            seen = view.image[rows, columns].mean(0) / 255
-            to_usual = np.abs(seen - backdrop.image[rows, columns].mean(0)).mean()
-            to_object = np.abs(seen - colors[row]).mean()
-            asked[row, s] += 1
-            votes[row, s] += to_usual + CLEARER < to_object
-    return (asked > 0) & (votes > 0.5 * asked)
+        if view.mask is not None:
+            of_camera.setdefault(camera_key(view.camera), []).append((nearest_knot(times, view.t), view))
+    for frames in of_camera.values():
+        for s, view in frames:
+            for row in np.flatnonzero(places.evidence[:, s] == 0):
+                columns, rows = _disc(view, places.centers[row, s], float(places.radii[row]))
+                if len(rows) == 0 or (_ids(view, rows, columns) > 0).mean() > HIDDEN:
+                    continue
+                marked = spread([v for k, v in frames if places.evidence[row, k] > 0], MOST_FRAMES)
+                if len(marked) < FEWEST_FRAMES:
+                    continue
+                empty, known = _without(marked, rows, columns)
+                if known.mean() < 0.5:
+                    continue
+                seen = view.image[rows, columns][known] / 255
+                asked[row, s] += 1
+                to_empty, to_object = (np.abs(seen - x).mean() for x in (empty[known], colors[row]))
+                votes[row, s] += to_empty + CLEARER < 0.5 * to_object
+    gone = (asked > 0) & (votes > 0.5 * asked)
+    for row, unseen in enumerate(places.evidence == 0):
+        runs, count = ndimage.label(unseen)
+        for k in range(1, count + 1):
+            run = np.flatnonzero(runs == k)
+            told = run[asked[row, run] > 0]
+            if len(told):
+                gone[row, run] = gone[row, told[np.abs(run[:, None] - told).argmin(1)]]
+    return gone
+
+
+def _without(frames: Sequence[TrainView], rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median colour of pixels over the frames in which no object covers them [n, 3], and which ever are free [n]."""
+    colors = np.stack([v.image[rows, columns] for v in frames]) / 255
+    free = np.stack([_ids(v, rows, columns) == 0 for v in frames])
+    known = free.any(0)
+    colors[~free] = np.nan
+    colors[:, ~known] = 0.0
+    return np.nanmedian(colors, axis=0), known
+
+
+def _ids(view: TrainView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    assert view.mask is not None
+    return view.mask[rows, columns]
 
 
 def _usual_colors(views: Sequence[TrainView], places: Places) -> np.ndarray:

@@ -18,10 +18,11 @@ from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
 from . import evidence, hull, scatter, shadows, sweep, triangulation
 from .config import Config
-from .views import TrainView, nearest_knot
+from .views import TrainView, nearest_knot, spread
 
 log = logging.getLogger(__name__)
 
+SAME_TIME = 0.1  # share of a camera's step in time within which the times of cameras are one
 SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
 
 
@@ -51,9 +52,27 @@ class Start:
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
-    """Knots of the tracks: the distinct observed times, or ``limit`` even ones where there are more."""
-    times = np.unique(np.round([v.t for v in views], 9))
-    return times if len(times) <= limit else np.linspace(times[0], times[-1], limit)
+    """Knots of the tracks: the distinct observed times.
+
+    Times of cameras that are a little out of step are one knot: those within a tenth of the step that each camera
+    takes. Where more than ``limit`` are left, a spread of them over their order, so that knots are dense where images
+    are. The first and the last observed time are knots.
+    """
+    of_camera: dict[bytes, set[float]] = {}
+    for view in views:
+        of_camera.setdefault(sweep.camera_key(view.camera), set()).add(round(view.t, 9))
+    steps = [np.diff(sorted(found)) for found in of_camera.values() if len(found) > 1]
+    times = np.unique([t for found in of_camera.values() for t in found])
+    if steps:
+        together = SAME_TIME * float(np.median(np.concatenate(steps)))
+        starts = [0]
+        for k, t in enumerate(times):
+            if t - times[starts[-1]] > together:
+                starts.append(k)
+        parts = np.split(times, starts[1:])
+        inner = [part[0] if len(part) == 1 else part.mean() for part in parts]
+        times = np.array([times[0], *inner[1:-1], times[-1]]) if len(parts) > 1 else times[-1:]
+    return np.array(spread(list(times), limit))
 
 
 def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.random.Generator) -> Start:
@@ -157,7 +176,7 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
     )
     with torch.no_grad():
         tracks.params["slope"].copy_(torch.from_numpy(shadow_slope))
-    known = evidence.gather(views, scenes, places, times)
+    known = evidence.gather(views, places, times)
     ids = np.concatenate([[0], places.object_ids])
     return Start(gaussians, tracks, ids, places, first, plane, placed.sky, known)
 

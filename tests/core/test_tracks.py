@@ -160,3 +160,48 @@ def test_a_single_time_or_a_scene_without_bodies_is_still_a_track():
     none = random_tracks(bodies=1, casters=())
     assert none.groups == 1 and float(none.roughness().detach()) == 0
     torch.testing.assert_close(none.poses(0.2).displacements, torch.zeros(1, 3))
+
+
+def rough(tracks, **weights):
+    return float(tracks.roughness(**weights).detach())
+
+
+def test_roughness_counts_entered_knots_only():
+    tracks, bent = steady_tracks(np.linspace(0, 1, 8)), steady_tracks(np.linspace(0, 1, 8))
+    with torch.no_grad():
+        bent.params["translations"][1, 6:] += 1.0
+        bent.params["rotvecs"][1, 6:] += 0.5
+    assert rough(bent) > 0.01
+    assert rough(bent, entered=(0, 5)) == rough(tracks, entered=(0, 5)) == pytest.approx(0, abs=1e-11)
+    assert rough(bent, entered=(3, 6)) > 0.005
+    assert rough(bent, entered=(5, 6)) == 0  # two knots are always steady
+
+
+def test_unit_stiffness_changes_nothing_and_stiffness_scales_where_it_is():
+    tracks = random_tracks()
+    ones, eyes = torch.ones(2, 5), torch.eye(3).expand(2, 5, 3, 3)
+    assert rough(tracks, shift_stiffness=ones, turn_stiffness=eyes) == pytest.approx(rough(tracks), rel=1e-5)
+    assert rough(tracks, shift_stiffness=3 * ones, turn_stiffness=3 * eyes) == pytest.approx(
+        3 * rough(tracks), rel=1e-5
+    )
+    steady = steady_tracks(np.linspace(0, 1, 7))
+    with torch.no_grad():
+        steady.params["translations"][1, 5] += 0.1
+    elsewhere, here = torch.ones(1, 7), torch.ones(1, 7)
+    elsewhere[0, 1], here[0, 5] = 50.0, 50.0
+    assert rough(steady, shift_stiffness=elsewhere) == pytest.approx(rough(steady), rel=1e-5)
+    assert rough(steady, shift_stiffness=here) > 5 * rough(steady)
+
+
+def test_a_turn_is_held_steady_about_its_stiff_axis_and_free_about_the_others():
+    wobble = []
+    for axis in range(3):
+        tracks = steady_tracks(np.linspace(0, 1, 7))
+        with torch.no_grad():
+            tracks.base_quats[1] = torch.tensor([1.0, 0, 0, 0])
+            tracks.params["translations"].zero_()
+            tracks.params["rotvecs"][1, 3, axis] = 0.1
+        stiff = torch.eye(3).expand(1, 7, 3, 3).clone()
+        stiff[..., 2, 2] = 40.0
+        wobble.append(rough(tracks, turn_stiffness=stiff) / rough(tracks))
+    assert wobble == pytest.approx([1.0, 1.0, 40.0], rel=1e-4)
