@@ -244,3 +244,31 @@ def test_variants_differ_by_one_key(tiny):
     assert not torch.equal(
         plain.state().tensors["field.layers.0.weight"], extra.state().tensors["field.layers.0.weight"]
     )
+
+
+def test_gradients_of_the_twist_loss_are_right_in_double_precision():
+    draw = torch.Generator().manual_seed(0)
+    motion = field._motion_of(np.linspace(0, 0.75, 6), tiny_datasets.settings(*FIELD))
+    begin, goal, *state = torch.randn(6, 6, 3, generator=draw, dtype=torch.float64).unbind(0)
+    state = [x.requires_grad_(True) for x in state]
+    groups = torch.tensor([1, 1, 1, 2, 2, 2])
+
+    def loss(*parts: torch.Tensor) -> torch.Tensor:
+        same = torch.Generator().manual_seed(1)
+        return field_fitting.cross_twist(motion, begin, goal, MotionState(*parts), 0.2, groups, same)
+
+    assert torch.autograd.gradcheck(loss, state)
+
+
+def test_stiffness_pulls_every_gaussian_towards_where_its_group_has_it():
+    draw = torch.Generator().manual_seed(0)
+    before = torch.randn(12, 3, generator=draw, dtype=torch.float64)
+    offsets = (0.2 * torch.randn(12, 3, generator=draw, dtype=torch.float64)).requires_grad_(True)
+    groups = torch.ones(12, dtype=torch.int64)
+    rest = torch.zeros(12, 3, dtype=torch.float64)
+    found, shift, _ = field.rigid_fits(before, before + offsets.detach(), groups)
+    quats = found[groups]
+    loss = field.stiffness(field.Moved(torch.arange(12), before, offsets, quats, rest), groups)
+    (gradient,) = torch.autograd.grad(loss, offsets)
+    goal = rotations.rotate(quats, before) + shift[groups]
+    torch.testing.assert_close(gradient, 2 * (before + offsets - goal).detach() / 12)

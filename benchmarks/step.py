@@ -1,0 +1,74 @@
+"""Time of one training step: processor milliseconds of tracks and of the field, on the same data and Gaussians.
+
+    python benchmarks/step.py DATA [--gaussians 12000] [--steps 200] [--json FILE]
+
+Each representation is trained until it has the wanted number of Gaussians (growth is hastened for that), then steps
+are timed with all kernels warm: median and least of processor time of one thread, pose, picture, loss, gradients and
+optimizer together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.train import config, trainer, warming
+
+VARIANTS = {
+    "tracks": [],
+    "tracks, identities beside": ["identity.training='detached'"],
+    "tracks, harmonics of degree 3": ["train.sh_degree=3"],
+    "field": ["train.representation='field'", "field.place_steps=20", "field.trd_steps=0"],
+    "field, through the TRD": [
+        "train.representation='field'",
+        "field.place_steps=20",
+        "field.trd_steps=0",
+        "field.trd_share=1.0",
+    ],
+}
+
+
+def measure(dataset: datasets.Dataset, overrides: list[str], gaussians: int, steps: int) -> dict[str, Any]:
+    """Grow to a number of Gaussians, then time steps; milliseconds."""
+    grown = ["densify.share=1.0", "densify.gradient=1e-6", f"densify.max_gaussians={gaussians}", "densify.start=20"]
+    settings = config.load(None, ["train.iterations=100000", "densify.every=20", *grown, *overrides])
+    run = trainer.Trainer(dataset, settings)
+    while len(run.gaussians) < 0.98 * gaussians and run.iteration < 1000:
+        run.step()
+    run.growth.observe = lambda *_: None  # type: ignore[method-assign]
+    times = []
+    for _ in range(steps):
+        began = time.process_time()
+        run.step()
+        times.append(1e3 * (time.process_time() - began))
+    return {"gaussians": len(run.gaussians), "median_ms": statistics.median(times), "least_ms": min(times)}
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--gaussians", type=int, default=12000)
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    warming.warm_up()
+    dataset = datasets.read(args.data)
+    rows = []
+    print(f"{'':32} {'Gaussians':>9} {'median ms':>9} {'least ms':>9}")
+    for name in args.variants:
+        row = {"variant": name, **measure(dataset, VARIANTS[name], args.gaussians, args.steps)}
+        rows.append(row)
+        print(f"{name:32} {row['gaussians']:>9} {row['median_ms']:>9.2f} {row['least_ms']:>9.2f}", flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=2))
+
+
+if __name__ == "__main__":
+    main()
