@@ -40,9 +40,11 @@ class Change:
 class ResidualField:
     """Nodes on the flexible bodies with their values at the knots; at zero it changes nothing.
 
+    All bodies pass together, F of them, padded to the most members and the most nodes of one.
+
     Args:
         nodes: Canonical places. [Q, 3]
-        owners: Motion group of each node, in runs. [Q] int64
+        owners: Motion group of each node. [Q] int64
         values: d and the rows of l at the knots. [S, Q, 4, 3]
     """
 
@@ -50,16 +52,15 @@ class ResidualField:
         self.nodes = nodes
         self.owners = owners
         self.values = values.detach().requires_grad_(True)
-        self._runs: list[tuple[int, slice, float, float]] = []
-        for body in owners.unique().tolist():
-            at = torch.nonzero(owners == body)[:, 0]
-            run = slice(int(at[0]), int(at[-1]) + 1)
-            self._runs.append((body, run, *_lengths(nodes[run])))
-
-    @property
-    def bodies(self) -> list[int]:
-        """Motion groups that have nodes."""
-        return [body for body, *_ in self._runs]
+        self.bodies: list[int] = owners.unique().tolist()
+        self._slots, self._there = _padded(owners, self.bodies)
+        sizes = [_lengths(nodes[owners == body]) for body in self.bodies]
+        self._lengths = nodes.new_tensor([length for length, _ in sizes]).reshape(-1, 1, 1)
+        self._spacings = nodes.new_tensor([spacing for _, spacing in sizes]).reshape(-1, 1, 1)
+        self._share = nodes.new_ones(len(nodes), 1, 1)  # 1 / length of each node's body
+        for body, (length, _) in zip(self.bodies, sizes, strict=True):
+            self._share[owners == body] = 1 / length
+        self._members: tuple[Tensor, Tensor, Tensor] | None = None
 
     def only(self, bodies: list[int]) -> ResidualField:
         """The field of some of its bodies."""
@@ -83,30 +84,25 @@ class ResidualField:
             motion_ids: Their motion groups. [N] int64
             weights: Of the knots at that time.
         """
-        means, opacities = means.detach(), opacities.detach()
+        index, there = self._members_of(motion_ids)
+        if not bool(there.any()):
+            none = means.new_zeros(0, 3)
+            return Change(motion_ids.new_zeros(0), none, means.new_zeros(0, 4), none)
         mixed = torch.zeros_like(self.values[0])
         for s, weight in weights.items():
             mixed = mixed + weight * self.values[s]
-        rows, offsets, gradients = [], [], []
-        for body, run, length, spacing in self._runs:
-            members = torch.nonzero(motion_ids == body)[:, 0]
-            if len(members) == 0:
-                continue
-            x = means[members]
-            offset, gradient = _blend(x, self.nodes[run], mixed[run], length, spacing)
-            shift, spin = _rigid_part(x, offset, opacities[members])
-            middle = x - _mean(x, opacities[members])
-            offsets.append(offset - shift - torch.linalg.cross(spin.expand_as(middle), middle))
-            gradients.append(gradient - _cross_matrix(spin))
-            rows.append(members)
-        if not rows:
-            none = means.new_zeros(0, 3)
-            return Change(motion_ids.new_zeros(0), none, means.new_zeros(0, 4), none)
-        where, gradient = torch.cat(rows), torch.cat(gradients) + torch.eye(3, dtype=means.dtype)
-        axes = rotations.quats_to_rotmats(rotations.normalize(quats[where]))
-        stretched = gradient @ axes
+        x, share = means.detach()[index], opacities.detach()[index] * there
+        offsets, slopes = self._blend(x, mixed[self._slots])
+        middle = x - _mean(x, share)
+        shift, spin = _rigid_part(middle, offsets, share)
+        offsets = offsets - shift - torch.linalg.cross(spin[:, None].expand_as(middle), middle)
+        slopes = slopes - _cross_matrix(spin)[:, None]
+        kept = torch.nonzero(there.flatten())[:, 0]
+        where = index.flatten()[kept]
+        gradient = slopes.flatten(0, 1)[kept] + torch.eye(3, dtype=means.dtype)
+        stretched = gradient @ rotations.quats_to_rotmats(rotations.normalize(quats[where]))
         growth = 0.5 * torch.log((stretched**2).sum(-2).clamp(min=1e-4))
-        return Change(where, torch.cat(offsets), _turn(gradient), growth)
+        return Change(where, offsets.flatten(0, 1)[kept], _turn(gradient), growth)
 
     def penalty(self, size: float, roughness: float) -> Tensor:
         """Weighted sum of the mean squared value and of its second difference over the knots, per length of the body.
@@ -115,16 +111,44 @@ class ResidualField:
             size: Weight of the values.
             roughness: Weight of their second differences.
         """
-        total = self.values.new_zeros(())
-        second = self.values[2:] - 2 * self.values[1:-1] + self.values[:-2]
-        for _, run, length, _ in self._runs:
-            total = total + size * ((self.values[:, run] / length) ** 2).mean()
-            if len(second):
-                total = total + roughness * ((second[:, run] / length) ** 2).mean()
-        return total / max(1, len(self._runs))
+        scaled = self.values * self._share
+        total = size * (scaled**2).mean()
+        if len(scaled) > 2:
+            total = total + roughness * ((scaled[2:] - 2 * scaled[1:-1] + scaled[:-2]) ** 2).mean()
+        return total
+
+    def _members_of(self, motion_ids: Tensor) -> tuple[Tensor, Tensor]:
+        """Members of each body and which entries are some. [F, n]"""
+        if self._members is None or not torch.equal(self._members[0], motion_ids):
+            self._members = (motion_ids.clone(), *_padded(motion_ids, self.bodies))
+        return self._members[1:]
+
+    def _blend(self, x: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Offsets [F, n, 3] and their gradients, column by axis of x, [F, n, 3, 3] of members at x."""
+        nodes = self.nodes[self._slots]
+        squared = (x**2).sum(-1, keepdim=True) - 2 * x @ nodes.mT + (nodes**2).sum(-1)[:, None]
+        squared = squared / (2 * self._spacings**2)
+        weights = torch.softmax(torch.where(self._there[:, None], -squared, -torch.inf), dim=-1)
+        slopes = values[:, :, 1:] / self._lengths[..., None]  # row: axis of x, column: component of the offset
+        base = values[:, :, 0] - (nodes[:, :, None] @ slopes)[:, :, 0]
+        flat = weights @ torch.cat([base, slopes.flatten(2)], -1)
+        gradient = flat[..., 3:].unflatten(-1, (3, 3))
+        return flat[..., :3] + (x[..., None, :] @ gradient)[..., 0, :], gradient.mT
 
 
-def spread(means: Tensor, motion_ids: Tensor, opacities: Tensor, bodies: list[int], count: int, knots: int):
+def _padded(ids: Tensor, bodies: list[int]) -> tuple[Tensor, Tensor]:
+    """Where each body's id stands, padded with zeros, and which entries are some. [F, most of one]"""
+    found = [torch.nonzero(ids == body)[:, 0] for body in bodies]
+    most = max((len(rows) for rows in found), default=0)
+    index, there = torch.zeros(len(bodies), most, dtype=torch.int64), torch.zeros(len(bodies), most, dtype=torch.bool)
+    for k, rows in enumerate(found):
+        index[k, : len(rows)], there[k, : len(rows)] = rows, True
+    return index, there
+
+
+def spread(
+    means: Tensor, motion_ids: Tensor, opacities: Tensor, bodies: list[int], count: int, knots: int
+) -> ResidualField:
     """A field at zero: nodes on the members of bodies, each as far from the others as can be.
 
     Args:
@@ -172,36 +196,33 @@ def _lengths(nodes: Tensor) -> tuple[float, float]:
     return length, max(float(distance.min(1).values.mean()), 1e-6)
 
 
-def _blend(x: Tensor, nodes: Tensor, values: Tensor, length: float, spacing: float) -> tuple[Tensor, Tensor]:
-    """Offsets [n, 3] and gradients, columns by the axis of x, [n, 3, 3] of members at x."""
-    squared = (x**2).sum(1, keepdim=True) - 2 * x @ nodes.T + (nodes**2).sum(1)
-    weights = torch.softmax(-squared / (2 * spacing**2), dim=1)
-    slopes = values[:, 1:] / length  # row: axis of x, column: component of the offset
-    base = values[:, 0] - (nodes[:, None] @ slopes)[:, 0]
-    flat = weights @ torch.cat([base, slopes.flatten(1)], 1)
-    gradient = flat[:, 3:].reshape(-1, 3, 3)
-    return flat[:, :3] + (x[:, None] @ gradient)[:, 0], gradient.transpose(1, 2)
-
-
 def _mean(x: Tensor, weights: Tensor) -> Tensor:
-    return (weights[:, None] * x).sum(0) / weights.sum().clamp(min=1e-9)
+    """Weighted mean of each body. [F, n, 3] -> [F, 1, 3]"""
+    return (weights[..., None] * x).sum(1, keepdim=True) / weights.sum(1).clamp(min=1e-9)[:, None, None]
 
 
-def _rigid_part(x: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean offset [3] and the small rotation [3] about the mean of x that explains the offsets best, weighted."""
-    middle = x - _mean(x, weights)
+def _rigid_part(middle: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean offset [F, 1, 3] and small rotation about the mean [F, 3] that explain the offsets best, weighted.
+
+    Args:
+        middle: Members about their weighted mean. [F, n, 3]
+        offsets: [F, n, 3]
+        weights: [F, n]
+    """
     shift = _mean(offsets, weights)
-    squares = (weights[:, None, None] * middle[:, :, None] * middle[:, None, :]).sum(0)
-    one = torch.eye(3, dtype=x.dtype)
-    inertia = one * squares.trace() - squares
-    inertia = inertia + 1e-6 * squares.trace().clamp(min=1e-12) * one  # a line does not tell its spin
-    moment = (weights[:, None] * torch.linalg.cross(middle, offsets - shift)).sum(0)
-    return shift, torch.linalg.solve(inertia, moment)
+    squares = (weights[..., None] * middle).mT @ middle
+    trace = squares.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
+    one = torch.eye(3, dtype=middle.dtype)
+    inertia = one * trace - squares + (1e-6 * trace + 1e-12) * one  # a line does not tell its spin
+    moment = (weights[..., None] * torch.linalg.cross(middle, offsets - shift)).sum(1)
+    return shift, (torch.linalg.inv(inertia) @ moment[..., None])[..., 0]
 
 
 def _cross_matrix(w: Tensor) -> Tensor:
-    zero = w.new_zeros(())
-    return torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
+    """Matrices of the cross product with vectors. [F, 3] -> [F, 3, 3]"""
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def _turn(gradient: Tensor) -> Tensor:

@@ -313,7 +313,7 @@ class ResidualSection:
     """
 
     start: float = 0.4
-    trial_steps: int = 200
+    trial_steps: int = 150
     threshold: float = 0.5
     nodes: int = 40
     size: float = 1e-3

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MARGIN = 2  # pixels around a mask that count to its object: what bends crosses its edge
-HELD_SHARE, MAX_HELD = 0.2, 30  # views that the trial leaves for the comparison
+HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
 MIN_PIXELS = 50  # on these together, below which nothing is said of a body
 SEED_STEP = 2  # the trial draws from a generator of its own
 PREFIX = "residual."
