@@ -23,9 +23,9 @@ def carve(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw points that all views agree to lie in the object.
 
-    A view that has the point in its frame votes: for it where the mask shows the object, against it where the mask
-    shows background, not at all where another object may hide it. The bounds start strict (no vote against it) and
-    are relaxed until enough points are found, so that noisy masks still give a start.
+    A view whose mask shows the object and that has the point in its frame votes: for it where the mask shows the
+    object, against it where the mask shows background, not at all where another object may hide it. The bounds start
+    strict (no vote against it) and are relaxed until enough points are found, so that noisy masks still give a start.
 
     Args:
         views: Views at the reference time.
@@ -37,7 +37,7 @@ def carve(
 
     Returns:
         Points [count, 3] and their colours, mean over the views that show the object there [count, 3] in [0, 1];
-        when nothing at all can be carved, points of a small ball.
+        when nothing at all can be carved, points of a small ball in the object's mean colour (gray if never seen).
     """
     direction = rng.normal(size=(24 * count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -46,9 +46,12 @@ def carve(
     outside = np.zeros(len(points))
     seen = np.zeros(len(points))
     colors = np.zeros((len(points), 3))
+    usual, pixels = np.zeros(3), 0
     for view in views:
-        if view.mask is None:
+        if view.mask is None or not (marked := view.mask == object_id).any():
             continue
+        usual += view.image[marked].sum(0) / 255
+        pixels += int(marked.sum())
         columns, rows, valid = pixel_indices(view, points)
         ids = np.where(valid, view.mask[rows, columns].astype(np.int64), -1)
         here = ids == object_id
@@ -64,7 +67,9 @@ def carve(
     if len(chosen) == 0:
         chosen = np.argsort(np.linalg.norm(points - center, axis=1))[:count]
     chosen = rng.choice(chosen, count, replace=len(chosen) < count)
-    return points[chosen], colors[chosen] / np.maximum(inside[chosen], 1)[:, None]
+    mean = usual / pixels if pixels else np.full(3, 0.5)
+    known = inside[chosen, None] > 0
+    return points[chosen], np.where(known, colors[chosen] / np.maximum(inside[chosen, None], 1), mean)
 
 
 def pixel_indices(view: TrainView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -58,6 +58,27 @@ def test_one_wrong_mask_does_not_empty_the_hull(tiny, posed):
         assert (view.mask[rows, columns] != 0).mean() > 0.95
 
 
+def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, posed):
+    seen, t, norm = posed
+    center = (tiny.center(1, t) - norm.origin) / norm.scale
+    unmarked = [dataclasses.replace(v, mask=np.where(v.mask == 1, 0, v.mask)) for v in seen[2:]]
+    points, colors = carve([*seen[:2], *unmarked], 1, center)
+    for view in seen[:2]:
+        columns, rows, _ = hull.pixel_indices(view, points)
+        assert (view.mask[rows, columns] != 0).all()
+    assert (colors.max(1) > 0.05).all()
+
+
+def test_a_ball_that_nothing_agrees_on_has_the_objects_mean_colour(posed):
+    seen, _, _ = posed
+    painted = [
+        dataclasses.replace(v, image=np.full_like(v.image, [90, 150, 30]), mask=np.where(v.mask == 1, 5, 0))
+        for v in seen
+    ]
+    _, colors = carve(painted, 5, np.array([0.0, 0.0, 50.0]), count=40)
+    np.testing.assert_allclose(colors, np.tile([90, 150, 30], (40, 1)) / 255, atol=1e-6)
+
+
 def test_without_any_agreement_a_small_ball_is_the_start(posed):
     seen, _, _ = posed
     points, colors = carve(seen, 9, np.array([0.1, 0.2, 0.3]), count=50)
