@@ -73,10 +73,9 @@ def observed_motion(
     for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
         bind[name][rows.numpy()] = value
     motion_ids = np.zeros(len(labels), np.int64)
-    start_ids = gaussians["motion_ids"].numpy()[rows.numpy()]
-    own = labels[rows.numpy()].astype(np.int64)
-    for k, caster in enumerate(shadows):  # background by its looks, that the masks' shadow groups started
-        own = np.where((own == 0) & (start_ids == len(object_ids) + k) & (caster > 0), len(object_ids) + k, own)
+    own = gaussians["motion_ids"].numpy()[rows.numpy()]
+    if not own.any():  # nobody said what belongs to what before training: the labels do
+        own = labels[rows.numpy()].astype(np.int64)
     motion_ids[rows.numpy()] = own
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
