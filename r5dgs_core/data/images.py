@@ -104,9 +104,10 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.png")
     try:
         target = oiio.ImageOutput.create(str(temporary))
-        good = target is not None and target.open(str(temporary), spec)
-        good = good and target.write_image(np.ascontiguousarray(pixels))
-        problem = oiio.geterror() if target is None else target.geterror()  # a full disk is told here alone
+        if target is None:
+            raise errors.DatasetError(f"{path}: cannot write the image ({oiio.geterror().strip()})")
+        good = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
+        problem = target.geterror()  # a full disk is told here alone
         if not good or problem or not target.close():
             problem = " ".join(problem.split()) or "no reason given"
             raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
