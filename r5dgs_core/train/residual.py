@@ -130,7 +130,7 @@ def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.nd
             region = view.mask == ids[body - 1]
             if not region.any():
                 continue
-            region = ndimage.binary_dilation(region, iterations=MARGIN)
+            region = np.asarray(ndimage.binary_dilation(region, iterations=MARGIN), bool)
             others = field.only([b for b in field.bodies if b != body])
             pixels[body - 1] += region.sum()
             errors[0, body - 1] += whole[region].sum()

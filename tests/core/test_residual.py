@@ -128,6 +128,12 @@ def test_nodes_spread_over_each_body_and_strays_carry_none():
     assert field_on(means, ids, weights, (1, 9)).bodies == [1]
 
 
+def test_a_field_of_no_body_changes_nothing():
+    means, quats, weights, ids = random_state()
+    field = field_on(means, ids, weights).only([])
+    assert field.bodies == [] and len(field.change(means, quats, weights, ids, {0: 1.0}).rows) == 0
+
+
 def test_a_body_of_one_gaussian_cannot_bend():
     means, quats, weights, _ = random_state(3)
     ids = torch.tensor([0, 1, 0])
