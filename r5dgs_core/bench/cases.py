@@ -24,10 +24,11 @@ VARIANTS: dict[str, dict[str, str]] = {
     "5dgs": {"train.representation": "field", "field.variant": "5dgs"},
     "r5dgs": {"train.representation": "field", "field.variant": "r5dgs"},
     "r5dgs_extra": {"train.representation": "field", "field.variant": "r5dgs_extra"},
+    "from_tracks": {"train.representation": "field", "field.variant": "r5dgs", "field.tracks_share": "0.4"},
     "tracks": {"train.representation": "tracks"},
 }
 # `5dgs` is trained as `r5dgs` is and differs only in how it is played, so its row comes from the checkpoint of `r5dgs`.
-DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "tracks")
+DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "from_tracks", "tracks")
 # Looking at held-out views while training would be counted into its time. The user's settings win over these.
 QUIET = ("train.probe_every=0",)
 COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # of a sitting; seconds add up

@@ -151,7 +151,7 @@ class FieldSection:
         movers: Gaussians that the networks move: ``all``, or ``labelled``: those that the masks put on an object
             or in its shadow; the others stand still exactly.
         place_steps: Steps that fit the field to the triangulated places of the objects before the first image.
-        tracks_steps: Length of a run of ``tracks`` that the field starts from; 0 starts from scratch.
+        tracks_share: Share of the run that is one of ``tracks``, which the field then starts from; 0 starts from scratch.
         distill_steps: Steps that fit field and TRD to the motion of those tracks.
         trd_steps: Steps that fit the TRD to the motion of the field, without images, at every ``trd_every``.
         trd_every: Steps between two such fits, as a share of the run; 0 for none.
@@ -167,7 +167,7 @@ class FieldSection:
     trd_share: float = 0.5
     movers: str = "labelled"
     place_steps: int = 300
-    tracks_steps: int = 0
+    tracks_share: float = 0.0
     distill_steps: int = 600
     trd_steps: int = 200
     trd_every: float = 0.2
@@ -542,6 +542,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("field.movers", lambda value: value in MOVERS, " or ".join(MOVERS)),
     ("field.trd_share", *_SHARE),
     ("field.trd_every", *_SHARE),
+    ("field.tracks_share", *_SHARE),
     ("field.chunk", *_AT_LEAST_1),
     ("losses.rigid_start", *_SHARE),
     ("identity.training", lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),

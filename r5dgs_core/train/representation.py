@@ -110,7 +110,7 @@ REPRESENTATIONS: dict[str, type[TracksRepresentation] | type[FieldRepresentation
 
 def make(start: initialization.Start, config: Config) -> Representation:
     """The representation that training starts with: the one asked for, or the tracks that a field starts from."""
-    if config.train.representation == TracksRepresentation.name or config.field.tracks_steps > 0:
+    if config.train.representation == TracksRepresentation.name or config.field.tracks_share > 0:
         return TracksRepresentation(start, config)
     bring_together(start.gaussians, start.tracks, start.first_time)
     return FieldRepresentation(start.tracks, start.first_time, config)

@@ -157,8 +157,7 @@ class Trainer:
         """
         if self.iteration == 0:
             self.motion.begin(self.gaussians, self.generator)
-        if self.iteration == self.config.field.tracks_steps > 0 and isinstance(self.motion, TracksRepresentation):
-            self._leave_tracks(self.motion)
+        self._leave_tracks()
         self._grow_times()
         index = self._draw()
         view = self.views[index]
@@ -238,10 +237,13 @@ class Trainer:
             return self.identity.labels(self.gaussians)
         return torch.from_numpy(self.motion.group_classes(self.motion.tensors()))[self.gaussians.motion_ids]
 
-    def _leave_tracks(self, tracks: TracksRepresentation) -> None:
-        """Go on with a field where the configuration asks for one that starts from tracks."""
-        if self.config.train.representation == field.FieldRepresentation.name:
-            self.motion = field.from_tracks(tracks, self.gaussians, self.first_time, self.config, self.generator)
+    def _leave_tracks(self) -> None:
+        """Go on with a field where the configuration asks for one and its share of tracks is over."""
+        asked = self.config.train.representation == field.FieldRepresentation.name
+        if not (asked and isinstance(self.motion, TracksRepresentation)):
+            return
+        if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
+            self.motion = field.from_tracks(self.motion, self.gaussians, self.first_time, self.config, self.generator)
             self.optimizer = self._make_optimizer()
 
     def _target(self, index: int) -> Tensor:

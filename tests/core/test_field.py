@@ -129,7 +129,7 @@ def test_a_rigid_motion_of_each_group_costs_no_stiffness_and_anything_else_does(
     torch.testing.assert_close(shift, torch.arange(3)[:, None].expand(3, 3) * 0.3, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("overrides", [(), ("field.tracks_steps=12", "field.distill_steps=20", "train.iterations=40")])
+@pytest.mark.parametrize("overrides", [(), ("field.tracks_share=0.3", "field.distill_steps=20", "train.iterations=40")])
 def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
     extra = ("field.variant='r5dgs_extra'", "identity.training='joint'", "losses.rigid_start=0.1", *overrides)
     reference = make(tiny, *extra)
@@ -151,7 +151,7 @@ def test_a_resumed_field_ends_with_the_same_numbers(tiny, tmp_path, overrides):
 
 def test_a_field_may_start_from_tracks_and_moves_as_they_did(tiny):
     trainer = make(
-        tiny, "field.tracks_steps=60", "field.distill_steps=500", "train.iterations=61", "densify.start=1000"
+        tiny, "field.tracks_share=0.98", "field.distill_steps=500", "train.iterations=61", "densify.start=1000"
     )
     while trainer.iteration < 60:
         trainer.step()
