@@ -151,7 +151,7 @@ class FieldSection:
         movers: Gaussians that the networks move: ``all``, or ``labelled``: those that the masks put on an object
             or in its shadow; the others stand still exactly.
         place_steps: Steps that fit the field to the triangulated places of the objects before the first image.
-        tracks_share: Share of the run that is one of ``tracks``, which the field then starts from; 0 starts from scratch.
+        tracks_share: Share of the run that is one of ``tracks``, from which the field then starts; 0 for none.
         distill_steps: Steps that fit field and TRD to the motion of those tracks.
         trd_steps: Steps that fit the TRD to the motion of the field, without images, at every ``trd_every``.
         trd_every: Steps between two such fits, as a share of the run; 0 for none.
