@@ -75,7 +75,13 @@ def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
     return np.array(spread(list(times), limit))
 
 
-def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.random.Generator) -> Start:
+def start(
+    views: Sequence[TrainView],
+    config: Config,
+    find_sky: bool,
+    rng: np.random.Generator,
+    cloud: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Start:
     """Place Gaussians and tracks.
 
     Args:
@@ -83,6 +89,7 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
         config: Configuration of the run.
         find_sky: Whether there may be sky behind the scene; not where the background's colour is given.
         rng: Source of the draws.
+        cloud: Points and colours in [0, 1] of a reconstruction, normalised coordinates. [P, 3] each
 
     Returns:
         The start of the training.
@@ -118,6 +125,10 @@ def start(views: Sequence[TrainView], config: Config, find_sky: bool, rng: np.ra
     where, shade = placed.points, placed.colors
     if at_random:
         where, shade = scatter.everywhere(scenes, init.background_points, rng)
+    elif cloud is not None:
+        known, hues = scatter.behind_objects(*cloud, views, init.background_points, rng)
+        fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]
+        where, shade = np.concatenate([known, where[fill]]), np.concatenate([hues, shade[fill]])
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
     opacities = [np.full(sum(map(len, points)) + len(where), init.opacity)]
     scales = [_neighbour_scales(np.concatenate([*points, where]))] if points or len(where) else []

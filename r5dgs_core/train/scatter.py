@@ -1,4 +1,4 @@
-"""Points at random where cameras look: the start that needs neither masks nor matching."""
+"""Backgrounds that need no matching of images: points at random where cameras look, and those of a reconstruction."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..scene import cameras
+from .hull import pixel_indices
 from .normalization import TARGET_DISTANCE
 from .sweep import Backdrop
+from .views import TrainView
 
 REACH = 1.5  # half the side of the cube that points are drawn from, in distances of the cameras from their focus
 BATCHES = 64
@@ -41,3 +43,30 @@ def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator)
             break
     where = np.concatenate(kept)[:count]
     return where, np.clip(0.5 + 0.1 * rng.standard_normal(where.shape), 0, 1)
+
+
+def behind_objects(
+    points: np.ndarray, colors: np.ndarray, views: Sequence[TrainView], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a reconstruction that belong to the background.
+
+    Args:
+        points: Points, normalised coordinates. [P, 3]
+        colors: Their colours. [P, 3]
+        views: Training views.
+        count: Most points that are wanted.
+        rng: Source of the draws.
+
+    Returns:
+        Those that masks put on objects in less than a third of the views that have them in the frame. [Q, 3] each
+    """
+    shown, covered = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        if view.mask is None:
+            continue
+        columns, rows, valid = pixel_indices(view, points)
+        shown += valid
+        covered += valid & (view.mask[rows, columns] > 0)
+    free = np.flatnonzero(covered <= shown / 3)
+    kept = np.sort(rng.permutation(free)[:count])
+    return points[kept], colors[kept]

@@ -70,7 +70,7 @@ class Trainer:
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
         rng = np.random.default_rng(config.train.seed)
-        start = initialization.start(self.views, config, behind is None, rng)
+        start = initialization.start(self.views, config, behind is None, rng, self._cloud())
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
@@ -119,6 +119,13 @@ class Trainer:
         )
         self.growth = strategies.make(config, conditions, len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
+
+    def _cloud(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Points of the data set's reconstruction in normalised coordinates and their colours, where it has one."""
+        points, colors = self.dataset.points, self.dataset.point_colors
+        if points is None or colors is None or len(points) == 0:
+            return None
+        return (points - self.normalization.origin) / self.normalization.scale, colors
 
     def _fixed_background(self) -> np.ndarray | None:
         kind = self.config.train.background

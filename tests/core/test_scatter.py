@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -45,3 +47,28 @@ def test_a_run_may_start_from_points_at_random_without_the_masks_help(tiny):
 def test_tracks_do_not_start_from_points_at_random():
     with pytest.raises(ConfigError, match="init.placement"):
         config.load(None, ["init.placement='random'"])
+
+
+def test_points_of_a_reconstruction_become_background_where_no_object_is(tiny):
+    trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("train.iterations=4"))
+    rng = np.random.default_rng(0)
+    floor = np.concatenate([rng.uniform(-0.2, 0.2, (50, 2)) + [1.4, 1.4], np.zeros((50, 1))], 1)
+    brick = tiny.center(tiny_datasets.BRICK, 0.3) + rng.normal(size=(50, 3)) * 0.03
+    world = np.concatenate([floor, brick])
+    points = (world - trainer.normalization.origin) / trainer.normalization.scale
+    then = [view for view in trainer.views if abs(view.t - 0.3) < 1e-6]
+    kept, colors = scatter.behind_objects(points, np.tile([0.2, 0.4, 0.6], (100, 1)), then, 1000, rng)
+    assert len(kept) == len(colors) > 30
+    assert np.linalg.norm(kept[:, None] - points[None, 50:], axis=-1).min() > 0.05
+    fewer, _ = scatter.behind_objects(points, points, then, 10, rng)
+    assert len(fewer) == 10
+
+
+def test_a_data_set_with_a_reconstruction_starts_from_its_points(tiny):
+    data = datasets.read(tiny.root)
+    points = np.random.default_rng(1).uniform(-1, 1, (80, 3)) * [1.5, 1.5, 0.01]
+    known = dataclasses.replace(data, points=points, point_colors=np.full((80, 3), 0.25))
+    trainer = Trainer(known, tiny_datasets.settings("train.iterations=4"))
+    means = trainer.normalization.points_to_world(trainer.gaussians.means.detach().numpy())
+    nearest = np.linalg.norm(means[:, None] - points[None], axis=-1).min(0)
+    assert (nearest < 1e-4).mean() > 0.6
