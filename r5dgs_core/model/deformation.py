@@ -39,7 +39,7 @@ class FieldShape:
 SHAPES = {
     "complex": FieldShape(),
     "light": FieldShape(depth=6, width=128, time_width=128),
-    "small": FieldShape(depth=4, width=128, position_bands=6, time_width=64),
+    "small": FieldShape(depth=4, width=128, position_bands=6, time_bands=3, time_width=64),
 }
 
 
