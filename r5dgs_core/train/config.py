@@ -230,6 +230,7 @@ class DensifySection:
         prune_width: Wider ones are removed; standard deviation as a share of the image width.
         prune_near: Background that is nearer to a camera and that no second camera sees is removed; normalised units
             (the cameras' focus is at about 4); 0 keeps it.
+        opacity: Weight of the mean opacity in the loss, so that what no image needs fades; 0 for none.
     """
 
     strategy: str = "share"
@@ -243,6 +244,7 @@ class DensifySection:
     prune_opacity: float = 0.01
     prune_width: float = 0.16
     prune_near: float = 1.0
+    opacity: float = 0.003
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,9 @@ class _Gradients:
 class Share(_Gradients):
     """The largest gradients grow, at most a share of all in a round; no opacity resets. The default.
 
+    A small weight on the mean opacity lets fade what no image needs: Gaussians that no camera sees, or that repeat the
+    sky before the sky, would otherwise stay as chance left them, and show in views from elsewhere.
+
     Args:
         section: Thresholds.
         conditions: What the run tells.
@@ -60,6 +63,12 @@ class Share(_Gradients):
         super().__init__(conditions, count)
         self.section = section
         self.width_limit = section.prune_width * conditions.image_width * conditions.pixel_size
+
+    def penalty(self, gaussians: Gaussians) -> Tensor | None:
+        """Mean opacity, weighted."""
+        if self.section.opacity <= 0 or len(gaussians) == 0:
+            return None
+        return self.section.opacity * torch.sigmoid(gaussians.params["opacity_logits"]).mean()
 
     def after_step(
         self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, iteration: int, means_rate: float

@@ -1,15 +1,18 @@
 """Densification: what the gradients ask for grows, within the cap, and what is not needed is removed."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import RasterStats
 from r5dgs_core.train import checkpoint, densification, strategies
+from r5dgs_core.train import config as configs
 from r5dgs_core.train.config import Config, DensifyDefaultSection, DensifySection
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
@@ -160,6 +163,25 @@ def test_nothing_grows_under_the_gradient_of_the_configuration():
     assert len(gaussians) == 40
 
 
+def test_what_no_image_needs_fades_and_is_removed():
+    gaussians, optimizer = make(n=6)
+    wanted = torch.arange(6) < 4
+    strategy = strategies.Share(SECTION, conditions(), 6)
+    optimizer.param_groups[3]["lr"] = 0.05
+    for iteration in range(1, 301):
+        optimizer.zero_grad()
+        image = (torch.sigmoid(gaussians.opacity_logits) - 0.7).abs() * wanted[: len(gaussians)]
+        (image.sum() + strategy.penalty(gaussians)).backward()
+        optimizer.step()
+        strategy.after_step(gaussians, optimizer, iteration, 1e-3)
+    assert len(gaussians) == 4
+    torch.testing.assert_close(
+        torch.sigmoid(gaussians.opacity_logits).detach(), torch.full((4,), 0.7), atol=0.03, rtol=0
+    )
+    kept = strategies.Share(dataclasses.replace(SECTION, opacity=0.0), conditions(), 6)
+    assert kept.penalty(gaussians) is None
+
+
 def test_the_default_strategy_grows_all_that_reach_the_threshold_whatever_their_share():
     gaussians, optimizer = make()
     adapt(gaussians, optimizer, gradients(torch.where(torch.arange(40) < 30, 3e-4, 1e-4)))
@@ -287,3 +309,16 @@ def test_harmonics_join_one_degree_at_a_time(tiny):
         trainer.step()
         trained.append(int(trainer.gaussians.sh_rest.detach().abs().amax((0, 2)).count_nonzero()))
     assert trained == [0] * 4 + [3] * 4 + [8] * 2
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("densify.strategy=mcmcc", "densify.strategy: expected share or default or mcmc, got 'mcmcc'"),
+        ("densify_default.reset_opacity=1", "densify_default.reset_opacity: expected between 0 and 1, got 1.0"),
+        ("densify_mcmc.noize=1", "densify_mcmc.noize: unknown key; did you mean 'noise'?"),
+    ],
+)
+def test_thresholds_that_no_strategy_can_use_are_named(override, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        configs.load(None, [override])
