@@ -276,10 +276,11 @@ class Trainer:
         if name == "shading" and not self.config.train.shading:
             return 0.0
         progress = self.iteration / self.config.train.iterations
-        if progress <= rates.decay_from or name not in GEOMETRY + APPEARANCE + NETWORKS:
+        begin = self.config.residual.start if name == "residual" else rates.decay_from  # later learned, later settled
+        if progress <= begin or name not in GEOMETRY + APPEARANCE + NETWORKS:
             return base
         decay = rates.decay_networks if name in NETWORKS else rates.decay
-        factor = decay ** ((progress - rates.decay_from) / (1 - rates.decay_from))
+        factor = decay ** ((progress - begin) / (1 - begin))
         return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
 
     def _curriculum(self) -> tuple[int, int]:
