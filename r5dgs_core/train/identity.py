@@ -21,8 +21,9 @@ from ..model.gaussians import Gaussians
 from ..raster import rasterize_splats
 from ..scene.scene import IDENTITY_DIM
 from . import identity_losses
-from .config import Config, IdentitySection
+from .config import Config
 from .posing import Splats
+from .sections import IdentitySection
 from .views import TrainView, spread
 
 VOTE_VIEWS = 80

@@ -15,8 +15,8 @@ from ..motion import rotations
 from ..raster import RasterStats
 from ..scene.cameras import Camera
 from . import densification
-from .config import DensifyMcmcSection
 from .densification import Conditions
+from .sections import DensifyMcmcSection
 
 MOST = 51  # Gaussians that one may be divided into at a time
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # the noise fades over 1 / slope as the opacity rises past this one

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..motion import rotations
 from ..scene.scene import MotionGroup
-from .config import Config, NeedsSection
+from .config import Config
+from .sections import NeedsSection
 
 STILL_QUAT = rotations.identity()
 STILL = 0.0025  # displacement over the observed time, as a share of the group's diameter, below which it is static

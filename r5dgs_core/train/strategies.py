@@ -14,8 +14,9 @@ from ..model.gaussians import Gaussians
 from ..raster import RasterStats
 from ..scene.cameras import Camera
 from . import densification, mcmc
-from .config import Config, DensifyDefaultSection, DensifySection
+from .config import Config
 from .densification import Conditions, ScreenGradients
+from .sections import DensifyDefaultSection, DensifySection
 
 
 class _Gradients:

@@ -13,7 +13,8 @@ from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import RasterStats
 from r5dgs_core.train import checkpoint, densification, strategies
 from r5dgs_core.train import config as configs
-from r5dgs_core.train.config import Config, DensifyDefaultSection, DensifySection
+from r5dgs_core.train.config import Config
+from r5dgs_core.train.sections import DensifyDefaultSection, DensifySection
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 from tests import scenes

@@ -13,8 +13,8 @@ from r5dgs_core.report import evaluate, metrics
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.train import config, identity, identity_losses
-from r5dgs_core.train.config import IdentitySection
 from r5dgs_core.train.posing import Splats
+from r5dgs_core.train.sections import IdentitySection
 from r5dgs_core.train.views import TrainView
 
 

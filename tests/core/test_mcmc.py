@@ -6,7 +6,7 @@ import torch
 
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.train import mcmc
-from r5dgs_core.train.config import DensifyMcmcSection
+from r5dgs_core.train.sections import DensifyMcmcSection
 from tests.core.test_densification import conditions, make
 
 SECTION = DensifyMcmcSection()
