@@ -83,7 +83,7 @@ def _among(t: float, times: Collection[float]) -> bool:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="How well training sees between the times that it saw.")
     parser.add_argument("data", type=Path)
     parser.add_argument("--every", type=int, default=3)
     parser.add_argument("--offset", type=int, default=1)

@@ -98,15 +98,15 @@ def turn_stiffness(views: Sequence[TrainView], places: Places, times: np.ndarray
 
 def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, int] | None:
     """Squared change of colour per radian, summed over the pixels inside a mask, camera axes [3, 3]; their number."""
-    inside = ndimage.binary_erosion(here, iterations=2)
+    inside = np.asarray(ndimage.binary_erosion(here, iterations=2), bool)
     if inside.sum() < 12:
         return None
     rows, cols = np.nonzero(here)
-    y, x = np.mgrid[: inside.shape[0], : inside.shape[1]].astype(np.float64)
-    b, a = y - rows.mean(), x - cols.mean()
+    height, width = here.shape
+    b, a = np.meshgrid(np.arange(height) - rows.mean(), np.arange(width) - cols.mean(), indexing="ij")
     radius2 = max((a[here] ** 2 + b[here] ** 2).max(), 1.0)
     image = part.astype(np.float64) / 255
-    near = ndimage.binary_dilation(inside)  # the gradient of a pixel looks at its neighbours
+    near = np.asarray(ndimage.binary_dilation(inside), bool)  # the gradient of a pixel looks at its neighbours
     shape = np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], -1)
     smooth = shape @ np.linalg.lstsq(shape[near], image[near], rcond=None)[0]
     texture = np.where(near[..., None], image - smooth, 0.0)
@@ -157,9 +157,9 @@ def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.
                 votes[row, s] += to_empty + CLEARER < 0.5 * to_object
     gone = (asked > 0) & (votes > 0.5 * asked)
     for row, unseen in enumerate(places.evidence == 0):
-        runs, count = ndimage.label(unseen)
-        for k in range(1, count + 1):
-            run = np.flatnonzero(runs == k)
+        first = np.flatnonzero(np.diff(unseen, prepend=False) & unseen)
+        for start in first:
+            run = start + np.flatnonzero(np.logical_and.accumulate(unseen[start:]))
             told = run[asked[row, run] > 0]
             if len(told):
                 gone[row, run] = gone[row, told[np.abs(run[:, None] - told).argmin(1)]]
@@ -170,7 +170,7 @@ def _without(frames: Sequence[TrainView], rows: np.ndarray, columns: np.ndarray)
     """Median colour of pixels over the frames in which no object covers them [n, 3], and which ever are free [n]."""
     colors = np.stack([v.image[rows, columns] for v in frames]) / 255
     free = np.stack([_ids(v, rows, columns) == 0 for v in frames])
-    known = free.any(0)
+    known = np.asarray(free.any(0))
     colors[~free] = np.nan
     colors[:, ~known] = 0.0
     return np.nanmedian(colors, axis=0), known
