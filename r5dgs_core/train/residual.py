@@ -21,9 +21,10 @@ from torch import Tensor
 
 from ..errors import TrainingError
 from ..model import residual_field
-from ..model.residual_field import ResidualField
+from ..model.residual_field import Change, ResidualField
 from ..model.tracks import Tracks
 from ..motion import rotations
+from . import shading as shading_vectors
 from .config import Config
 from .groups import PointMotion
 
@@ -160,6 +161,28 @@ def residual_of(tensors: Mapping[str, Tensor]) -> ResidualField | None:
     return ResidualField(nodes, owners, values)
 
 
+def relight(
+    change: Change, colors: Tensor, shading: Tensor, light: Tensor, rotmats: Tensor, groups: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colours and shading vectors in which what turns on its own is lit by its own rotation.
+
+    Args:
+        change: The members of flexible bodies and how they turn.
+        colors: Colours of all Gaussians, before the shading. [N, 3]
+        shading: The vectors g. [N, 3]
+        light: The vector l. [3]
+        rotmats: Rotations of the motion groups. [G, 3, 3]
+        groups: Group of each member. [n]
+
+    Returns:
+        Colours with the members' shading in them [N, 3], and vectors that are zero for the members [N, 3].
+    """
+    seen = rotations.rotate(rotations.conjugate(change.quats), (light @ rotmats)[groups])  # l from the member's frame
+    factor = (1 + (shading[change.rows] * (seen - light)).sum(1, keepdim=True)).clamp(min=0)
+    lit = colors[change.rows].clamp(min=0) * factor
+    return colors.index_copy(0, change.rows, lit), shading.index_fill(0, change.rows, 0.0)
+
+
 @torch.no_grad()
 def point_motion(
     field: ResidualField, tracks: Tracks, tensors: Mapping[str, Tensor]
@@ -175,10 +198,11 @@ def point_motion(
         States at the knots in training coordinates; and parameters by name in which members have their shape of the
         last knot, moved back to the canonical state.
     """
-    g = {name: tensors[f"gaussians.{name}"].double() for name in ("means", "quats", "log_scales", "opacity_logits")}
+    names = ("means", "quats", "log_scales", "sh", "sh_rest", "shading")
+    g = {name: tensors[f"gaussians.{name}"].double() for name in names}
     ids, centers = tensors["gaussians.motion_ids"], tracks.group_centers().double()
     opacities = torch.sigmoid(tensors["gaussians.opacity_logits"])
-    bind = {name: g[name].numpy().copy() for name in ("means", "quats", "log_scales")}
+    bind = {name: tensor.numpy().copy() for name, tensor in g.items()}
     rows = np.zeros(0, np.int64)
     states: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for s, t in enumerate(tracks.times):
@@ -190,8 +214,12 @@ def point_motion(
         quats = rotations.multiply(change.quats.double(), rotations.normalize(g["quats"][change.rows]))
         sizes = g["log_scales"][change.rows] + change.log_scales
         if s == len(tracks.times) - 1:
-            for name, value in (("means", means), ("quats", quats), ("log_scales", sizes)):
-                bind[name][rows] = value.numpy()
+            sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1)[rows]
+            since, light = change.quats.numpy().astype(np.float64), tensors["light"].numpy().astype(np.float64)
+            sh, vectors = shading_vectors.rebind(sh, bind["shading"][rows], since, light)
+            state = {"means": means.numpy(), "quats": quats.numpy(), "log_scales": sizes.numpy()}
+            for name, value in (state | {"sh": sh[:, :1], "sh_rest": sh[:, 1:], "shading": vectors}).items():
+                bind[name][rows] = value
         turn = tracks.knot_quats()[:, s].double()[group]
         shift = centers[group] + tracks.params["translations"][:, s].double()[group]
         moved = shift + rotations.rotate(turn, means - centers[group])

@@ -84,19 +84,22 @@ class TracksRepresentation:
                 pose_ids=gaussians.motion_ids,
             )
         means, quats, log_scales = params["means"], params["quats"], params["log_scales"]
+        shading = params["shading"]
         if self.residuals is not None:
             weights, opacities = self.tracks.knot_weights(t), torch.sigmoid(params["opacity_logits"])
             change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, weights)
             means = means.index_add(0, change.rows, change.offsets)
             log_scales = log_scales.index_add(0, change.rows, change.log_scales)
             quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
+            group = gaussians.motion_ids[change.rows]
+            colors, shading = residual.relight(change, colors, shading, self.light, poses.rotmats, group)
         splats = posing.pose(
             means,
             quats,
             log_scales,
             params["opacity_logits"],
             colors,
-            params["shading"],
+            shading,
             self.light,
             gaussians.motion_ids,
             poses,

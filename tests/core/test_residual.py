@@ -144,6 +144,26 @@ def test_a_body_of_one_gaussian_cannot_bend():
     assert change.offsets.abs().max() < 1e-9 and change.log_scales.isfinite().all()
 
 
+def test_what_turns_on_its_own_is_lit_like_what_its_track_turns():
+    generator = torch.Generator().manual_seed(4)
+    colors, shading = torch.rand(5, 3, generator=generator), 0.3 * torch.randn(5, 3, generator=generator)
+    light, turn = torch.tensor([0.2, -0.5, 0.9]), rotations.rotvecs_to_quats(torch.tensor([[0.3, 0.1, -0.8]]))
+    rows, groups, none = torch.tensor([1, 3]), torch.tensor([0, 0]), torch.zeros(2, 3)
+    still, matrix = torch.tensor([[1.0, 0, 0, 0]]), rotations.quats_to_rotmats(turn)
+    found = []
+    for own, track in ((turn, torch.eye(3)[None]), (still, matrix)):
+        change = residual_field.Change(rows, none, own.expand(2, 4), none)
+        found.append(residual.relight(change, colors, shading, light, track, groups))
+    (a, left), (b, _) = found
+    torch.testing.assert_close(a, b)
+    factor = 1 + (shading @ (matrix[0].T @ light - light))[:, None]
+    torch.testing.assert_close(a[rows], (colors * factor.clamp(min=0))[rows])
+    others = torch.tensor([0, 2, 4])
+    assert (
+        torch.equal(a[others], colors[others]) and torch.equal(left[others], shading[others]) and not left[rows].any()
+    )
+
+
 def test_bodies_that_gain_more_than_the_threshold_keep_residuals():
     means, _, weights, ids = random_state()
     field = field_on(means, ids, weights)
