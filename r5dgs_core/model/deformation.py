@@ -119,6 +119,7 @@ class DeformationField(nn.Module):
             if not reads_inputs:
                 hidden = F.relu(layer(hidden))
                 continue
+            assert isinstance(layer, nn.Linear)
             weight, p, s = layer.weight, position.shape[1], len(time)
             bias = layer.bias + weight[:, p : p + s] @ time
             total = F.linear(position, weight[:, :p], bias)

@@ -240,8 +240,9 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
 
 def _parameters(motion: Motion) -> dict[str, Tensor]:
     """Weights of both networks, by ``field.NAME`` and ``trd.NAME``."""
-    named = {f"field.{n}": p for n, p in motion.field.named_parameters()}
-    return named | {f"trd.{n}": p for n, p in motion.trd.named_parameters()}
+    named: dict[str, Tensor] = {f"field.{n}": p for n, p in motion.field.named_parameters()}
+    named.update({f"trd.{n}": p for n, p in motion.trd.named_parameters()})
+    return named
 
 
 @torch.no_grad()
