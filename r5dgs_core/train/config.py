@@ -1,4 +1,4 @@
-"""The configuration of a run: its `sections` read from TOML, from a preset, and changed by ``--set section.key=value``."""
+"""The configuration of a run: `sections` read from TOML, from a preset, and changed by ``--set section.key=value``."""
 
 from __future__ import annotations
 

@@ -34,7 +34,6 @@ from .field_motion import Clock, Motion
 from .groups import ObservedMotion
 from .tracks_representation import TracksRepresentation
 
-QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
 
 
@@ -144,19 +143,22 @@ class FieldRepresentation:
         if t > motion.horizon:
             return motion.through(means, motion.horizon, t, h)
         through, sign = torch.rand(2, generator=draw).tolist()
-        if t < h or through >= self._config.field.trd_share:
+        first = float(self.times[0])
+        if t < first + h or through >= self._config.field.trd_share:
             return motion.deltas(means, t)
-        start = min(max(t - h if sign < 0.5 else t + h, 0.0), motion.horizon)
+        start = min(max(t - h if sign < 0.5 else t + h, first), motion.horizon)
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
         """Stiffness of the groups, and L_rigid in the variant that has it."""
         moved, self._last = self._last, None
-        if moved is None or self._tracks.bodies < 2:
+        if moved is None or self._tracks.bodies < 2 or len(moved.rows) == 0:
             return None
         groups, terms = gaussians.motion_ids[moved.rows], []
         if self._config.field.stiffness > 0:
-            terms.append(self._config.field.stiffness * stiffness(moved, groups))
+            after = moved.before + moved.offsets
+            bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups)
+            terms.append(self._config.field.stiffness * bent)
         losses = self._config.losses
         started = iteration >= losses.rigid_start * self._config.train.iterations
         if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
@@ -252,55 +254,12 @@ def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
 
 
 def _movers(motion_ids: Tensor, bodies: int, config: Config) -> Tensor:
-    """Rows that the networks move. [R] int64"""
+    """Rows that the networks move; none where the user says that nothing does. [R] int64"""
+    if config.needs.tracks == "off":
+        return torch.zeros(0, dtype=torch.int64)
     if config.field.movers == "all" or bodies < 2:
         return torch.arange(len(motion_ids))
     return (motion_ids > 0).nonzero()[:, 0]
-
-
-def stiffness(moved: Moved, groups: Tensor) -> Tensor:
-    """Mean squared distance from the best rigid motion of each group, and difference from its rotation.
-
-    Args:
-        moved: The moved Gaussians; those of group 0 do not count.
-        groups: Their motion groups. [R]
-    """
-    after = moved.before + moved.offsets
-    with torch.no_grad():
-        turn, shift, known = rigid_fits(moved.before, after, groups)
-        goal = rotations.rotate(turn[groups], moved.before) + shift[groups]
-        counted = (groups > 0) & known[groups]
-        sign = torch.where((moved.quats * turn[groups]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-    off = (after - goal).square().sum(-1) + QUAT_WEIGHT * (moved.quats - sign * turn[groups]).square().sum(-1)
-    off = off + moved.log_scales.square().sum(-1) * QUAT_WEIGHT
-    return torch.where(counted, off, 0.0).sum() / counted.sum().clamp(min=1)
-
-
-def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Least-squares rigid motion of each group of points (Kabsch).
-
-    Args:
-        before: Points. [R, 3]
-        after: Where they went. [R, 3]
-        groups: Group of each. [R]
-
-    Returns:
-        Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and whether a group has points enough. [G]
-    """
-    count = int(groups.max()) + 1 if len(groups) else 0
-    n = torch.bincount(groups, minlength=count).to(before.dtype)
-
-    def mean(x: Tensor) -> Tensor:
-        return torch.zeros(count, 3, dtype=x.dtype).index_add(0, groups, x) / n.clamp(min=1)[:, None]
-
-    a, b = mean(before), mean(after)
-    outer = (after - b[groups])[:, :, None] * (before - a[groups])[:, None, :]
-    spread = torch.zeros(count, 3, 3, dtype=before.dtype).index_add(0, groups, outer)
-    u, _, vt = torch.linalg.svd(spread)
-    flip = torch.ones(count, 3, dtype=before.dtype)
-    flip[:, 2] = torch.sign(torch.linalg.det(u @ vt))
-    quats = rotations.rotmats_to_quats(u @ (flip[:, :, None] * vt))
-    return quats, b - rotations.rotate(quats, a), n >= 4
 
 
 def from_tracks(

@@ -1,4 +1,4 @@
-"""Rigidity of objects under a deformation: members keep their distance to the representative of their object.
+"""Rigidity of objects under a deformation: L_rigid of the paper, and the distance from a group's best rigid motion.
 
 Notation: N Gaussians, C classes, class 0 the background; -1 stands for none.
 """
@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..motion import rotations
+
 SEEN_OPACITY = 0.3  # fainter Gaussians do not say where an object is
+QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 SOFTENING = 1e-6  # length that keeps the slope of a distance finite at 0
 
 
@@ -75,6 +78,53 @@ def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor) -> Tensor:
     centers = anchor_rows[members]
     was, now = (x.index_select(0, members) - x.index_select(0, centers) for x in (before.detach(), after))
     return (_lengths(now) - _lengths(was)).abs().mean()
+
+
+def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, groups: Tensor) -> Tensor:
+    """Mean squared distance from the best rigid motion of each group, and difference from its rotation and size.
+
+    Args:
+        before: Canonical centres. [R, 3]
+        after: Centres at another time. [R, 3]
+        quats: Rotations since then, unit wxyz. [R, 4]
+        log_scales: Change of the log scales. [R, 3]
+        groups: Motion groups; those of group 0, and of groups of fewer than four, do not count. [R] int64
+    """
+    with torch.no_grad():
+        turn, shift, known = rigid_fits(before, after, groups)
+        goal = rotations.rotate(turn[groups], before) + shift[groups]
+        counted = (groups > 0) & known[groups]
+        sign = torch.where((quats * turn[groups]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    off = (after - goal).square().sum(-1)
+    off = off + QUAT_WEIGHT * ((quats - sign * turn[groups]).square().sum(-1) + log_scales.square().sum(-1))
+    return torch.where(counted, off, 0.0).sum() / counted.sum().clamp(min=1)
+
+
+def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Least-squares rigid motion of each group of points (Kabsch).
+
+    Args:
+        before: Points. [R, 3]
+        after: Where they went. [R, 3]
+        groups: Group of each. [R]
+
+    Returns:
+        Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and whether a group has points enough. [G]
+    """
+    count = int(groups.max()) + 1 if len(groups) else 0
+    n = torch.bincount(groups, minlength=count).to(before.dtype)
+
+    def mean(x: Tensor) -> Tensor:
+        return torch.zeros(count, 3, dtype=x.dtype).index_add(0, groups, x) / n.clamp(min=1)[:, None]
+
+    a, b = mean(before), mean(after)
+    outer = (after - b[groups])[:, :, None] * (before - a[groups])[:, None, :]
+    spread = torch.zeros(count, 3, 3, dtype=before.dtype).index_add(0, groups, outer)
+    u, _, vt = torch.linalg.svd(spread)
+    flip = torch.ones(count, 3, dtype=before.dtype)
+    flip[:, 2] = torch.sign(torch.linalg.det(u @ vt))
+    quats = rotations.rotmats_to_quats(u @ (flip[:, :, None] * vt))
+    return quats, b - rotations.rotate(quats, a), n >= 4
 
 
 def _lengths(offsets: Tensor) -> Tensor:

@@ -127,3 +127,34 @@ def test_the_loss_holds_an_object_together_that_something_else_pulls_apart(weigh
         optimizer.step()
     left = float(rigidity.rigidity(means, after.detach(), anchors))
     assert left < 0.04 if weight else left > 0.15
+
+
+def test_a_rigid_motion_of_each_group_costs_no_stiffness_and_anything_else_does():
+    generator = torch.Generator().manual_seed(0)
+    before = torch.randn(40, 3, generator=generator)
+    groups = torch.arange(40) % 3
+    turns = rotations.normalize(torch.randn(3, 4, generator=generator))
+    quats = turns[groups]
+    offsets = rotations.rotate(quats, before) + groups[:, None] * 0.3 - before
+    same = torch.zeros(40, 3)
+    assert float(rigidity.stiffness(before, before + offsets, quats, same, groups)) < 1e-10
+    bent = before + offsets + 0.1 * before.square()
+    assert float(rigidity.stiffness(before, bent, quats, same, groups)) > 1e-4
+    found, shift, known = rigidity.rigid_fits(before, before + offsets, groups)
+    assert known.all()
+    assert rotations.angle_between(found.numpy(), turns.numpy()).max() < 1e-3
+    torch.testing.assert_close(shift, torch.arange(3)[:, None].expand(3, 3) * 0.3, atol=1e-5, rtol=0)
+
+
+def test_stiffness_pulls_every_gaussian_towards_where_its_group_has_it():
+    draw = torch.Generator().manual_seed(0)
+    before = torch.randn(12, 3, generator=draw, dtype=torch.float64)
+    offsets = (0.2 * torch.randn(12, 3, generator=draw, dtype=torch.float64)).requires_grad_(True)
+    groups = torch.ones(12, dtype=torch.int64)
+    rest = torch.zeros(12, 3, dtype=torch.float64)
+    found, shift, _ = rigidity.rigid_fits(before, before + offsets.detach(), groups)
+    quats = found[groups]
+    loss = rigidity.stiffness(before, before + offsets, quats, rest, groups)
+    (gradient,) = torch.autograd.grad(loss, offsets)
+    goal = rotations.rotate(quats, before) + shift[groups]
+    torch.testing.assert_close(gradient, 2 * (before + offsets - goal).detach() / 12)
