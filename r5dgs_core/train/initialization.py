@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 
-from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
-from . import evidence, hull, scatter, shadows, sweep, triangulation
+from . import evidence, hull, placing, scatter, shadows, sweep, triangulation
 from .config import Config
 from .views import TrainView, nearest_knot, spread
 
@@ -105,7 +103,7 @@ def start(
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))
     translations = np.zeros((bodies, len(times), 3))
-    points, colors, labels = [], [], []
+    clouds = []
     at_random = init.placement == "random"
     for row, object_id in enumerate(places.object_ids):
         reference = _reference_time(places.visibility[row], places.measured[row], first)
@@ -113,10 +111,8 @@ def start(
         translations[row + 1] = places.centers[row] - centers[row + 1]
         then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
         count = 0 if at_random else init.object_points
-        where, shade = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
-        points.append(where)
-        colors.append(shade)
-        labels.append(np.full(len(where), row + 1))
+        carved = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
+        clouds.append((*carved, row + 1))
     scenes = sweep.backdrops(views)
     search = sweep.Sweep(scenes, init.background_points, init.sweep_depths)
     eyes = np.stack([v.camera.center for v in views])
@@ -130,51 +126,18 @@ def start(
         fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]
         where, shade = np.concatenate([known, where[fill]]), np.concatenate([hues, shade[fill]])
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
-    opacities = [np.full(sum(map(len, points)) + len(where), init.opacity)]
-    scales = [_neighbour_scales(np.concatenate([*points, where]))] if points or len(where) else []
-    points.append(where)
-    colors.append(shade)
-    labels.append(np.zeros(len(where)))
+    parts = [placing.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters = np.zeros(0, np.int64)
     shadow_slope = np.zeros(3)
-    flat: list[np.ndarray] = [np.tile([1.0, 0, 0, 0], (len(opacities[0]), 1))]
     if plane is not None and config.train.shadows and init.shadow_points > 0:
         casters = np.arange(1, bodies)
-        normal, _ = plane
         light = shadows.find_light(views, scenes, places, times, plane, rng)
-        shadow_slope = shadows.slope(light.direction, normal)
+        shadow_slope = shadows.slope(light.direction, plane[0])
         log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
         for body in casters:
-            radius = places.radii[body - 1]
-            drop = shadows.cast(centers[body], light.direction, plane)
-            jitter = rng.normal(size=(init.shadow_points, 3)) * 0.6 * radius
-            lift = (0.02 + 0.01 * rng.random(init.shadow_points)) * 1.0
-            jitter += (lift - jitter @ normal)[:, None] * normal
-            points.append(drop + jitter)
-            colors.append(np.zeros((init.shadow_points, 3)))
-            labels.append(np.full(init.shadow_points, bodies + body - 1))
-            opacities.append(np.full(init.shadow_points, 0.03))
-            size = np.full((init.shadow_points, 3), 0.25 * radius)
-            size[:, 2] = 0.01
-            scales.append(np.log(size))
-            flat.append(np.tile(_quat_from_z(normal), (init.shadow_points, 1)))
-    everything = np.concatenate(points) if points else np.zeros((0, 3))
-    n = len(everything)
-    opacity = np.concatenate(opacities)
-    bases = (config.train.sh_degree + 1) ** 2
-    params = {
-        "means": everything,
-        "quats": np.concatenate(flat),
-        "log_scales": np.concatenate(scales) if scales else np.zeros((0, 3)),
-        "opacity_logits": np.log(opacity / (1 - opacity)),
-        "sh": spherical_harmonics.rgb_to_dc(np.concatenate(colors))[:, None, :],
-        "sh_rest": np.zeros((n, bases - 1, 3)),
-        "shading": np.zeros((n, 3)),
-    }
-    gaussians = Gaussians(
-        {name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in params.items()},
-        torch.from_numpy(np.concatenate(labels).astype(np.int64)),
-    )
+            radius, group = float(places.radii[body - 1]), bodies + int(body) - 1
+            parts.append(placing.shadow(centers[body], radius, light.direction, plane, group, init.shadow_points, rng))
+    gaussians = placing.gaussians_of(parts, config.train.sh_degree)
     base = torch.zeros(bodies, len(times), 4)
     base[..., 0] = 1.0
     tracks = Tracks(
@@ -249,18 +212,3 @@ def _reference_time(visibility: np.ndarray, measured: np.ndarray, first: int) ->
     score = np.where(measured, visibility + SEEN_AT_ALL, 0.0)
     good = np.flatnonzero(score >= 0.75 * score.max())
     return int(good[np.argmin(np.abs(good - first))])
-
-
-def _neighbour_scales(points: np.ndarray) -> np.ndarray:
-    """Logarithm of the mean distance to the three nearest neighbours, bounded. [P, 3]"""
-    if len(points) < 4:
-        return np.full((len(points), 3), np.log(0.05))
-    distance, _ = KDTree(points).query(points, k=4)
-    return np.repeat(np.log(np.clip(distance[:, 1:].mean(1), 0.005, 0.2))[:, None], 3, axis=1)
-
-
-def _quat_from_z(normal: np.ndarray) -> np.ndarray:
-    """Rotation that takes the z axis to ``normal``, wxyz."""
-    axis = np.cross([0.0, 0, 1], normal)
-    quat = np.array([1 + normal[2], *axis])
-    return np.array([0.0, 1, 0, 0]) if np.linalg.norm(quat) < 1e-6 else quat / np.linalg.norm(quat)
