@@ -66,6 +66,20 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
         MotionModel("constant_twist", velocity=[1, 0, 0.3], angular_velocity=[0, 0, 2]),
         ("constant twist",),
     ),
+    "pendulum": (
+        MotionModel(
+            "ballistic_spin",
+            angular_velocity=[0, 0.9, 0.3],
+            angular_acceleration=[0, -3.6, -1.2],
+            center_offset=[0.2, -0.2, 0.6],
+            frequency=5.0,
+        ),
+        ("pendulum",),
+    ),
+    "spring": (
+        MotionModel("translation", velocity=[0.3, 0.1, -0.9], acceleration=[0, 0.4, 6.0], frequency=8.0),
+        ("spring",),
+    ),
 }
 
 

@@ -13,14 +13,17 @@ import numpy as np
 
 from . import models, rotations, se3
 
-_SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3}
+_SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
 # Priors as standard deviations, in radii and spans: far wider than what observed motions show; they only close
 # directions that the poses leave open (a centre along its own axis, the centre of a body that does not turn).
-_PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0}
+_PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0, "swing": 10.0, "phase": 10.0, "pace": 5.0}
 _DIFFERENCE = 1e-5
 _STEPS = 30
 _STEPS_AGAIN = 4  # per round of reweighting, which starts near its end
 _ROUNDS = 8
+_PACES = 25  # frequencies tried for a first guess
+_STARTS = 2  # of them that are refined
+_GAIN = 9.0  # variances: a frequency three standard deviations from none
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,19 @@ class Candidate:
         name: As in the score table.
         kind: Kind of `models.MotionModel` that it becomes.
         blocks: Free blocks besides the pose at t_max: "v", "a", "w", "eps", "u" as in `models`; "kappa" is the relative
-            rate of a spin about a fixed axis: w(tau) = w_mid (1 + kappa (tau - tau_mid)).
+            rate of a spin about a fixed axis: w(tau) = w_mid (1 + kappa (tau - tau_mid)). "swing" q and "phase" f are
+            an angle about a fixed axis, q sin(W tau + f), which stays determined where w or eps is zero; "pace" is the
+            logit of W in `frequencies`.
         tau_mid: Middle of the window, for "kappa".
+        frequencies: Lowest and highest W of a motion with "pace". Less than a quarter of a period in the window cannot
+            be told from a steady acceleration.
     """
 
     name: str
     kind: str
     blocks: tuple[str, ...]
     tau_mid: float = -0.5
+    frequencies: tuple[float, float] = (0.5 * np.pi, 8 * np.pi)
 
     @property
     def parameters(self) -> int:
@@ -46,8 +54,9 @@ class Candidate:
         return 6 + sum(_SIZES[b] for b in self.blocks)
 
     def unpack(self, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """Vectors r, e, v, a, w, eps, u of parameter vectors; zero where not free. [B, P] -> [B, 3] each"""
+        """Vectors r, e, v, a, w, eps, u [B, 3] and frequency [B, 1] of parameters [B, P]; zero where not free."""
         parts = {name: np.zeros((*theta.shape[:-1], 3)) for name in ("r", "e", "v", "a", "w", "eps", "u")}
+        parts["frequency"] = np.zeros((*theta.shape[:-1], 1))
         start = 0
         for block in ("r", "e", *self.blocks):
             stop = start + _SIZES[block]
@@ -57,7 +66,29 @@ class Candidate:
             kappa, w_mid = parts.pop("kappa"), parts["w"]
             parts["eps"] = kappa * w_mid
             parts["w"] = w_mid * (1 - kappa * self.tau_mid)
+        if "pace" in parts:
+            low, high = self.frequencies
+            parts["frequency"] = low + (high - low) / (1 + np.exp(-np.clip(parts.pop("pace"), -30, 30)))
+        if "swing" in parts:
+            swing, phase, frequency = parts.pop("swing"), parts.pop("phase"), parts["frequency"]
+            parts["w"], parts["eps"] = swing * np.cos(phase) * frequency, -swing * np.sin(phase) * frequency**2
         return parts
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether a frequency is free."""
+        return "pace" in self.blocks
+
+    def index(self, block: str) -> int:
+        """Where a free block starts in the parameters."""
+        free = ("r", "e", *self.blocks)
+        return sum(_SIZES[b] for b in free[: free.index(block)])
+
+    def pace(self, frequency: float) -> float:
+        """The parameter "pace" of a frequency between the lowest and the highest."""
+        low, high = self.frequencies
+        share = min(max((frequency - low) / (high - low), 1e-3), 1 - 1e-3)
+        return float(np.log(share / (1 - share)))
 
     def poses(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of the fitted curve. [B, P], [S] -> quaternions [B, S, 4], displacements [B, S, 3]"""
@@ -68,7 +99,7 @@ class Candidate:
         elif self.kind == "world_twist":
             quats, d = _world_twist(p, tau)
         else:
-            quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], span)
+            quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], p["frequency"], span)
         return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
 
 
@@ -92,6 +123,8 @@ FAMILY = (
     Candidate("translation + spin", "ballistic_spin", ("v", "w")),
     Candidate("constant twist", "constant_twist", ("v", "w")),
     Candidate("hinge", "ballistic_spin", ("w", "kappa", "u")),
+    Candidate("spring", "translation", ("v", "a", "pace")),
+    Candidate("pendulum", "ballistic_spin", ("swing", "phase", "u", "pace")),
     Candidate("ballistic + spin", "ballistic_spin", ("v", "a", "w")),
     Candidate("ballistic + spin, accelerating", "ballistic_spin", ("v", "a", "w", "kappa")),
     Candidate("ballistic + spin, free axis", "ballistic_spin", ("v", "a", "w", "eps")),
@@ -173,6 +206,85 @@ def start(candidate: Candidate, track: Track) -> np.ndarray:
     return np.concatenate([guesses[b] for b in ("r", "e", *candidate.blocks)])
 
 
+@dataclass(frozen=True)
+class _Sweep:
+    """A path fitted at each of F frequencies, where it is linear in place, rate and its rate.
+
+    Attributes:
+        frequencies: [F]
+        rates: Place, rate and its rate at t_max. [F, 3, 3]
+        misses: Weighted sum of squares that remains. [F]
+        gain: How much more the parabola leaves than the best frequency, in variances of the residuals of the latter.
+    """
+
+    frequencies: np.ndarray
+    rates: np.ndarray
+    misses: np.ndarray
+    gain: float
+
+
+def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
+    """Two rounds, the second with the poses weighed by the residuals of the first as in `solve`. path: [S, 3]"""
+    frequencies = np.r_[0.0, np.geomspace(*candidate.frequencies, _PACES)[1:-1]]
+    clocks = models.clocks(frequencies[:, None, None], track.tau[:, None])
+    columns = np.concatenate([np.ones_like(clocks[0]), *clocks], axis=-1)
+    weights = track.weights
+    for _ in range(2):
+        root = np.sqrt(weights)[:, None]
+        rates = np.linalg.pinv(columns * root) @ (path * root)
+        sizes = ((columns @ rates - path) ** 2).sum(-1)
+        misses = (weights * sizes).sum(-1)
+        best = 1 + int(np.argmin(misses[1:]))
+        scale2 = (2 * 1.4826) ** 2 * max(float(np.median(sizes[best])), 1e-18)
+        gain = (misses[0] - misses[best]) / max(misses[best], 1e-18) * (3 * len(path) - 10)
+        weights = track.weights / (1 + sizes[best] / scale2)
+    return _Sweep(frequencies[1:], rates[1:], misses[1:], float(gain))
+
+
+def _turned(track: Track) -> np.ndarray:
+    """Sum of the turns between neighbours: about a fixed axis, the rotation vector without its ambiguity. [S, 3]"""
+    turns = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
+
+
+def may_swing(candidate: Candidate, track: Track) -> bool:
+    """Whether a swing explains the turns or the displacements so much better than a parabola that fitting it pays."""
+    paths = [track.displacements] + ([_turned(track)] if "swing" in candidate.blocks else [])
+    return any(_sweep(candidate, track, path).gain > _GAIN for path in paths)
+
+
+def swinging_starts(candidate: Candidate, track: Track) -> list[np.ndarray]:
+    """First guesses of a motion with a frequency, the most promising first. [P] each
+
+    They are the frequencies that fit the displacements or the turns better than their neighbours do.
+    """
+    path = _turned(track) if "swing" in candidate.blocks else track.displacements
+    sweep = _sweep(candidate, track, path)
+    padded = np.pad(sweep.misses, 1, constant_values=np.inf)
+    valleys = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]))
+    best = valleys[np.argsort(sweep.misses[valleys], kind="stable")][:_STARTS]
+    return [_swinging(candidate, track, float(sweep.frequencies[i]), sweep.rates[i]) for i in best]
+
+
+def _swinging(candidate: Candidate, track: Track, frequency: float, rates: np.ndarray) -> np.ndarray:
+    """Parameters from the rates [3, 3] of a fit at one frequency: place, rate and its rate at t_max. [P]"""
+    guesses = {"r": np.zeros(3), "e": rates[0], "v": rates[1], "a": rates[2], "pace": candidate.pace(frequency)}
+    if "swing" in candidate.blocks:
+        # The axis and phase nearest to both rates: their matrix of rank one.
+        left, sizes, right = np.linalg.svd(np.stack([rates[1] / frequency, -rates[2] / frequency**2]).T)
+        guesses["swing"] = left[:, 0] * sizes[0]
+        guesses["phase"] = np.arctan2(right[0, 1], right[0, 0])
+        matrices = rotations.quats_to_rotmats(track.quats)
+        # d = e + u - R u is linear in e and u.
+        columns = np.concatenate([np.broadcast_to(np.eye(3), (len(track.tau), 3, 3)), np.eye(3) - matrices], -1)
+        ridge = np.diag([0.0] * 3 + [1 / _PRIORS["u"]] * 3) * 1e-3
+        stacked = np.concatenate([columns.reshape(-1, 6), ridge])
+        right_side = np.concatenate([track.displacements.reshape(-1), np.zeros(6)])
+        solution = np.linalg.lstsq(stacked, right_side, rcond=None)[0]
+        guesses["e"], guesses["u"] = solution[:3], solution[3:]
+    return np.concatenate([np.atleast_1d(guesses[b]) for b in ("r", "e", *candidate.blocks)])
+
+
 def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first: np.ndarray | None = None) -> Solution:
     """Fit by Levenberg-Marquardt under a Cauchy loss.
 
@@ -180,12 +292,15 @@ def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first
         candidate: The family.
         track: The poses.
         sigmas: Noise of displacements (radii) and rotations (rad): sets their relative weight.
-        first: First guess, or None for `start`. [P]
+        first: First guess, or None for `start`; with a frequency, the best of `swinging_starts`. [P]
 
     Returns:
         The solution. Weights per pose are 1 / (1 + (rho / c)^2), rho the root mean square of its six scaled residuals
         and c twice 1.4826 times their median; no reweighting where the largest is under four medians.
     """
+    if first is None and candidate.oscillates:
+        solutions = [solve(candidate, track, sigmas, guess) for guess in swinging_starts(candidate, track)]
+        return min(solutions, key=lambda solution: solution.chi2)
     theta = start(candidate, track) if first is None else first
     precision = _prior_precision(candidate)
     robust = np.ones(len(track.tau))

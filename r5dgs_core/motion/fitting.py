@@ -29,6 +29,7 @@ _FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
 _LARGEST = families.BY_NAME["full, free centre"]
 _STATIC = families.BY_NAME["static"]
 _TAIL = 5
+FREQUENCY_ERROR = 0.25  # relative standard deviation above which a motion is not called a swing
 STOP_RATIO = 8.0  # distance of the poses before a stop over the scatter of those after it
 STOP_MOTION = 0.02  # radii; less is no motion worth stopping
 
@@ -40,7 +41,8 @@ class Score:
     Attributes:
         name: Candidate.
         parameters: Its free parameters, six of the pose included.
-        held_out: Root mean square of the held-out residuals in units of the noise; infinite where not fitted.
+        held_out: Root mean square of the held-out residuals in units of the noise; infinite where not fitted, and for a
+            swing whose frequency the poses do not determine.
         fit: The same over all poses after the final fit, NaN where that was not made.
     """
 
@@ -116,16 +118,22 @@ def fit(
         displacements[used] / radius,
         weights[used] / weights[used].mean(),
     )
-    family = tuple(replace(c, tau_mid=float(0.5 * (track.tau[0] + track.tau[-1]))) for c in family)
+    middle, frequencies = float(0.5 * (track.tau[0] + track.tau[-1])), _frequencies(track)
+    family = tuple(replace(c, tau_mid=middle, frequencies=frequencies) for c in family)
+    family = tuple(c for c in family if not c.oscillates or frequencies[0] < frequencies[1])
     if len(track.tau) < 4:
         return _few(track, family, radius, span)
 
-    sigmas, outliers = _noise(track, family)
-    scores = [_held_out(c, track, sigmas, outliers) for c in family]
-    finite = [s for s in scores if np.isfinite(s)]
-    best = max(min(finite), 1e-3) if finite else math.inf
-    near = [c for c, s in zip(family, scores, strict=True) if s <= WITHIN * best] or [family[0]]
-    solutions = {c.name: families.solve(c, track, sigmas) for c in near}
+    tried = tuple(c for c in family if not c.oscillates or families.may_swing(c, track))
+    sigmas, outliers = _noise(track, tried)
+    scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
+    solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
+    # Without a frequency that the poses determine, no swing: then others may be near the best.
+    for name, solution in list(solutions.items()):
+        if not _determined(solution, track, sigmas):
+            scores[name] = math.inf
+    near = _near(family, scores)
+    solutions = {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
     chosen = min(near, key=lambda c: c.parameters)
     resting = _TAIL if _rests(solutions[chosen.name], track, sigmas) else _stopped(track)
     rested = resting > 0
@@ -134,13 +142,39 @@ def fit(
         evidence = track.rows(slice(-resting, None))
         solution = families.solve(_STATIC, evidence, sigmas)
     table = tuple(
-        Score(c.name, c.parameters, float(s), math.sqrt(solutions[c.name].chi2) if c.name in solutions else math.nan)
-        for c, s in zip(family, scores, strict=True)
+        Score(c.name, c.parameters, scores[c.name], math.sqrt(solutions[c.name].chi2) if c in near else math.nan)
+        for c in family
     )
     model = _to_model(solution, radius, span, evidence, sigmas)
     near_solutions = [] if rested else list(solutions.values())
     band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
     return Fit(model, table, solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candidate]:
+    """Candidates whose held-out error is within `WITHIN` of the best; the first where none could be fitted."""
+    finite = [s for s in scores.values() if np.isfinite(s)]
+    best = max(min(finite), 1e-3) if finite else math.inf
+    return [c for c in family if scores[c.name] <= WITHIN * best and finite] or [family[0]]
+
+
+def _frequencies(track: Track) -> tuple[float, float]:
+    """Range of frequencies that can be seen: from a quarter of a period in the window to four poses a period."""
+    return 0.5 * math.pi / float(track.tau[-1] - track.tau[0]), 0.5 * math.pi / float(np.median(np.diff(track.tau)))
+
+
+def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
+    """Whether a frequency lies inside its range and is known to `FREQUENCY_ERROR`; True where none is free."""
+    candidate = solution.candidate
+    if not candidate.oscillates:
+        return True
+    low, high = candidate.frequencies
+    frequency = float(candidate.unpack(solution.theta)["frequency"][0])
+    index = candidate.index("pace")
+    variance = _covariance(solution, track, sigmas)[index, index]
+    share = (frequency - low) / (high - low)
+    sigma = math.sqrt(max(variance, 0.0)) * share * (1 - share) * (high - low)
+    return 0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency
 
 
 def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weights: np.ndarray, radius: float) -> None:
@@ -189,15 +223,19 @@ def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, fl
 
     Errors common to the members of a group do not show in its own rigid fit, so that fit's spread would be too small.
     """
-    wide = [c for c in (_FREE_AXIS, _LARGEST) if c.parameters <= 6 * len(track.tau) - 6] or [
+    swings = (c for c in family if c.oscillates)
+    wide = [c for c in (_FREE_AXIS, _LARGEST, *swings) if c.parameters <= 6 * len(track.tau) - 6] or [
         max((c for c in family if c.parameters < 6 * len(track.tau)), key=lambda c: c.parameters, default=_STATIC)
     ]
     best: tuple[float, Solution, np.ndarray] | None = None
+    swung: dict[str, np.ndarray] = {}
     sigmas = (1.0, 1.0)
     for _ in range(2):
         best = None
         for candidate in wide:
-            solution = families.solve(candidate, track, sigmas)
+            solution = families.solve(candidate, track, sigmas, swung.get(candidate.name))
+            if candidate.oscillates:
+                swung[candidate.name] = solution.theta
             values = families.residuals(candidate, solution.theta[None], track, (1.0, 1.0))[0]
             dof = max(6 * len(track.tau) - candidate.parameters, 1) / (6 * len(track.tau))
             level = solution.chi2 / dof
@@ -289,6 +327,7 @@ def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) ->
         "center_offset": p["u"] * radius,
         "offset_rotvec": p["r"],
         "offset_displacement": p["e"] * radius,
+        "frequency": p["frequency"] / span,
     }
 
 
@@ -299,15 +338,18 @@ def _to_model(
     step = 1e-6
     shifted = solution.theta + step * np.eye(len(solution.theta))
     moved = _rates(solution, shifted, radius, span)
-    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in _RATES], axis=-1).T
+    names = (*_RATES, *(["frequency"] if solution.candidate.oscillates else []))
+    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
+    frequency = float(rates.pop("frequency")[0])
     covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T
     return models.MotionModel(
         kind=solution.candidate.kind,
         **rates,
+        frequency=frequency,
         fade_time=FADE_PER_SPAN * span,
         radius=radius,
         covariance=0.5 * (covariance + covariance.T),
-        covariance_names=tuple(f"{name}.{axis}" for name in _RATES for axis in "xyz"),
+        covariance_names=(*(f"{name}.{axis}" for name in _RATES for axis in "xyz"), *names[len(_RATES) :]),
     )
 
 

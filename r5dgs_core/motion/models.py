@@ -8,6 +8,9 @@ where the curve is at t_max, seen from the bind state, and are blended in with s
     R(tau) = R_f(tau) exp(s r),    d(tau) = d_f(tau) + s e.
 
 So R(0) = I and d(0) = 0 to the bit, and the motion converges to the fitted curve R_f exp(r), d_f + e.
+
+A motion may swing with a frequency W: the clocks s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2 stand where those of a
+steady motion, tau and tau^2/2, stood. W = 0 is the steady motion to the bit.
 """
 
 from __future__ import annotations
@@ -43,8 +46,8 @@ class MotionModel:
     """Rigid motion past t_max. All rates are those at t_max, in the world frame; all vectors are float64. [3]
 
     Attributes:
-        kind: "static" (stays), "translation" (velocity, acceleration), "ballistic_spin" (centroid form:
-            d_f = v tau + a tau^2/2 + u - R_f u, R_f = exp(w tau + eps tau^2/2)), "constant_twist" (a screw:
+        kind: "static" (stays), "translation" (d_f = v s1 + a s2), "ballistic_spin" (centroid form:
+            d_f = v s1 + a s2 + u - R_f u, R_f = exp(w s1 + eps s2)), "constant_twist" (a screw:
             R_f = exp(w tau), d_f = V(w tau) v tau) or "world_twist" (v(x) = v + w x (x - p) with v and w linear in
             time, x in the world; Magnus-4 steps).
         velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
@@ -57,8 +60,10 @@ class MotionModel:
         offset_displacement: e, its displacement.
         fade_time: Time constant with which the offsets are blended in, > 0.
         radius: Radius of the group, world units: what tolerances refer to.
+        frequency: W >= 0, rad per unit of time, of "translation" (a spring) and "ballistic_spin" (a pendulum, with
+            v = a = 0 and u on its axis); 0 does not swing.
         covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
-        covariance_names: Names of its rows, such as "velocity.x".
+        covariance_names: Names of its rows, such as "velocity.x"; "frequency" where that was fitted.
     """
 
     kind: str = "static"
@@ -71,6 +76,7 @@ class MotionModel:
     offset_displacement: np.ndarray = field(default_factory=_zeros)
     fade_time: float = 0.1
     radius: float = 1.0
+    frequency: float = 0.0
     covariance: np.ndarray | None = None
     covariance_names: tuple[str, ...] = ()
 
@@ -92,6 +98,10 @@ class MotionModel:
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name}: expected a positive number, got {value}")
             object.__setattr__(self, name, value)
+        frequency = float(self.frequency)
+        if not (math.isfinite(frequency) and frequency >= 0):
+            raise ValueError(f"frequency: expected a number >= 0, got {frequency}")
+        object.__setattr__(self, "frequency", frequency)
         object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
         if self.covariance is not None:
             covariance = np.array(self.covariance, np.float64)
@@ -111,6 +121,8 @@ class MotionModel:
         for name in _VECTORS:
             result[name] = getattr(self, name).tolist()
         result.update(fade_time=self.fade_time, radius=self.radius)
+        if self.frequency > 0:
+            result["frequency"] = self.frequency
         if self.covariance is not None:
             result.update(covariance=self.covariance.tolist(), covariance_names=list(self.covariance_names))
         return result
@@ -171,13 +183,15 @@ def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray,
         return quats, displacements
     stacked = {name: np.array([getattr(model, name) for model in models]) for name in _VECTORS}
     span = np.array([[float(tau)]])
+    frequencies = np.array([[model.frequency] for model in models])
     for kind in {model.kind for model in models} - {"static"}:
         rows = np.array([g for g, model in enumerate(models) if model.kind == kind])
         v, a, w, eps, u = (stacked[name][rows] for name in _VECTORS[:5])
         if kind == "translation":
-            displacements[rows] = v * span + 0.5 * a * span**2
+            once, twice = clocks(frequencies[rows], span)
+            displacements[rows] = v * once + a * twice
         elif kind == "ballistic_spin":
-            quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, span)
+            quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, frequencies[rows], span)
         elif kind == "constant_twist":
             quats[rows], displacements[rows] = twist_poses(v, w, span)
         else:
@@ -228,14 +242,16 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     if model.kind == "static":
         return rotations.identity(*tau.shape), zero, zero, zero
+    once, twice = clocks(model.frequency, span)
+    slope = np.cos(model.frequency * span)  # of s1; that of s2 is s1
     if model.kind == "translation":
-        return rotations.identity(*tau.shape), v * span + 0.5 * a * span**2, zero, v + a * span
+        return rotations.identity(*tau.shape), v * once + a * twice, zero, v * slope + a * once
     if model.kind == "ballistic_spin":
         u = model.center_offset
-        quats, d = spin_poses(v, a, w, eps, u, span)
+        quats, d = spin_poses(v, a, w, eps, u, model.frequency, span)
         # R = exp(phi) turns with V(phi) phi'.
-        spins = se3.v_matrix_times(w * span + 0.5 * eps * span**2, w + eps * span)
-        return quats, d, spins, v + a * span - rotations.cross(spins, rotations.rotate(quats, u + zero))
+        spins = se3.v_matrix_times(w * once + eps * twice, w * slope + eps * once)
+        return quats, d, spins, v * slope + a * once - rotations.cross(spins, rotations.rotate(quats, u + zero))
     if model.kind == "constant_twist":
         quats, d = twist_poses(v, w, span)
         return quats, d, w + zero, rotations.rotate(quats, v + zero)
@@ -244,13 +260,34 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
     return quats, d, spins, v + a * span + rotations.cross(spins, d)
 
 
+def clocks(frequency: float | np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What rates and their rates are multiplied with.
+
+    Args:
+        frequency: W >= 0, rad per unit of time. [..., 1]
+        span: Times tau since t_max, of either sign. [..., 1]
+
+    Returns:
+        s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2; exactly tau and tau^2/2 for W = 0.
+    """
+    phase2 = (frequency * span) ** 2
+    return span * rotations.sine_ratio(phase2), span**2 * rotations.versine_ratio(phase2)
+
+
 def spin_poses(
-    v: np.ndarray, a: np.ndarray, w: np.ndarray, eps: np.ndarray, center: np.ndarray, span: np.ndarray
+    v: np.ndarray,
+    a: np.ndarray,
+    w: np.ndarray,
+    eps: np.ndarray,
+    center: np.ndarray,
+    frequency: float | np.ndarray,
+    span: np.ndarray,
 ) -> se3.Pose:
-    """Poses of the "ballistic_spin" curve, all arguments broadcast: rates [..., 3], times span [..., 1]."""
-    quats = rotations.rotvecs_to_quats(w * span + 0.5 * eps * span**2)
+    """Poses of "ballistic_spin", all arguments broadcast: rates [..., 3], frequency and times span [..., 1]."""
+    once, twice = clocks(frequency, span)
+    quats = rotations.rotvecs_to_quats(w * once + eps * twice)
     arm = rotations.rotate(quats, center + 0 * quats[..., 1:])
-    return quats, v * span + 0.5 * a * span**2 + (center - arm)
+    return quats, v * once + a * twice + (center - arm)
 
 
 def twist_poses(v: np.ndarray, w: np.ndarray, span: np.ndarray) -> se3.Pose:

@@ -96,6 +96,49 @@ def test_a_hinge_keeps_its_axis_in_place():
     np.testing.assert_allclose(axis_point, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["pendulum", "spring"])
+def test_a_swing_comes_back_after_each_period(name):
+    model = CASES[name]
+    period = 2 * np.pi / model.frequency
+    tau = np.linspace(0, period, 9)
+    for here, later in zip(models.curve(model, tau), models.curve(model, tau + 3 * period), strict=True):
+        np.testing.assert_allclose(later, here, atol=1e-12)
+    assert np.abs(models.curve(model, 0.5 * period)[1]).max() > 0.1
+
+
+def test_a_pendulum_keeps_its_axis_in_place():
+    model = CASES["pendulum"]
+    quats, displacements = models.evaluate(model, np.linspace(0, 3, 20))
+    hook = rotations.rotate(quats, np.broadcast_to(model.center_offset, displacements.shape)) + displacements
+    np.testing.assert_allclose(hook, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
+
+
+def test_a_spring_is_pulled_back_in_proportion_to_its_way():
+    model, tau, h = CASES["spring"], np.linspace(0, 2, 11), 1e-4
+    rest = model.acceleration / model.frequency**2  # of d, where nothing pulls
+    before, here, after = (models.curve(model, tau + shift)[1] for shift in (-h, 0, h))
+    np.testing.assert_allclose((after - 2 * here + before) / h**2, -(model.frequency**2) * (here - rest), atol=1e-4)
+
+
+def test_the_clocks_run_steadily_without_a_frequency_to_the_bit_and_smoothly_towards_it():
+    tau = np.array([[-2.0], [0.0], [0.3], [7.1]])
+    once, twice = models.clocks(0.0, tau)
+    assert once.tolist() == tau.tolist()
+    assert twice.tolist() == (0.5 * tau**2).tolist()
+    for frequency in (1e-200, 1e-9, 1e-5):
+        for slow, still in zip(models.clocks(frequency, tau), (once, twice), strict=True):
+            np.testing.assert_allclose(slow, still, rtol=1e-9)
+    for frequency in (0.01, 0.07, 0.5, 3.0):
+        once, twice = models.clocks(frequency, tau)
+        np.testing.assert_allclose(once, np.sin(frequency * tau) / frequency, rtol=1e-12)
+        np.testing.assert_allclose(twice, 2 * (np.sin(0.5 * frequency * tau) / frequency) ** 2, rtol=1e-12)
+
+
+def test_a_model_that_does_not_swing_is_written_as_before():
+    assert "frequency" not in MotionModel("translation", velocity=[1, 0, 0]).to_dict()
+    assert MotionModel.from_dict(CASES["spring"].to_dict()).frequency == CASES["spring"].frequency
+
+
 def test_a_screw_is_a_hinge_where_it_does_not_advance():
     tau = np.linspace(0, 3, 7)
     w, u = np.array([0, 0, 2.0]), np.array([0.5, 0.2, 0.0])
@@ -154,6 +197,8 @@ def test_json_restores_a_model_to_the_bit(vector, number, kind):
         ({"velocity": "fast"}, "velocity"),
         ({"fade_time": 0.0}, "fade_time"),
         ({"radius": -1.0}, "radius"),
+        ({"frequency": -1.0}, "frequency"),
+        ({"frequency": math.nan}, "frequency"),
         ({"speed": 3}, "speed"),
         ({"covariance": [[1.0]]}, "covariance"),
     ],
@@ -176,3 +221,5 @@ def test_static_and_turning_are_told_apart():
     assert MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1]).turns
     assert MotionModel("static", offset_rotvec=[0.1, 0, 0]).turns
     assert MotionModel("ballistic_spin", center_offset=[1, 0, 0]).is_static
+    assert MotionModel("ballistic_spin", frequency=3.0).is_static
+    assert not MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1], frequency=3.0).is_static
