@@ -228,17 +228,20 @@ def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
     frequencies = np.r_[0.0, np.geomspace(*candidate.frequencies, _PACES)[1:-1]]
     clocks = models.clocks(frequencies[:, None, None], track.tau[:, None])
     columns = np.concatenate([np.ones_like(clocks[0]), *clocks], axis=-1)
-    weights = track.weights
-    for _ in range(2):
+
+    def fit(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         root = np.sqrt(weights)[:, None]
         rates = np.linalg.pinv(columns * root) @ (path * root)
         sizes = ((columns @ rates - path) ** 2).sum(-1)
-        misses = (weights * sizes).sum(-1)
-        best = 1 + int(np.argmin(misses[1:]))
-        scale2 = (2 * 1.4826) ** 2 * max(float(np.median(sizes[best])), 1e-18)
-        gain = (misses[0] - misses[best]) / max(misses[best], 1e-18) * (3 * len(path) - 10)
-        weights = track.weights / (1 + sizes[best] / scale2)
-    return _Sweep(frequencies[1:], rates[1:], misses[1:], float(gain))
+        return rates, sizes, (weights * sizes).sum(-1)
+
+    _, sizes, misses = fit(track.weights)
+    best = sizes[1 + int(np.argmin(misses[1:]))]
+    scale2 = (2 * 1.4826) ** 2 * max(float(np.median(best)), 1e-18)
+    rates, _, misses = fit(track.weights / (1 + best / scale2))
+    least = float(misses[1:].min())
+    gain = (float(misses[0]) - least) / max(least, 1e-18) * (3 * len(path) - 10)
+    return _Sweep(frequencies[1:], rates[1:], misses[1:], gain)
 
 
 def _turned(track: Track) -> np.ndarray:

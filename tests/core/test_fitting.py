@@ -140,6 +140,51 @@ def test_the_apex_of_a_throw_is_not_a_stop(acceleration):
         assert not fit.rested
 
 
+def swing(phase_per_window, start=0.4):
+    """A pendulum that goes through so many radians of its phase in the window, from the phase `start`."""
+    frequency = phase_per_window / T_MAX
+    phase = start + phase_per_window  # at t_max
+    return models.MotionModel(
+        "ballistic_spin",
+        angular_velocity=[0, 0.35 * frequency * np.cos(phase), 0],
+        angular_acceleration=[0, -0.35 * frequency**2 * np.sin(phase), 0],
+        center_offset=[0.1, 0, 0.7],
+        frequency=frequency,
+    )
+
+
+@pytest.mark.parametrize("phase_per_window", [3.0, 12.0])
+def test_a_pendulum_swings_on_with_its_frequency(phase_per_window):
+    truth = swing(phase_per_window)
+    rng = np.random.default_rng(15)
+    quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.002 * SIZE, np.radians(0.3))
+    quats[4] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.0, 0])), quats[4])
+    fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+    assert fit.chosen == "pendulum"
+    assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 5
+    assert fit.model.covariance_names[-1] == "frequency"
+    sigma = fit.model.covariance[-1, -1] ** 0.5
+    assert 0 < sigma < 0.1 * truth.frequency
+    assert abs(fit.model.frequency - truth.frequency) < 4 * sigma
+
+
+def test_less_than_a_quarter_of_a_period_is_no_swing():
+    for phase_per_window in (0.5, 1.0):
+        truth = swing(phase_per_window)
+        quats, d, _, _ = problems.observe(truth, TIMES, np.random.default_rng(16), 1e-4 * SIZE, 1e-4)
+        fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+        assert fit.chosen not in ("pendulum", "spring")
+        assert fit.model.frequency == 0
+
+
+def test_noise_that_swings_by_chance_is_no_swing():
+    rng = np.random.default_rng(17)
+    for name in ("uniform", "spin", "hinge", "ballistic"):
+        for _ in range(2):
+            quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.005 * SIZE, np.radians(0.6), 0.7)
+            assert fitting.fit(TIMES, quats, d, radius=RADIUS).model.frequency == 0
+
+
 def test_the_band_holds_the_true_error():
     rng = np.random.default_rng(7)
     inside = []
