@@ -10,6 +10,7 @@ from __future__ import annotations
 import colorsys
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 from . import checkpoint, groups, needs, point_baking, representation, residual
 from . import shading as shading_vectors
 from .normalization import Normalization
+from .sections import NeedsSection
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
@@ -42,82 +44,41 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     """
     dataset = dataset if dataset is not None else datasets.read(run.data())
     state = checkpoint.load(run.folder)
-    tensors = state.tensors
+    tensors, wanted = state.tensors, run.config.needs
     norm = Normalization(np.array(state.origin), state.scale)
-    g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}
-    if not all(np.isfinite(a).all() for a in g.values()):
-        raise CheckpointError(f"{run.folder}: the checkpoint holds values that are not finite; train again")
-    present = tensors["object_ids"].numpy()
-    labels = tensors["labels"].numpy() if "labels" in tensors else None  # an unfinished run has none yet
-    if labels is None:
-        labels = representation.group_classes(state.representation, tensors)[g["motion_ids"]]
-    motion = representation.observed_motion(
-        state.representation, tensors, present, state.observed.numpy(), labels, run.config
-    )
-    g |= motion.gaussians or {}
-    if motion.motion_ids is not None:
-        g["motion_ids"] = motion.motion_ids
+    cloud, motion = _observed(run, state, norm)
     light, strength = _unit(motion.light)
-    wanted = run.config.needs
-    identities = tensors["identities"].numpy() if "identities" in tensors else None
-    groups, points = motion.groups, motion.points
-    if wanted.shadows == "off":
-        groups = tuple(group for group in groups if group.role != "shadow")
-        kept = g["motion_ids"] < len(groups)  # shadows are the last groups
-        g = {n: a[kept] for n, a in g.items()}
-        identities, labels = None if identities is None else identities[kept], labels[kept]
-        points = None if points is None else points.keep(kept)
-    motion_ids = g["motion_ids"].astype(np.int32)
-    object_ids = present[labels].astype(np.int32)
-    log_scales = g["log_scales"] + np.log(norm.scale)
-    means = norm.points_to_world(g["means"])
-    quats = rotations.normalize(g["quats"].astype(np.float64))
-    sh = np.concatenate([g["sh"], g["sh_rest"]], axis=1).astype(np.float64)
-    if wanted.view_dependent_colour == "off":
-        sh = sh[:, :1]
-    shading = strength * g["shading"].astype(np.float64)
-    opacities = 1 / (1 + np.exp(-g["opacity_logits"].astype(np.float64)))
-    rows: list[MotionGroup] = []
-    track_poses = []
-    for index, group in enumerate(groups):
-        members = motion_ids == index
-        center = norm.points_to_world(group.center)
-        path = group.displacements * norm.scale
-        q, d = group.quats[-1], path[-1]
-        means[members] = center + rotations.rotate(q, means[members] - center) + d
-        quats[members] = rotations.multiply(q, quats[members])
-        sh[members], shading[members] = shading_vectors.rebind(sh[members], shading[members], q, light)
-        pivot = _pivot(means[members], opacities[members], center + d)
-        poses = _relative(group.quats, path, center, pivot)
-        if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen
-            first = int(np.argmax(group.observed))
-            poses[:first] = poses[first]
-        radius = _radius(means[members], opacities[members], pivot)
-        if wanted.rotation == "off":
-            poses[:, :4] = needs.STILL_QUAT
-        if needs.is_pinned(group.role, poses, radius, wanted):
-            poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
-        track_poses.append(poses)
-        anchor = _anchor(np.flatnonzero(members), means[members], opacities[members], pivot)
-        rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
-    order = np.lexsort((motion_ids, object_ids))
+    cloud.shading *= strength
+    rows, true_poses, track_poses = _bind(cloud, motion, norm, light, wanted)
+    order = np.lexsort((cloud.motion_ids, cloud.object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
     single: dict[str, Any] = {}
-    if points is not None:
+    if motion.points is not None and wanted.tracks != "off":
         pivots = np.stack([row.pivot for row in rows])
-        extent = float(np.ptp(np.quantile(means, [0.01, 0.99], axis=0), axis=0).max())
-        single = point_baking.members(points, norm, motion_ids, np.stack(track_poses), pivots, order, extent)
+        extent = float(np.ptp(np.quantile(cloud.means, [0.01, 0.99], axis=0), axis=0).max())
+        # Relative to what the groups really did: what the user switches off must not come back as residuals.
+        single = point_baking.members(motion.points, norm, cloud.motion_ids, true_poses, pivots, order, extent)
     bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
-    bases, classified = sh.shape[1], identities is not None
+    bases, classified = cloud.sh.shape[1], cloud.identities is not None
     decisions = needs.decide(
-        rows, track_poses, motion_ids, shading, light, used_background, bases, classified, wanted, bent
+        rows,
+        track_poses,
+        cloud.motion_ids,
+        cloud.shading,
+        light,
+        used_background,
+        bases,
+        classified,
+        wanted,
+        bent,
     )
     keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
-    classified = classified and needs.is_on(decisions, "classifier")
+    identities = cloud.identities if needs.is_on(decisions, "classifier") else None
     if not needs.is_on(decisions, "residuals"):
         single = {name: value for name, value in single.items() if not name.startswith("residual_")}
     elif "residual_rows" in single:
-        rows = point_baking.departures(rows, motion_ids[order], single["residual_rows"], single["residual_offsets"])
+        stored = single["residual_rows"], single["residual_offsets"]
+        rows = point_baking.departures(rows, cloud.motion_ids[order], *stored)
     rank = np.argsort(order)
     rows = [
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
@@ -125,26 +86,26 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     ]
     return Scene(
         name=dataset.name,
-        means=means[order].astype(np.float32),
-        quats=rotations.normalize(quats[order]).astype(np.float32),
-        log_scales=log_scales[order].astype(np.float32),
-        opacity_logits=g["opacity_logits"][order].astype(np.float32),
-        sh=sh[order].astype(np.float32),
-        object_ids=object_ids[order],
-        motion_ids=motion_ids[order],
+        means=cloud.means[order].astype(np.float32),
+        quats=rotations.normalize(cloud.quats[order]).astype(np.float32),
+        log_scales=cloud.log_scales[order].astype(np.float32),
+        opacity_logits=cloud.opacity_logits[order].astype(np.float32),
+        sh=cloud.sh[order].astype(np.float32),
+        object_ids=cloud.object_ids[order],
+        motion_ids=cloud.motion_ids[order],
         track_times=motion.times.astype(np.float64),
-        track_poses=np.stack(track_poses),
-        objects=_objects(object_ids[order], present, dataset),
+        track_poses=track_poses,
+        objects=_objects(cloud.object_ids[order], tensors["object_ids"].numpy(), dataset),
         groups=tuple(rows),
         t_max=float(motion.times[-1]),
         frames_per_unit=dataset.frames_per_unit,
         world_convention=dataset.world_convention,
         cameras=dataset.cameras,
         background_sh=used_background.astype(np.float32),
-        identities=identities[order].astype(np.float16) if identities is not None and classified else None,
-        classifier_weight=tensors["classifier.weight"].numpy() if classified else None,
-        classifier_bias=tensors["classifier.bias"].numpy() if classified else None,
-        shading=shading[order].astype(np.float32) if keep_shading else None,
+        identities=None if identities is None else identities[order].astype(np.float16),
+        classifier_weight=tensors["classifier.weight"].numpy() if identities is not None else None,
+        classifier_bias=tensors["classifier.bias"].numpy() if identities is not None else None,
+        shading=cloud.shading[order].astype(np.float32) if keep_shading else None,
         light_direction=light if keep_shading else None,
         provenance={
             "config": run.config.to_dict(),
@@ -153,7 +114,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
             "train": {
                 "seconds": state.seconds,
                 "iterations": state.iteration,
-                "gaussians": len(means),
+                "gaussians": len(cloud.means),
                 "finished": state.finished,
             },
         },
@@ -161,6 +122,113 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         near_plane=NEAR_PLANE * norm.scale,
         **single,
     )
+
+
+@dataclass
+class _Cloud:
+    """The run's Gaussians in the world, in the order of training; brought to the bind state by `_bind`.
+
+    Attributes:
+        means: [N, 3] float64
+        quats: Unit wxyz. [N, 4] float64
+        log_scales: [N, 3]
+        opacity_logits: [N]
+        sh: [N, K, 3] float64
+        shading: [N, 3] float64
+        motion_ids: [N] int32
+        object_ids: [N] int32
+        identities: [N, 16] or None
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    shading: np.ndarray
+    motion_ids: np.ndarray
+    object_ids: np.ndarray
+    identities: np.ndarray | None
+
+
+def _observed(
+    run: checkpoint.Run, state: checkpoint.Checkpoint, norm: Normalization
+) -> tuple[_Cloud, groups.ObservedMotion]:
+    """Gaussians and observed motion of a checkpoint, without what the user leaves out."""
+    tensors, wanted = state.tensors, run.config.needs
+    g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}
+    if not all(np.isfinite(a).all() for a in g.values()):
+        raise CheckpointError(f"{run.folder}: the checkpoint holds values that are not finite; train again")
+    present = tensors["object_ids"].numpy()
+    if "labels" in tensors:
+        labels = tensors["labels"].numpy()
+    else:  # an unfinished run has none yet
+        labels = representation.group_classes(state.representation, tensors)[g["motion_ids"]]
+    motion = representation.observed_motion(
+        state.representation, tensors, present, state.observed.numpy(), labels, run.config
+    )
+    g |= motion.gaussians or {}
+    if motion.motion_ids is not None:
+        g["motion_ids"] = motion.motion_ids
+    identities = tensors["identities"].numpy() if "identities" in tensors else None
+    if wanted.shadows == "off":
+        kept_groups = tuple(group for group in motion.groups if group.role != "shadow")
+        kept = g["motion_ids"] < len(kept_groups)  # shadows are the last groups
+        g = {n: a[kept] for n, a in g.items()}
+        identities, labels = None if identities is None else identities[kept], labels[kept]
+        points = None if motion.points is None else motion.points.keep(kept)
+        motion = dataclasses.replace(motion, groups=kept_groups, points=points)
+    sh = np.concatenate([g["sh"], g["sh_rest"]], axis=1).astype(np.float64)
+    cloud = _Cloud(
+        means=norm.points_to_world(g["means"]),
+        quats=rotations.normalize(g["quats"].astype(np.float64)),
+        log_scales=g["log_scales"] + np.log(norm.scale),
+        opacity_logits=g["opacity_logits"],
+        sh=sh[:, :1] if wanted.view_dependent_colour == "off" else sh,
+        shading=g["shading"].astype(np.float64),
+        motion_ids=g["motion_ids"].astype(np.int32),
+        object_ids=present[labels].astype(np.int32),
+        identities=identities,
+    )
+    return cloud, motion
+
+
+def _bind(
+    cloud: _Cloud, motion: groups.ObservedMotion, norm: Normalization, light: np.ndarray, wanted: NeedsSection
+) -> tuple[list[MotionGroup], np.ndarray, np.ndarray]:
+    """Bring the Gaussians to the bind state, in place, and fit the motion of their groups.
+
+    Returns:
+        The scene's groups; their poses relative to the bind state as they were trained, and as the scene plays them,
+        without what is still or switched off. [G, S, 7] each
+    """
+    rows, trained, played = [], [], []
+    opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
+    for index, group in enumerate(motion.groups):
+        members = cloud.motion_ids == index
+        center = norm.points_to_world(group.center)
+        path = group.displacements * norm.scale
+        q, d = group.quats[-1], path[-1]
+        cloud.means[members] = center + rotations.rotate(q, cloud.means[members] - center) + d
+        cloud.quats[members] = rotations.multiply(q, cloud.quats[members])
+        cloud.sh[members], cloud.shading[members] = shading_vectors.rebind(
+            cloud.sh[members], cloud.shading[members], q, light
+        )
+        pivot = _pivot(cloud.means[members], opacities[members], center + d)
+        poses = _relative(group.quats, path, center, pivot)
+        if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen
+            first = int(np.argmax(group.observed))
+            poses[:first] = poses[first]
+        trained.append(poses.copy())
+        radius = _radius(cloud.means[members], opacities[members], pivot)
+        if wanted.rotation == "off":
+            poses[:, :4] = needs.STILL_QUAT
+        if needs.is_pinned(group.role, poses, radius, wanted):
+            poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
+        played.append(poses)
+        anchor = _anchor(np.flatnonzero(members), cloud.means[members], opacities[members], pivot)
+        rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
+    return rows, np.stack(trained), np.stack(played)
 
 
 def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np.ndarray) -> np.ndarray:

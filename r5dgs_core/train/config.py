@@ -171,10 +171,11 @@ def _check(name: str, value: Any, kind: type) -> Any:
 
 def _validate(config: Config) -> None:
     """Raise ConfigError naming the first key whose value no run can use."""
-    if config.init.placement == "random" and (config.train.representation, config.field.movers) != ("field", "all"):
+    wanted = (config.train.representation, config.field.movers, config.field.tracks_share)
+    if config.init.placement == "random" and wanted != ("field", "all", 0.0):
         raise ConfigError(
-            "init.placement: random places nothing on objects, so it needs train.representation='field' and "
-            "field.movers='all'"
+            "init.placement: random places nothing on objects, so it needs train.representation='field', "
+            "field.movers='all' and field.tracks_share=0"
         )
     for name, good, expected in _RULES:
         section, key = name.split(".")
@@ -186,10 +187,21 @@ def _validate(config: Config) -> None:
         if getattr(config.needs, need) == "on" and not getattr(getattr(config, section), key):
             found = getattr(getattr(config, section), key)
             raise ConfigError(f"needs.{need} is on, but {name} is {found!r}; leave one of them out")
+    for need, name, value in _EXCLUDED:
+        section, key = name.split(".")
+        if getattr(config.needs, need) == "on" and getattr(getattr(config, section), key) == value:
+            raise ConfigError(f"needs.{need} is on, but {name} is {value!r}; leave one of them out")
 
 
 # What may not be switched off where the need is said to be there.
 _CONTRADICTED = {"shading": "train.shading", "shadows": "train.shadows", "classifier": "identity.iterations"}
+# Other settings under which a need can not be there, as (need, key, value that excludes it).
+_EXCLUDED = (
+    ("classifier", "identity.training", "off"),
+    ("residuals", "train.representation", "field"),
+    ("residuals", "needs.tracks", "off"),
+    ("residuals", "residual.start", 1.0),
+)
 _AT_LEAST_1: tuple[Callable[[Any], bool], str] = (lambda value: value >= 1, "at least 1")
 _SHARE: tuple[Callable[[Any], bool], str] = (lambda value: 0 <= value <= 1, "0 to 1")
 _POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more than 0")
@@ -204,7 +216,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("field.movers", lambda value: value in MOVERS, " or ".join(MOVERS)),
     ("field.trd_share", *_SHARE),
     ("field.trd_every", *_SHARE),
-    ("field.tracks_share", *_SHARE),
+    ("field.tracks_share", lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
     ("field.chunk", *_AT_LEAST_1),
     ("losses.rigid_start", *_SHARE),
     ("identity.training", lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),

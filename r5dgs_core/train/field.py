@@ -143,10 +143,9 @@ class FieldRepresentation:
         if t > motion.horizon:
             return motion.through(means, motion.horizon, t, h)
         through, sign = torch.rand(2, generator=draw).tolist()
-        first = float(self.times[0])
-        if t < first + h or through >= self._config.field.trd_share:
+        if t < motion.start + h or through >= self._config.field.trd_share:
             return motion.deltas(means, t)
-        start = min(max(t - h if sign < 0.5 else t + h, first), motion.horizon)
+        start = min(max(t - h if sign < 0.5 else t + h, motion.start), motion.horizon)
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
@@ -234,6 +233,7 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
         deformation.DeformationField(deformation.SHAPES[section.size], generator),
         TRD(TRD_SHAPES[section.size], generator),
         Clock.of(times),
+        first,
         min(section.horizon or first + HORIZON * (last - first), last),
         section.step or 2 * spacing,
         section.chunk,

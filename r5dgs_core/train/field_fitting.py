@@ -95,9 +95,9 @@ def fit_trd(
         twist: Weight of the cross-Gaussian twist loss.
         generator: Source of the draws.
     """
-    if len(means) == 0 or steps == 0:
+    first = motion.start
+    if len(means) == 0 or steps == 0 or motion.horizon <= first:  # at a single time nothing moves
         return
-    first = motion.clock.origin
 
     def loss() -> Tensor:
         rows = _sample(len(means), generator)

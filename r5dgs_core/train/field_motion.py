@@ -44,17 +44,26 @@ class Motion:
         field: The deformation field.
         trd: The TRD network.
         clock: From scene time to theirs.
+        start: First observed scene time.
         horizon: Scene time T.
         step: Scene time h that the TRD bridges in training.
         chunk: Gaussians that pass the networks at once.
     """
 
     def __init__(
-        self, field: deformation.DeformationField, trd: TRD, clock: Clock, horizon: float, step: float, chunk: int
+        self,
+        field: deformation.DeformationField,
+        trd: TRD,
+        clock: Clock,
+        start: float,
+        horizon: float,
+        step: float,
+        chunk: int,
     ):
         self.field = field
         self.trd = trd
         self.clock = clock
+        self.start = start
         self.horizon = horizon
         self.step = step
         self.chunk = chunk

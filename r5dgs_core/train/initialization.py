@@ -20,6 +20,7 @@ from .views import TrainView, nearest_knot, spread
 
 log = logging.getLogger(__name__)
 
+MASKS = "Remedy: object_mask/train/IMAGE.png files"
 SAME_TIME = 0.1  # share of a camera's step in time within which the times of cameras are one
 SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
 
@@ -96,7 +97,12 @@ def start(
     times = observed_times(views)
     places = triangulation.locate(views, times, init.min_mask_pixels)
     if all(v.mask is None for v in views):
-        log.warning("no masks: everything is trained as one static scene. Remedy: object_mask/train/IMAGE.png files")
+        if config.train.representation == "field":
+            log.warning("no masks: the field moves every Gaussian, and there are no objects. %s", MASKS)
+        else:
+            log.warning(
+                "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS
+            )
     elif len(times) == 1:
         log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))

@@ -20,7 +20,6 @@ STRATEGIES = ("share", "default", "mcmc")
 NEEDS = ("auto", "on", "off")
 
 
-# What `--preset` changes; a configuration file and `--set` win over it.
 @dataclass(frozen=True)
 class TrainSection:
     """What is trained and for how long.

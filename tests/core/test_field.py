@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -248,3 +250,28 @@ def test_nothing_moves_where_the_user_says_that_nothing_does(tiny):
     with torch.no_grad():
         early, late = (trainer.splats(trainer.views[0].camera, t).means for t in (0.0, 0.9))
     assert torch.equal(early, late) and torch.equal(early, trainer.gaussians.means)
+
+
+def test_at_a_single_time_a_field_is_a_still_scene(tmp_path):
+    data = tiny_datasets.make_dataset(tmp_path)
+    known = datasets.read(data.root)
+    once = dataclasses.replace(known, train=tuple(view for view in known.train if view.t == 0))
+    trainer = Trainer(once, tiny_datasets.settings(*FIELD, "train.iterations=30"))
+    while not trainer.done:
+        trainer.step()
+    assert torch.isfinite(trainer.gaussians.means).all()
+
+
+def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):
+    data = datasets.read(tiny.root)
+    body = tiny_datasets.BRICK
+
+    def travel(*overrides: str) -> float:
+        changed = dataclasses.replace(made, config=made.config.override(overrides))
+        scene = bake.bake(changed, data)
+        mine = scene.object_ids == body
+        early, late = (playback.frame(scene, t).means[mine].mean(0) for t in (0.0, scene.t_max))
+        return float(np.linalg.norm(late - early))
+
+    assert travel() > 0.3
+    assert travel("needs.tracks=off") < 1e-6
