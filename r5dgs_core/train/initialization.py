@@ -132,6 +132,12 @@ def start(
         fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]
         where, shade = np.concatenate([known, where[fill]]), np.concatenate([hues, shade[fill]])
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
+    if len(where) == 0:
+        log.warning(
+            "the background cannot be placed: too little of it is seen by two cameras (there %s). Remedy: more cameras "
+            "that look at the same place",
+            "is one" if len(scenes) == 1 else f"are {len(scenes)}",
+        )
     parts = [placing.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters = np.zeros(0, np.int64)
     shadow_slope = np.zeros(3)

@@ -118,7 +118,7 @@ def train(
     _clean_up(folder, trainer.iteration)
     pictures = curves.Curves(run.folder)
     _optimise(trainer, run, began, go_on, progress, probe, pictures)
-    with stopping.at_once(f"stopped after the last step, before the labels are made; go on with: {go_on}"):
+    with stopping.at_once(f"stopped after the last step, with labels still to be made; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
