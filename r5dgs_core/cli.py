@@ -1,4 +1,4 @@
-"""The ``r5dgs`` command: demo, train, bake, import, evaluate, info, warm-up.
+"""The ``r5dgs`` command: demo, train, bake, import, evaluate, bench, info, warm-up.
 
 Each sub-command is a function ``run_<name>`` that does the work and can be called without the command line.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import __version__, errors
+from .bench import variants
 
 if TYPE_CHECKING:
     from .scene.scene import Scene
@@ -274,10 +275,11 @@ def parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
     add_progress(evaluate)
 
+    some, usual = ", ".join(variants.VARIANTS), " ".join(variants.DEFAULT_VARIANTS)
     bench = commands.add_parser("bench", help="train variants on scenes and lay out the paper's tables")
     bench.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="data set folders")
     bench.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs and the tables")
-    bench.add_argument("--variants", nargs="+", metavar="NAME", help="of tracks, 5dgs, r5dgs, r5dgs_extra")
+    bench.add_argument("--variants", nargs="+", metavar="NAME", help=f"of {some} (default: {usual})")
     bench.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="seeds of training (default: 0)")
     bench.add_argument("--modes", nargs="+", metavar="MODE", help="playback modes (default: all that a scene has)")
     bench.add_argument("--remeasure", action="store_true", help="bake and measure finished runs again")
@@ -347,7 +349,7 @@ def _dispatch(args: argparse.Namespace) -> None:
         plan = cases.Plan(
             scenes=tuple(args.scenes),
             out=args.out,
-            variants=tuple(args.variants or cases.DEFAULT_VARIANTS),
+            variants=tuple(args.variants or variants.DEFAULT_VARIANTS),
             seeds=tuple(args.seeds),
             modes=tuple(args.modes or playback.MODES),
             preset=args.preset,

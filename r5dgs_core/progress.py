@@ -86,10 +86,12 @@ def _plain() -> Progress:
 
 
 def _remembering() -> Callable[[Event], Event]:
-    """A function that gives steps in between the PSNR that the last look at held-out views found."""
+    """A function that gives steps in between the PSNR that the last look at held-out views of their run found."""
     known: Event = {}
 
     def complete(event: Event) -> Event:
+        if event["event"] == "start":
+            known.clear()
         if event["event"] != "step":
             return event
         known.update({key: event[key] for key in ("val_psnr",) if key in event})

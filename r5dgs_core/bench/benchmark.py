@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import platform
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from .. import __version__
 from ..data import dataset as datasets
 from ..errors import CheckpointError, R5dgsError, TrainingError
 from ..progress import make as make_progress
-from ..raster import compile as compilation
 from ..report import bench_plot, bench_tables, evaluate
 from ..scene import playback, scene_file
 from ..train import bake, checkpoint, stopping, warming
@@ -96,8 +91,10 @@ def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> lis
         **case.names,
         "gaussians": measured["gaussians"],
         "iterations": measured["iterations"],
+        "trained_on": measured.get("trained_on"),
         "train": cases.cost(record["sittings"]),
     }
+    shared["machine"] = None  # of what an earlier version measured, which did not note it
     return [{**shared, "mode": mode, **measured["modes"][mode]} for mode in plan.modes if mode in measured["modes"]]
 
 
@@ -159,7 +156,11 @@ def _measure(
     )
     played = playing.measure(scene, dataset.test or dataset.val, modes)
     found = {
-        mode: {"splits": {split: evaluation["splits"][split][mode] for split in SPLITS}, "playback": played[mode]}
+        mode: {
+            "splits": {split: evaluation["splits"][split][mode] for split in SPLITS},
+            "playback": played[mode],
+            "machine": machine(),
+        }
         for mode in modes
     }
     return {
@@ -167,6 +168,7 @@ def _measure(
         "gaussians": evaluation["train"]["gaussians"],
         "iterations": evaluation["train"]["iterations"],
         "objects": evaluation["objects"],
+        "trained_on": {**run.platform, "torch_threads": run.config.train.threads, "versions": run.versions},
         "modes": {**measured["modes"], **found},
         "absent": [mode for mode in wanted if mode not in there],
     }
@@ -203,19 +205,5 @@ def _show(plan: Plan, result: dict[str, Any]) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What the times were measured on."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model)
-    except OSError:
-        pass  # another system
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "processor": model,
-        "cores": usable,
-        "raster_threads": compilation.threads(),
-        "torch_threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "versions": {**checkpoint.versions(), "r5dgs": __version__},
-    }
+    """What times are measured on in this process."""
+    return {**checkpoint.machine(), "torch_threads": torch.get_num_threads(), "versions": checkpoint.versions()}

@@ -18,17 +18,8 @@ from ..errors import CheckpointError, ConfigError
 from ..scene import files, playback
 from ..train import checkpoint
 from ..train import config as configs
+from . import variants as kinds
 
-# What each variant sets; it wins over everything that the user gives.
-VARIANTS: dict[str, dict[str, str]] = {
-    "5dgs": {"train.representation": "field", "field.variant": "5dgs"},
-    "r5dgs": {"train.representation": "field", "field.variant": "r5dgs"},
-    "r5dgs_extra": {"train.representation": "field", "field.variant": "r5dgs_extra"},
-    "from_tracks": {"train.representation": "field", "field.variant": "r5dgs", "field.tracks_share": "0.4"},
-    "tracks": {"train.representation": "tracks"},
-}
-# `5dgs` is trained as `r5dgs` is and differs only in how it is played, so its row comes from the checkpoint of `r5dgs`.
-DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "from_tracks", "tracks")
 # Looking at held-out views while training would be counted into its time. The user's settings win over these.
 QUIET = ("train.probe_every=0",)
 COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # of a sitting; seconds add up
@@ -41,7 +32,7 @@ class Plan:
     Attributes:
         scenes: Data sets.
         out: Folder of the benchmark.
-        variants: Of `VARIANTS`.
+        variants: Of `variants.VARIANTS`.
         seeds: Of training.
         modes: Of `playback.MODES`; a scene is played in those that it has data for.
         preset: Named settings of training.
@@ -51,7 +42,7 @@ class Plan:
 
     scenes: tuple[Path, ...]
     out: Path
-    variants: tuple[str, ...] = DEFAULT_VARIANTS
+    variants: tuple[str, ...] = kinds.DEFAULT_VARIANTS
     seeds: tuple[int, ...] = (0,)
     modes: tuple[str, ...] = playback.MODES
     preset: str | None = None
@@ -66,7 +57,7 @@ class Case:
     Attributes:
         scene: Name of the data set.
         root: Its folder.
-        variant: Of `VARIANTS`.
+        variant: Of `variants.VARIANTS`.
         seed: Of training.
         run: Run folder.
         overrides: All ``section.key=value`` of its configuration.
@@ -87,7 +78,7 @@ class Case:
     @property
     def names(self) -> dict[str, Any]:
         """What tells the case from the others, for its records."""
-        representation = VARIANTS[self.variant]["train.representation"]
+        representation = kinds.VARIANTS[self.variant]["train.representation"]
         return {"scene": self.scene, "representation": representation, "variant": self.variant, "seed": self.seed}
 
     def beside(self, suffix: str) -> Path:
@@ -103,9 +94,9 @@ def make(plan: Plan) -> list[Case]:
     Raises:
         ConfigError: A variant, mode or setting is unknown, or a case was begun with other settings.
         DatasetError: A data set cannot be read, or two have one name.
-        CheckpointError: A run folder is damaged.
+        CheckpointError: A run folder is damaged, or its run was trained on other data.
     """
-    for name, given, known in (("--variants", plan.variants, VARIANTS), ("--modes", plan.modes, playback.MODES)):
+    for name, given, known in (("--variants", plan.variants, kinds.VARIANTS), ("--modes", plan.modes, playback.MODES)):
         if not given:
             raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")
         for item in given:
@@ -114,20 +105,23 @@ def make(plan: Plan) -> list[Case]:
     if plan.out.exists() and not plan.out.is_dir():
         raise ConfigError(f"--out {plan.out}: is a file; name a folder")
     roots: dict[str, Path] = {}
+    digests: dict[str, str] = {}
     for root in plan.scenes:
         dataset = datasets.read(root)
         name = Path(dataset.root).resolve().name
         if name in roots:
             raise ConfigError(f"{roots[name]} and {root}: are both called {name}; give one of them another name")
-        roots[name] = root
+        roots[name], digests[name] = root, dataset.digest
     cases = []
     for seed in dict.fromkeys(plan.seeds):
         for scene, root in roots.items():
             for variant in dict.fromkeys(plan.variants):
-                settings = {**VARIANTS[variant], "train.seed": str(seed)}
-                overrides = (*QUIET, *plan.overrides, *(f"{key}={value}" for key, value in settings.items()))
+                suited = kinds.suited(variant, plan.preset)
+                settings = {**kinds.settings(variant, plan.preset), "train.seed": str(seed)}
+                overrides = (*QUIET, *_texts(suited), *plan.overrides, *_texts(settings))
                 case = Case(scene, root, variant, seed, plan.out / scene / f"{variant}_seed{seed}", overrides)
                 _check_settings(case, configs.load(plan.config_path, overrides, plan.preset))
+                _check_data(case, digests[scene])
                 cases.append(case)
     return cases
 
@@ -144,6 +138,22 @@ def _check_settings(case: Case, wanted: configs.Config) -> None:
                     f"{case.run}: was begun with {section}.{key} = {found[section][key]}, not {value}; "
                     "go on with the settings it was begun with, or choose another --out"
                 )
+
+
+def _check_data(case: Case, digest: str) -> None:
+    """Raise CheckpointError where the case was trained on other data than there is now."""
+    if not (case.run / checkpoint.CHECKPOINT_FILE).exists():
+        return  # nothing of other data is in it
+    if checkpoint.open_run(case.run).digest != digest:
+        raise CheckpointError(
+            f"{case.run}: was trained on other data than {case.root} now holds; restore the data, choose another "
+            f"--out, or remove {case.run} and {case.beside('.json').name} beside it to train it again"
+        )
+
+
+def _texts(settings: dict[str, str]) -> tuple[str, ...]:
+    """Settings as ``--set`` takes them."""
+    return tuple(f"{key}={value}" for key, value in settings.items())
 
 
 def read_record(case: Case) -> dict[str, Any]:

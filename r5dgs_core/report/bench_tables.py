@@ -22,6 +22,17 @@ PAPER = {
     ("r5dgs_extra", "rigid_paper"): "R5DGS + extra",
 }
 OURS = "ours"
+UNKNOWN = "unknown"
+# What is said of the machine of a record.
+_MACHINE = {
+    "processor": "processor",
+    "cores": "usable cores",
+    "gpu": "GPU",
+    "raster_threads": "threads of the rasterizer",
+    "torch_threads": "threads of torch",
+    "system": "system",
+    "versions": "versions",
+}
 _ORDER = ("5DGS", "R5DGS", "R5DGS + extra", "", OURS)
 _QUALITY = (("PSNR", "psnr", "{:.2f}"), ("SSIM", "ssim", "{:.4f}"), ("LPIPS", "lpips", "{:.4f}"))
 _QUALITY = (*_QUALITY, ("FLIP", "flip", "{:.4f}"))
@@ -74,7 +85,7 @@ def sheets(result: dict[str, Any]) -> list[Sheet]:
     Args:
         result: What `bench.benchmark.run_bench` writes.
     """
-    records, failures, machine = result["results"], result["failures"], result["machine"]
+    records, failures = result["results"], result["failures"]
     costs = [Column(label, _at("train", key), form) for label, key, form in _COST]
     tables = []
     for split, title in (("test", "Table 1: extrapolation (test)"), ("val", "Table 1, observed time (val)")):
@@ -83,8 +94,7 @@ def sheets(result: dict[str, Any]) -> list[Sheet]:
     played = [Column(label, _at("playback", key), form) for label, key, form in _PLAYED]
     overlaps = [Column(f"mIoU {split}", _at("splits", split, "miou"), "{:.3f}") for split in ("test", "val")]
     count = Column("Gaussians", lambda record: record["gaussians"], "{:.0f}")
-    threads = f"rasterizer on {machine['raster_threads']} thread(s), {machine['gpu'] or machine['processor']}"
-    note = f"frames of the test views in sequence, medians, colours alone; {threads}"
+    note = f"frames of the test views in sequence, medians, colours alone; {_where(records)}"
     tables.append(("Table 2: speed and identities", [*played, *overlaps, count, costs[0], costs[2]], note))
     data = [(records, failures)] * len(tables)
     if compared := against_standard(records):
@@ -114,7 +124,7 @@ def to_rich(sheet: Sheet) -> Table:
 
 def markdown(result: dict[str, Any]) -> str:
     """All tables, what failed, and what the times were measured on."""
-    parts = []
+    records, parts = result["results"], []
     for sheet in sheets(result):
         rule = ["---"] * sheet.words + ["---:"] * (len(sheet.head) - sheet.words)
         lines = [sheet.head, tuple(rule), *(line for block in sheet.blocks for line in block)]
@@ -123,19 +133,14 @@ def markdown(result: dict[str, Any]) -> str:
     if result["failures"]:
         lines = [f"- {f['scene']}, {f['variant']}, seed {f['seed']}: {f['error']}" for f in result["failures"]]
         parts.append("## What failed\n\n" + "\n".join(lines) + "\n")
-    machine = result["machine"]
-    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    threads = f"{machine['raster_threads']} of the rasterizer, {machine['torch_threads']} of torch"
     settings = result["settings"]
     given = [f"preset {settings['preset']}"] if settings["preset"] else []
     given += [f"configuration {settings['config']}"] if settings["config"] else []
     given += settings["set"]
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
     parts.append(
         "## How\n\n"
         f"Settings: {', '.join(given) or 'defaults'}. CPU s, wall s and MB are of the process that trained, start and "
-        f"labels included; FPS of the process that measured. {machine['processor']}, {machine['cores']} usable "
-        f"cores{gpu}; threads: {threads}; {versions}.\n"
+        "labels included; FPS of the process that measured.\n\n" + "\n".join(_machines(records)) + "\n"
     )
     return "\n".join(parts)
 
@@ -215,6 +220,43 @@ def paper_row(variant: str, mode: str, variants: Iterable[str]) -> str:
     if mode == "standard" and variant == "r5dgs" and "5dgs" in variants:
         return ""
     return OURS if mode == "rigid" else PAPER.get((variant, mode), "")
+
+
+def _where(records: Sequence[Record]) -> str:
+    """What the frames were timed on, or in what that differs from record to record."""
+    found = {key: sorted({_said(record["machine"], key) for record in records}) for key in _MACHINE}
+    differ = [f"{_MACHINE[key]} {' / '.join(said)}" for key, said in found.items() if len(said) > 1]
+    if differ:
+        return f"not all measured alike, see tables.md: {', '.join(differ)}"
+    told = [(key, found[key][0]) for key in ("raster_threads", "processor", "gpu") if found[key]]
+    return ", ".join(f"{_MACHINE[key]} {said}" for key, said in told if said != ABSENT)
+
+
+def _machines(records: Sequence[Record]) -> list[str]:
+    """A line for each kind of machine, threads and versions that runs were trained or measured on; with what ran there
+    where there are several."""
+    lines = []
+    for task, where in (("trained", "trained_on"), ("measured", "machine")):
+        ran: dict[str, dict[str, None]] = {}
+        for record in records:
+            text = ", ".join(f"{word} {_said(record[where], key)}" for key, word in _MACHINE.items())
+            mode = f" {record['mode']}" if where == "machine" else ""
+            who = f"{record['scene']} {record['variant']}{mode} seed {record['seed']}"
+            ran.setdefault(text if record[where] else UNKNOWN, {})[who] = None
+        differ = len(ran) > 1
+        if differ:
+            lines += ["", f"Not all runs were {task} alike, so their times do not compare:", ""]
+        for text, who in ran.items():
+            lines.append(f"- {task}: {text}" + (f" ({'; '.join(who)})" if differ else ""))
+    return lines
+
+
+def _said(machine: dict[str, Any] | None, key: str) -> str:
+    """An entry of a machine in words."""
+    value = (machine or {}).get(key, UNKNOWN)
+    if isinstance(value, dict):
+        return " ".join(f"{name} {version}" for name, version in value.items())
+    return ABSENT if value is None else str(value)
 
 
 def _at(*path: str) -> Callable[[Record], float | None]:

@@ -25,6 +25,7 @@ from .. import __version__
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model.gaussians import PARAMETERS
+from ..raster import compile as compilation
 from ..scene import files
 from . import config as configs
 from .config import Config
@@ -44,6 +45,7 @@ class Run:
         digest: Hash of the data set's content.
         config: Configuration of the run.
         versions: Versions of what it ran on.
+        platform: What else its times depend on, as of `machine`; empty where that is not known.
     """
 
     folder: Path
@@ -51,6 +53,7 @@ class Run:
     digest: str
     config: Config
     versions: dict[str, str]
+    platform: dict[str, Any]
 
     def data(self, given: Path | None = None) -> Path:
         """Where to look for the data set: the ``given`` place, else where it was.
@@ -119,11 +122,19 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, Any]:
     """What a run's times, and in the last bits its numbers, depend on beside the versions."""
+    processor = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), processor)
+    except OSError:
+        pass  # another system
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "system": platform.platform(),
-        "machine": platform.machine(),
-        "processors": os.cpu_count(),
-        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "processor": processor,
+        "cores": usable,
+        "raster_threads": compilation.threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
 
@@ -144,7 +155,7 @@ def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         raise CheckpointError(f"{folder}: cannot be read: {error}; choose another --out") from error
     if foreign:
         raise CheckpointError(f"{folder}: exists and is not a run folder; choose another --out")
-    return Run(folder, Path(dataset.root).resolve(), dataset.digest, config, versions())
+    return Run(folder, Path(dataset.root).resolve(), dataset.digest, config, versions(), machine())
 
 
 def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
@@ -160,7 +171,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         "digest": run.digest,
         "config": config.to_dict(),
         "versions": run.versions,
-        "platform": machine(),
+        "platform": run.platform,
         "begun": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
     try:
@@ -204,6 +215,7 @@ def open_run(folder: Path) -> Run:
         text = json.loads(path.read_text(encoding="utf-8"))
         found, made_by = text["format_version"], text["versions"]
         place, digest, settings = Path(text["dataset"]), text["digest"], text["config"]
+        ran_on = dict(text.get("platform", {}))
     except (FileNotFoundError, NotADirectoryError):
         raise CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'") from None
     except OSError as error:
@@ -218,7 +230,7 @@ def open_run(folder: Path) -> Run:
             "or use the version of r5dgs that made it"
         )
     try:
-        return Run(Path(folder), place, digest, configs.from_dict(settings), made_by)
+        return Run(Path(folder), place, digest, configs.from_dict(settings), made_by, ran_on)
     except (ConfigError, AttributeError) as error:
         by = made_by.get("r5dgs", "another version") if isinstance(made_by, dict) else "another version"
         raise CheckpointError(

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from r5dgs_core import cli
-from r5dgs_core.bench import benchmark, cases, playing, process
+from r5dgs_core.bench import benchmark, cases, playing, process, variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.train import bake, checkpoint
+from r5dgs_core.train import bake, checkpoint, presets
+from r5dgs_core.train import config as configs
 from tests import datasets as tiny_datasets
 
 OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
@@ -162,6 +163,33 @@ def test_a_fault_in_one_case_does_not_cost_the_others(tiny, tmp_path, monkeypatc
     assert len(json.loads((tmp_path / benchmark.RESULT_FILE).read_text())["results"]) == 1
 
 
+def test_a_record_says_what_it_was_trained_and_measured_on(made):
+    _, case, _, result = made
+    (found,) = result["results"]
+    assert found["machine"] == benchmark.machine() and found["machine"]["cores"] >= 1
+    assert found["trained_on"]["torch_threads"] == 1 and found["trained_on"]["versions"] == checkpoint.versions()
+    assert {**checkpoint.machine(), **found["trained_on"]} == found["trained_on"]
+    assert cases.read_record(case)["measured"]["modes"]["rigid"]["machine"] == found["machine"]
+
+
+def test_what_was_measured_elsewhere_keeps_its_machine(made, monkeypatch):
+    plan, _, _, result = made
+    monkeypatch.setattr(checkpoint, "machine", lambda: {"processor": "another"})
+    (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
+    assert found["machine"] == result["results"][0]["machine"]
+
+
+def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, tiny, tmp_path):
+    plan, _, _, _ = made
+    root = tmp_path / tiny.root.name
+    shutil.copytree(tiny.root, root)
+    assert len(cases.make(plan_for(tiny, plan.out, scenes=(root,)))) == 1, "the same data in another place"
+    path = root / "transforms_val.json"
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(CheckpointError, match=r"tracks_seed0: was trained on other data.*restore the data.*--out"):
+        cases.make(plan_for(tiny, plan.out, scenes=(root,)))
+
+
 def test_a_run_that_was_begun_with_other_settings_is_refused_before_anything_is_done(made, tiny):
     plan, case, _, _ = made
     before = contents(plan.out)
@@ -197,10 +225,46 @@ def test_cases_go_seed_by_seed_and_their_variants_win_over_the_users_settings(ti
     overrides = ("train.representation=tracks", "train.seed=7", "train.probe_every=9")
     made = cases.make(plan_for(tiny, tmp_path, variants=("r5dgs", "tracks"), seeds=(0, 1), overrides=overrides))
     assert [(case.seed, case.variant) for case in made] == [(0, "r5dgs"), (0, "tracks"), (1, "r5dgs"), (1, "tracks")]
-    settings = cases.configs.load(None, made[2].overrides)
+    settings = configs.load(None, made[2].overrides)
     assert (settings.train.representation, settings.field.variant, settings.train.seed) == ("field", "r5dgs", 1)
     assert settings.train.probe_every == 9
     assert len({case.run for case in made}) == 4
+
+
+@pytest.mark.parametrize("preset", [None, *presets.PRESETS])
+def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny, tmp_path, preset):
+    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset=preset))
+    found = {case.variant: configs.load(None, case.overrides, preset) for case in made}
+    assert tuple(found) == variants.DEFAULT_VARIANTS
+    for name in ("r5dgs", "r5dgs_extra"):
+        identity = found[name].identity
+        assert (identity.training, identity.spatial) == ("joint", 2.0)
+        assert identity.weight == (1.0 if preset == "paper" else 0.05), name
+    assert found["r5dgs_extra"].identity.majority == 0.5
+    for name in ("from_tracks", "tracks"):
+        config = found[name]
+        assert (config.init.placement, config.curriculum.start, config.curriculum.stages) == ("scene", "best", 0)
+        assert config.train.shading and config.train.shadows
+    assert (found["from_tracks"].field.movers, found["from_tracks"].field.tracks_share) == ("labelled", 0.4)
+    plain = found["tracks"]
+    assert (plain.densify.strategy, plain.identity.training, plain.identity.rate) == ("share", "after", 0.01)
+    assert plain.rates == configs.Config().rates
+    assert plain.train.iterations == configs.load(None, (), preset).train.iterations
+
+
+def test_what_does_not_suit_tracks_in_a_preset_is_still_the_users_to_set(tiny, tmp_path):
+    overrides = ("train.shading=false", "identity.training=off", "identity.weight=0.3")
+    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset="paper", overrides=overrides))
+    found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
+    assert not found["tracks"].train.shading and found["tracks"].identity.training == "off"
+    assert found["r5dgs"].identity.training == "joint" and found["r5dgs"].identity.weight == 0.3
+
+
+@pytest.mark.parametrize("name", ["5dgs", "r5dgs", "r5dgs_extra"])
+def test_the_method_does_not_depend_on_the_users_settings(name):
+    given = variants.settings(name, None)
+    assert {"train.representation", "field.variant", "identity.training", "identity.weight"} <= set(given)
+    assert set(given) - set(variants.settings(name, "paper")) == {"identity.weight"}
 
 
 def test_a_sitting_of_which_nothing_is_known_makes_the_sum_unknown():

@@ -11,6 +11,7 @@ from r5dgs_core.errors import ConfigError
 from r5dgs_core.report import bench_plot, bench_tables, evaluate
 
 MACHINE = {
+    "system": "Some system",
     "processor": "Some CPU",
     "cores": 2,
     "raster_threads": 1,
@@ -30,6 +31,8 @@ def record(scene="room", variant="tracks", mode="rigid", seed=0, psnr=30.0, cpu=
         "seed": seed,
         "gaussians": 1000,
         "iterations": 20,
+        "trained_on": MACHINE,
+        "machine": MACHINE,
         "train": {"cpu_seconds": cpu, "wall_seconds": 40.0, "peak_mb": 600.0, "peak_gpu_mb": None},
         "splits": {"test": metrics, "val": {**metrics, "psnr": psnr + 3}},
         "playback": {
@@ -58,6 +61,30 @@ def test_seeds_become_their_mean_and_half_their_range():
     assert line["PSNR"] == "30.50 ± 0.50" and line["CPU s"] == "10 ± 0" and line["LPIPS"] == "-"
     assert lines_of(val)[0]["PSNR"] == "33.50 ± 0.50"
     assert lines_of(played)[0]["FPS"] == "200.0 ± 0.0" and "seeds 0, 1" in played.caption
+
+
+def test_the_tables_say_which_records_were_measured_on_what():
+    records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
+    found = result(records)
+    assert "alike" not in bench_tables.markdown(found)
+    caption = bench_tables.sheets(found)[2].caption
+    assert "threads of the rasterizer 1" in caption and "Some CPU" in caption and "GPU" not in caption
+    records[1]["machine"] = {**MACHINE, "raster_threads": 4}
+    caption = bench_tables.sheets(found)[2].caption
+    assert "not all measured alike" in caption and "rasterizer 1 / 4" in caption and "Some CPU" not in caption
+    (line,) = [line for line in bench_tables.markdown(found).splitlines() if "rasterizer 4" in line and line[0] == "-"]
+    assert line.startswith("- measured:") and line.endswith("(room tracks rigid seed 1)")
+
+
+def test_the_tables_say_which_runs_were_trained_elsewhere_or_nobody_knows_where():
+    records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
+    records[0]["trained_on"] = {**MACHINE, "versions": {"r5dgs": "0.1"}}
+    records[2]["trained_on"] = None
+    text = bench_tables.markdown(result(records))
+    assert "Not all runs were trained alike" in text and "Not all runs were measured alike" not in text
+    trained = [line for line in text.splitlines() if line.startswith("- trained:")]
+    assert len(trained) == 3 and "r5dgs 0.1" in trained[0] and trained[0].endswith("(room tracks seed 0)")
+    assert trained[2] == "- trained: unknown (room r5dgs seed 0)"
 
 
 def test_a_single_seed_has_no_spread():

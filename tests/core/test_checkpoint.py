@@ -127,7 +127,8 @@ def test_a_run_is_opened_as_it_was_made(tmp_path):
     assert opened == made and opened.config == settings and opened.digest == "d1"
     assert set(opened.versions) >= {"r5dgs", "torch", "numpy"}
     text = json.loads((tmp_path / "deep" / "run" / checkpoint.RUN_FILE).read_text())
-    assert text["platform"]["processors"] >= 1 and text["platform"]["system"] and text["begun"].startswith("2")
+    assert text["platform"] == opened.platform and text["begun"].startswith("2")
+    assert opened.platform["cores"] >= 1 and opened.platform["raster_threads"] >= 1 and opened.platform["system"]
 
 
 def test_a_new_run_in_an_old_run_folder_starts_clean(tmp_path):

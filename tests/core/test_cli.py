@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core import __version__, cli, demo, progress
+from r5dgs_core.bench import variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import files, scene_file
@@ -161,6 +162,20 @@ def test_help_and_version_need_no_torch():
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert shown.splitlines() == [f"r5dgs {__version__}", "False"]
+
+
+def test_help_of_bench_names_every_variant(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["bench", "--help"])
+    shown = capsys.readouterr().out.replace("\n", " ")
+    assert all(f"{name}," in shown or f"{name} " in shown for name in variants.VARIANTS)
+    assert f"(default: {' '.join(variants.DEFAULT_VARIANTS)})" in " ".join(shown.split())
+
+
+def test_the_module_of_the_command_line_names_every_command():
+    (commands,) = [action.choices for action in cli.parser()._actions if isinstance(action.choices, dict)]
+    named = cli.__doc__.splitlines()[0].partition(": ")[2].rstrip(".").split(", ")
+    assert sorted(named) == sorted(commands)
 
 
 def test_the_bundled_data_is_found_and_small():

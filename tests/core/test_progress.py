@@ -93,3 +93,17 @@ def test_steps_keep_showing_what_the_last_look_at_held_out_views_found(capsys, m
         report({"event": "step", "iteration": 1, "loss": 0.5, "val_psnr": 31.23})
         report({"event": "step", "iteration": 2, "loss": 0.4})
     assert "loss 0.4000, held-out 31.2 dB" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_run_that_starts_forgets_what_held_out_views_of_the_one_before_gave(capsys, monkeypatch, terminal):
+    monkeypatch.setattr(progress.sys.stdout, "isatty", lambda: terminal, raising=False)
+    monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
+    with progress.make("auto") as report:
+        report({"event": "start", "iterations": 1})
+        report({"event": "step", "iteration": 1, "loss": 0.5, "val_psnr": 31.23})
+        capsys.readouterr()
+        report({"event": "start", "iterations": 2})
+        report({"event": "step", "iteration": 2, "loss": 0.4})
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "loss 0.4000" in shown and "loss 0.4000, held-out" not in shown
