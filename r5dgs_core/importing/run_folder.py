@@ -118,7 +118,7 @@ def read_config(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         call = ast.parse(text.strip(), mode="eval").body
-    except (OSError, UnicodeDecodeError, SyntaxError, ValueError, RecursionError) as error:
+    except (OSError, SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', cannot be read ({error})") from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
         raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', found {text.strip()[:40]!r}")
@@ -128,7 +128,7 @@ def read_config(path: Path) -> dict[str, Any]:
             continue
         try:
             config[keyword.arg] = ast.literal_eval(keyword.value)
-        except ValueError:
+        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
             config[keyword.arg] = ast.unparse(keyword.value)
     return config
 

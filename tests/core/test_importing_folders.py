@@ -181,13 +181,14 @@ def test_other_folders_are_told_apart(tmp_path, deformed):
 def test_settings_are_read_and_never_run(tmp_path):
     path, sprung = tmp_path / "cfg_args", tmp_path / "sprung"
     path.write_text(
-        f"Namespace(max_time=0.65, light=True, n=-3, names=['a', 'b'], device=open({str(sprung)!r}, 'w'), none=None)\n"
+        f"Namespace(max_time=0.65, light=True, n=-3, names=['a', 'b'], device=open({str(sprung)!r}, 'w'), none=None, "
+        "a={[]: 1})\n"
     )
     config = run_folder.read_config(path)
     assert not sprung.exists()
     assert config["max_time"] == 0.65 and config["light"] is True and config["n"] == -3
     assert config["names"] == ["a", "b"] and config["none"] is None
-    assert config["device"].startswith("open(")
+    assert config["device"].startswith("open(") and config["a"] == "{[]: 1}"
     assert run_folder.read_config(tmp_path / "none") == {}
     for text in ("Namespace(a=", "dict(a=1)", "", "[1, 2]"):
         path.write_text(text)
