@@ -29,21 +29,21 @@ class Background:
     def __init__(self, coefficients: Tensor, learned: bool):
         self.learned = learned
         self.params: dict[str, Tensor] = {"background": coefficients.detach().requires_grad_(learned)}
-        self._bases: dict[bytes, Tensor] = {}
+        self._bases: dict[tuple, Tensor] = {}
 
     def image(self, camera: Camera) -> Tensor:
         """Colours behind the pixels of a camera: [3] for a fixed colour, else [H, W, 3]."""
         coefficients = self.params["background"]
         if not self.learned:
             return spherical_harmonics.dc_to_rgb(coefficients[0]).clamp(0, 1)
-        key = camera.T_cam_world[:3, :3].tobytes() + camera.intrinsics.tobytes() + bytes([len(coefficients)])
+        shape = (camera.height, camera.width, 3)
+        key = (*shape, camera.T_cam_world[:3, :3].tobytes(), camera.intrinsics.tobytes(), len(coefficients))
         if key not in self._bases:
             rays = torch.from_numpy(cameras.pixel_rays(camera).reshape(-1, 3).astype(np.float32))
             basis = spherical_harmonics.basis(rays, spherical_harmonics.degree_of(len(coefficients)))
             if sum(b.nbytes for b in self._bases.values()) + basis.nbytes > BASES_BYTES:
                 self._bases.clear()
             self._bases[key] = basis
-        shape = (camera.height, camera.width, 3)
         return (self._bases[key] @ coefficients + 0.5).clamp(0, 1).reshape(shape)
 
 

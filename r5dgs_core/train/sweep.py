@@ -83,7 +83,7 @@ def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
 
 
 def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
-    """Views that share pose and lens; a spread of ``limit`` cameras where there are more."""
+    """Views that share pose, lens and size; a spread of ``limit`` cameras where there are more."""
     groups: dict[bytes, list[TrainView]] = {}
     for view in views:
         groups.setdefault(camera_key(view.camera), []).append(view)
@@ -91,8 +91,9 @@ def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
 
 
 def camera_key(camera: cameras.Camera) -> bytes:
-    """Equal for cameras of the same pose and lens."""
-    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes()
+    """Equal for cameras of the same pose, lens and image size."""
+    size = np.array([camera.width, camera.height])
+    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()
 
 
 def _free(view: TrainView) -> np.ndarray:

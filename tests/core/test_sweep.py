@@ -170,3 +170,11 @@ def test_depths_are_found_the_same_however_rays_are_cut_into_bands(floor, monkey
     for ours, theirs in zip(cut.rays, whole.rays, strict=True):
         np.testing.assert_allclose(ours.costs, theirs.costs, rtol=1e-5)
         assert (ours.depths == theirs.depths).mean() > 0.99
+
+
+def test_images_of_another_size_have_a_backdrop_of_their_own(floor):
+    view = floor[0]
+    cut = dataclasses.replace(view, camera=dataclasses.replace(view.camera, height=20), image=view.image[:20])
+    found = sweep.backdrops([view, cut, view])
+    assert [b.image.shape[:2] for b in found] == [(48, 64), (20, 64)]
+    np.testing.assert_array_equal(found[1].image, found[0].image[:20])
