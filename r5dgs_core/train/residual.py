@@ -55,7 +55,12 @@ def decision_step(config: Config, all_entered: int) -> int | None:
 
 
 def decide(trainer: Trainer) -> None:
-    """Try residuals on all bodies, and go on from where the run was with those that help."""
+    """Try residuals on all bodies, and go on from where the run was with those that help.
+
+    With one observed time nothing can bend, so that nothing is tried.
+    """
+    if len(trainer.times) < 2:
+        return
     before = trainer.state()
     field, gains = _try(trainer)
     kept = flexible(gains, field, trainer.config)
@@ -248,4 +253,6 @@ def need(
     largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
     bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)
     rigid = f"{len(gains) - len(kept)} of {len(gains)} objects are rigid"
+    if kept and not there and config.needs.residuals != "off":
+        bent += ", too little to be stored"
     return largest, threshold, there, "gain by bending, dB: " + (f"{bent}; {rigid}" if bent else rigid)

@@ -1,5 +1,8 @@
 """Objects that bend or breathe are found by trying, keep residuals that play, and others are left without a trace."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -228,6 +231,29 @@ def test_a_trial_that_fails_leaves_the_run_alone(tiny, monkeypatch):
     assert trainer.state().tensors["residual.gains"].isnan().all()
 
 
+def test_nothing_is_tried_where_one_time_alone_was_observed(tiny, tmp_path):
+    shutil.copytree(tiny.root, tmp_path / "still")
+    path = tmp_path / "still" / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"] = [frame for frame in content["frames"] if frame["time"] == tiny_datasets.T_MAX]
+    path.write_text(json.dumps(content))
+    settings = tiny_datasets.settings("train.iterations=60", "needs.residuals=on")
+    trainer = advance(Trainer(datasets.read(tmp_path / "still"), settings), 30)
+    tensors = trainer.state().tensors
+    assert trainer.motion.residuals is None and not any(name.startswith("residual.") for name in tensors)
+    largest, _, there, reason = residual.need(tensors, {}, settings, there=False)
+    assert (largest, there) == (0.0, False) and "none was tried" in reason
+
+
+def test_the_table_says_where_what_bends_is_too_little_to_be_stored():
+    means, _, weights, ids = random_state()
+    tensors = residual.tensors_of(field_on(means, ids, weights).only([2]))
+    tensors |= {"residual.gains": torch.tensor([-1.0, 0.7]), "object_ids": torch.tensor([0, 1, 2])}
+    for there in (True, False):
+        reason = residual.need(tensors, {2: "ball"}, config.load(None), there)[3]
+        assert "ball (+0.7)" in reason and ("too little to be stored" in reason) != there
+
+
 SETTINGS = ("train.iterations=300", "residual.trial_steps=400", "identity.iterations=0")
 DECISION = 120
 
@@ -305,24 +331,35 @@ def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     assert row["decision"] == "off" and row["reason"].startswith("set off by you")
 
 
-@pytest.fixture(scope="module")
-def states(breathing):
-    """A trainer of that data, and its states: just before residuals are tried, and some steps after."""
-    trainer, found = make(breathing[0], *SETTINGS), []
+BESIDE = {
+    "alone": (),
+    "detached": ("identity.training='detached'", "identity.iterations=80"),
+    "joint": ("identity.training='joint'", "identity.iterations=80", "needs.residuals=on"),
+    "mcmc": ("densify.strategy='mcmc'", "densify_mcmc.start=10", "densify_mcmc.every=10", "needs.residuals=on"),
+}
+
+
+@pytest.fixture(scope="module", params=BESIDE)
+def states(breathing, request):
+    """Settings, and states of a run with them: just before residuals are tried, and some steps after."""
+    settings = (*SETTINGS, *BESIDE[request.param])
+    trainer, found = make(breathing[0], *settings), []
     for k in (DECISION - 1, DECISION + 9, DECISION + 20):
         found.append(advance(trainer, k).state())
-    return trainer, found
+    return settings, found
 
 
 @pytest.mark.parametrize("k", [0, 1])
-def test_a_run_with_residuals_goes_on_to_the_same_bits(states, tmp_path, k):
-    trainer, found = states
+def test_a_run_with_residuals_goes_on_to_the_same_bits(breathing, states, tmp_path, k):
+    settings, found = states
     checkpoint.save(tmp_path, found[k])
+    trainer = make(breathing[0], *settings)
     trainer.restore(checkpoint.load(tmp_path))
     assert (trainer.motion.residuals is None) == (k == 0)
     last = advance(trainer, DECISION + 20).state()
-    assert trainer.motion.residuals.bodies == [BALL]
+    assert trainer.motion.residuals.bodies == ([BRICK, BALL] if "needs.residuals=on" in settings else [BALL])
     assert_same_tensors(last.tensors, found[-1].tensors)
+    assert (last.queue, last.running_loss) == (found[-1].queue, found[-1].running_loss)
 
 
 def test_you_may_say_that_every_object_bends(tiny):
