@@ -74,8 +74,9 @@ def folder(root: Path) -> Path | None:
 def read(root: Path) -> Found:
     """Read cameras, times and points of a data set.
 
-    Every eighth camera (by name, from the first one on) is held out where there are at least eight, within the times
-    that the others observe; views later than "t_max" of ``times.json`` are the test.
+    Every eighth camera (by name, from the first one on) is held out where there are at least eight, within the span of
+    times that the others observe: what it took outside is left out, and a camera that took nothing inside is trained
+    on. Views later than "t_max" of ``times.json`` are the test.
 
     Raises:
         DatasetError: Something is missing or damaged; distorted lenses are not supported.
@@ -202,21 +203,34 @@ def _count(root: Path, camera: str) -> int:
 
 
 def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
-    """Frames of each split."""
+    """Frames of each split; no camera of "val" is in "train".
+
+    Held-out cameras of which nothing lies within the times of the others are trained on; of the rest, frames outside
+    those times are left out.
+    """
     names = sorted({frame.camera for frame in frames})
     held = set(names[::HELD_OUT]) if len(names) >= HELD_OUT else set()
     early = [frame for frame in frames if frame.t <= t_max + 1e-9]
-    seen = [frame.t for frame in early if frame.camera not in held]
-    if not seen:
+    if not early:
         raise errors.DatasetError(f"t_max {t_max:g} of times.json: expected images up to it, found none")
-    splits: dict[str, list[_Frame]] = {"train": [], "val": [], "test": []}
-    for frame in frames:
-        if frame.t > t_max + 1e-9:
-            splits["test"].append(frame)
-        else:
-            inside = min(seen) - 1e-9 <= frame.t <= max(seen) + 1e-9
-            splits["val" if frame.camera in held and inside else "train"].append(frame)
-    return splits
+    first, last = _span(early, held)
+    held &= {frame.camera for frame in early if first <= frame.t <= last}
+    first, last = _span(early, held)
+    val = [frame for frame in early if frame.camera in held]
+    inside = [frame for frame in val if first <= frame.t <= last]
+    if len(inside) < len(val):
+        _log.info("%d images of held-out cameras are left out: the others observe no such time", len(val) - len(inside))
+    return {
+        "train": [frame for frame in early if frame.camera not in held],
+        "val": inside,
+        "test": [frame for frame in frames if frame.t > t_max + 1e-9],
+    }
+
+
+def _span(frames: list[_Frame], held: set[str]) -> tuple[float, float]:
+    """First and last time of the cameras that are not held out, with a little to spare; empty without such frames."""
+    seen = [frame.t for frame in frames if frame.camera not in held]
+    return min(seen, default=math.inf) - 1e-9, max(seen, default=-math.inf) + 1e-9
 
 
 def _entry(sparse: Path, frame: _Frame) -> Entry:

@@ -133,6 +133,26 @@ def test_a_moving_camera_has_a_time_and_a_pose_per_image(flat):
         same_camera(view, views[f"{view.name}.png"])
 
 
+def test_a_held_out_camera_is_never_trained_on(rig, caplog):
+    root, _ = rig
+    times = {f"cam{k}/frame_{n:04d}.png": 0.1 * n for k in range(9) for n in (6, 8)}
+    times |= {"cam0/frame_0004.png": 0.4, "cam8/frame_0012.png": 1.2, "cam3/frame_0012.png": 1.0}
+    (root / "times.json").write_text(json.dumps(times))
+    with caplog.at_level("INFO"):
+        dataset = datasets.read(root)
+    assert {v.camera.name for v in dataset.val} == {"cam0", "cam8"} and len(dataset.val) == 4
+    assert {v.camera.name for v in dataset.train} == {f"cam{k}" for k in range(1, 8)} and len(dataset.train) == 15
+    assert "2 images of held-out cameras are left out" in caplog.text
+
+
+def test_where_only_held_out_cameras_are_early_they_are_trained_on(rig):
+    root, _ = rig
+    times = {f"cam{k}/frame_0012.png": 1.2 for k in range(9)} | {"cam0/frame_0004.png": 0.4}
+    (root / "times.json").write_text(json.dumps({"times": times, "t_max": 0.5}))
+    dataset = datasets.read(root)
+    assert [v.name for v in dataset.train] == ["cam0/frame_0004"] and dataset.val == () and len(dataset.test) == 9
+
+
 def test_masks_and_names_lie_beside_the_images(flat):
     root, _ = flat
     images.write_png(root / "object_mask" / "img_03.png", np.full((8, 12, 1), 2, np.uint8))
