@@ -39,6 +39,11 @@ def held_out(times: Sequence[float], every: int, offset: int, sparse: bool = Fal
 
 def derive(data: Path, removed: Collection[float], folder: Path) -> Path:
     """Copy a data set without the training frames at the ``removed`` times; returns its folder."""
+    if not (data / "transforms_train.json").is_file():
+        raise SystemExit(
+            f"{data / 'transforms_train.json'}: expected the camera file of the training split, found none; times of a "
+            "COLMAP data set cannot be held out by this benchmark"
+        )
     copy = folder / data.resolve().name
     shutil.copytree(data, copy)
     path = copy / "transforms_train.json"

@@ -37,6 +37,23 @@ def test_the_copy_lacks_the_frames_of_those_times_and_nothing_else(held_out_time
     assert all(v.mask_path is not None for v in copy.train)
 
 
+def test_data_without_camera_files_are_named(held_out_times, tmp_path):
+    (tmp_path / "data" / "sparse").mkdir(parents=True)
+    with pytest.raises(SystemExit, match=r"transforms_train\.json: expected the camera file .* found none; .*COLMAP"):
+        held_out_times.derive(tmp_path / "data", [0.5], tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+
+
+@pytest.mark.parametrize("variant", ["tracks", "field"])
+def test_steps_are_timed_on_all_observed_times(monkeypatch, tiny, variant):
+    with benchmark_modules.importing(monkeypatch) as load:
+        step = load("step")
+        settings = step.settings(step.VARIANTS[variant], 12000).override(tiny_datasets.SETTINGS)
+        run = step.trainer.Trainer(datasets.read(tiny.root), settings)
+        run.step()
+        assert run.entered == (0, len(tiny_datasets.OBSERVED) - 1)
+
+
 def test_rows_compare_the_same_scene_at_observed_and_at_held_out_times(held_out_times, tiny, baked):
     removed = held_out_times.held_out(tiny_datasets.OBSERVED, 3, 1)
     rows = held_out_times.measure(baked, datasets.read(tiny.root), removed)
