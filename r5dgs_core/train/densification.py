@@ -35,6 +35,7 @@ class Conditions:
         extent: Radius of the cameras, normalised units (`extent_of`).
         eyes: The distinct training cameras, in normalised coordinates.
         generator: Source of the draws; its state is kept by the run.
+        white: Whether a fixed white background is behind everything.
     """
 
     cap: int
@@ -44,6 +45,7 @@ class Conditions:
     extent: float
     eyes: Sequence[Camera]
     generator: torch.Generator
+    white: bool = False
 
 
 class Strategy(Protocol):

@@ -5,6 +5,7 @@ Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -101,6 +102,8 @@ class Share(_Gradients):
 class Adaptive(_Gradients):
     """The default strategy of 3DGS, adaptive density control, under a hard cap; opacities are reset now and then.
 
+    Before a white background they are reset once more as growth begins, so that white Gaussians before white fade.
+
     Args:
         section: Thresholds.
         conditions: What the run tells.
@@ -120,7 +123,8 @@ class Adaptive(_Gradients):
             return
         if iteration > section.start and iteration % section.every == 0:
             self.round(gaussians, optimizer, sizes=section.reset_every > 0 and iteration > section.reset_every)
-        if section.reset_every > 0 and iteration % section.reset_every == 0:
+        begins = self.conditions.white and iteration == section.start
+        if section.reset_every > 0 and (begins or iteration % section.reset_every == 0):
             self.reset(gaussians, optimizer)
 
     @torch.no_grad()
@@ -166,5 +170,6 @@ def make(config: Config, conditions: Conditions, count: int) -> densification.St
     if config.densify.strategy == "mcmc":
         return mcmc.MCMC(config.densify_mcmc, conditions)
     if config.densify.strategy == "default":
-        return Adaptive(config.densify_default, conditions, count)
+        white = conditions.white or config.train.background == "white"
+        return Adaptive(config.densify_default, dataclasses.replace(conditions, white=white), count)
     return Share(config.densify, conditions, count)

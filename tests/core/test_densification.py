@@ -226,6 +226,30 @@ def test_a_reset_lowers_what_is_opaque_and_forgets_its_moments():
     assert optimizer.state[gaussians.means]["exp_avg"].all()
 
 
+@pytest.mark.parametrize(("white", "expected"), [(False, [100, 200]), (True, [30, 100, 200])])
+def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(white, expected):
+    section = DensifyDefaultSection(start=30, every=1000, reset_every=100)
+    place = dataclasses.replace(conditions(iterations=500), white=white)
+    gaussians, optimizer = make()
+    strategy, found = strategies.Adaptive(section, place, 40), []
+    for iteration in range(1, 501):
+        with torch.no_grad():
+            gaussians.opacity_logits.fill_(1.0)
+        strategy.after_step(gaussians, optimizer, iteration, 1e-3)
+        if torch.sigmoid(gaussians.opacity_logits).max() < 0.011:
+            found.append(iteration)
+    assert found == expected
+
+
+@pytest.mark.parametrize("background", ["auto", "learned", "black", "white"])
+def test_a_run_before_white_tells_the_default_strategy(background):
+    config = Config().replace(**{"densify.strategy": "default", "train.background": background})
+    strategy = strategies.make(config, conditions(), 40)
+    assert strategy.conditions.white == (background == "white")
+    told = dataclasses.replace(conditions(), white=True)  # as where images are transparent
+    assert strategies.make(config, told, 40).conditions.white
+
+
 def test_rounds_come_when_the_section_says():
     section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
     strategy = strategies.Adaptive(section, conditions(cap=10**6), 40)
