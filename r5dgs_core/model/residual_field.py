@@ -27,7 +27,7 @@ class Change:
     Attributes:
         rows: The members among all Gaussians. [n] int64
         offsets: Added to the centres. [n, 3]
-        quats: Rotations that go before those of the Gaussians, unit wxyz. [n, 4]
+        quats: Rotations applied to those of the Gaussians (turn q), unit wxyz. [n, 4]
         log_scales: Added to the log scales. [n, 3]
     """
 

@@ -13,9 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from ..motion import rotations
+
 Array = Any  # np.ndarray or torch.Tensor
 
 MAX_DEGREE = 3
+_ROTATED_AT_ONCE = 4096
+_TURN = np.pi * (1 + 5**0.5) * (np.arange(48) + 0.5)
+_HEIGHT = 1 - (2 * np.arange(48) + 1) / 48
+# Directions spread evenly over the sphere. [48, 3]
+_DIRECTIONS = np.stack(
+    [np.sqrt(1 - _HEIGHT**2) * np.cos(_TURN), np.sqrt(1 - _HEIGHT**2) * np.sin(_TURN), _HEIGHT], axis=-1
+)
 
 # Normalisation constants of the real spherical harmonics, in the order of the products in `basis`.
 C0 = 0.5 / math.sqrt(math.pi)
@@ -105,6 +114,31 @@ def rgb_to_dc(rgb: Array) -> Array:
 def dc_to_rgb(dc: Array) -> Array:
     """Inverse of `rgb_to_dc`: the colour averaged over all directions. [..., 3] -> [..., 3]"""
     return 0.5 + C0 * dc
+
+
+def rotate(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Coefficients of colours that turn with their body: the result seen along d is ``sh`` seen along R^T d.
+
+    Bands do not mix, so the change of basis is exact; it is solved from more directions than there are functions.
+
+    Args:
+        sh: Coefficients. [N, K, C]
+        quats: Rotations R, unit wxyz, one for all or one for each. [4] or [N, 4]
+
+    Returns:
+        Coefficients in the turned frame, float64. [N, K, C]
+    """
+    degree = degree_of(sh.shape[-2])
+    if degree == 0 or len(sh) == 0:
+        return sh.astype(np.float64)
+    inverse = np.linalg.pinv(basis(_DIRECTIONS, degree))  # [K, P]
+    result = np.empty(sh.shape, np.float64)
+    for start in range(0, len(sh), _ROTATED_AT_ONCE):
+        rows = slice(start, start + _ROTATED_AT_ONCE)
+        back = rotations.conjugate(quats if quats.ndim == 1 else quats[rows, None])
+        change = inverse @ basis(rotations.rotate(back, _DIRECTIONS), degree)
+        result[rows] = change @ sh[rows]
+    return result
 
 
 def _library(array: Array):

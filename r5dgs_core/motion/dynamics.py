@@ -15,7 +15,17 @@ from . import rotations, se3
 
 Array = rotations.Array
 MAX_STEPS = 512
+TRACE_STEP = 1 / 60  # TRACE's step at playback, in units of time
 CHUNK = 16384
+
+
+def time_unit(first: float, last: float) -> float:
+    """The unit of time that steps are counted in: 1 where observed times lie in [0, 1] and fill a quarter of it (as
+    in the paper's data), else the observed span.
+    """
+    if first >= 0 and last <= 1 and last - first >= 0.25:
+        return 1.0
+    return last - first if last > first else 1.0
 
 
 def rk2(

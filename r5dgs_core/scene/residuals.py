@@ -15,7 +15,6 @@ from ..motion import dynamics, keyframes, rotations
 from .scene import Scene
 
 TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
-TRACE_STEP = 1 / 60  # TRACE's step at playback
 
 
 def deformed(scene: Scene, t: float) -> tuple[Scene, np.ndarray | None]:
@@ -77,13 +76,14 @@ def literal(scene: Scene, tau: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     assert scene.dynamics is not None and scene.canonical_means is not None
     means, quats = scene.means.astype(np.float64), scene.quats.astype(np.float64)
     turns = rotations.identity(len(means))
+    step = dynamics.TRACE_STEP * dynamics.time_unit(float(scene.track_times[0]), scene.t_max)
     for group in scene.groups:
         rows = np.flatnonzero(scene.motion_ids == group.id)
         r = group.anchor_index
         if group.role != "body" or r < 0:
             continue
         v, w, a, e = np.split(scene.dynamics[r].astype(np.float64), 4)
-        moved, turn = dynamics.rk2(np.zeros(3), v, w, a, e, tau, TRACE_STEP)
+        moved, turn = dynamics.rk2(np.zeros(3), v, w, a, e, tau, step)
         offsets = scene.canonical_means[rows].astype(np.float64) - scene.canonical_means[r]
         means[rows] += moved + rotations.rotate(turn, offsets) - offsets
         turns[rows] = turn

@@ -105,7 +105,7 @@ class Scene:
         classifier_bias: Its bias, in the same order. [M + 1] float32 or None
         residual_rows: Gaussians whose observed motion their group does not explain, increasing. [R] int32 or None
         residual_offsets: What is added to their centres at the knots, bind frame. [R, S, 3] float32 or None
-        residual_quats: Rotations that go before those of the bind state at the knots, unit wxyz. [R, S, 4] float32
+        residual_quats: Rotations applied to those of the bind state at the knots (turn q), unit wxyz. [R, S, 4] float32
             or None
         residual_log_scales: What is added to their log scales at the knots. [R, S, 3] float32 or None
         dynamics: Motion of each Gaussian on its own past t_max, for mode "standard": velocity of its centre, angular

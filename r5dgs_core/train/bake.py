@@ -211,9 +211,8 @@ def _bind(
         q, d = group.quats[-1], path[-1]
         cloud.means[members] = center + rotations.rotate(q, cloud.means[members] - center) + d
         cloud.quats[members] = rotations.multiply(q, cloud.quats[members])
-        cloud.sh[members], cloud.shading[members] = shading_vectors.rebind(
-            cloud.sh[members], cloud.shading[members], q, light
-        )
+        turned = spherical_harmonics.rotate(cloud.sh[members], q)
+        cloud.sh[members], cloud.shading[members] = shading_vectors.rebind(turned, cloud.shading[members], q, light)
         pivot = _pivot(cloud.means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
         if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen

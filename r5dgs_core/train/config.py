@@ -171,6 +171,8 @@ def _check(name: str, value: Any, kind: type) -> Any:
 
 def _validate(config: Config) -> None:
     """Raise ConfigError naming the first key whose value no run can use."""
+    if config.train.representation == "field" and config.needs.rotation == "off":
+        raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
     wanted = (config.train.representation, config.field.movers, config.field.tracks_share)
     if config.init.placement == "random" and wanted != ("field", "all", 0.0):
         raise ConfigError(

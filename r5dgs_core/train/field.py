@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import ConfigError
 from ..model import deformation, spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import GroupPoses, Tracks
@@ -75,6 +76,7 @@ class FieldRepresentation:
         self._tracks = tracks
         self._first = first
         self._last: Moved | None = None
+        self._iteration = config.field.warm_up  # of training; a field that is only looked at is past the warm-up
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -82,8 +84,10 @@ class FieldRepresentation:
         return {**_parameters(self.motion), "light": self.light}
 
     def movers(self, gaussians: Gaussians) -> Tensor:
-        """Rows that the networks move. [R] int64"""
-        return _movers(gaussians.motion_ids, self._tracks.bodies, self._config)
+        """Rows that the networks move, none while training warms up. [R] int64"""
+        if self._iteration < self._config.field.warm_up:
+            return torch.zeros(0, dtype=torch.int64)
+        return _movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -103,6 +107,11 @@ class FieldRepresentation:
             colors = harmonics.seen_colors(
                 means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
             )
+            # The harmonics of what moves live in its own frame and turn with it.
+            seen = means.detach()[rows] - torch.from_numpy(np.asarray(camera.center)).float()
+            seen = rotations.rotate(rotations.conjugate(moved.quats.detach()), seen / seen.norm(dim=1, keepdim=True))
+            both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
+            colors = colors.index_copy(0, rows, spherical_harmonics.to_rgb(both, seen))
         if self._config.train.shading:
             change = rotations.rotate(rotations.conjugate(moved.quats), self.light) - self.light
             factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
@@ -124,6 +133,7 @@ class FieldRepresentation:
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
         """Fit field and TRD to the places of the objects, before the first image is looked at."""
         section = self._config.field
+        self._iteration = 0
         if self._tracks.bodies < 2 or section.place_steps == 0:
             return
         rows = self.movers(gaussians)
@@ -172,6 +182,7 @@ class FieldRepresentation:
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Fit the TRD to the motion that the field has by now."""
         section = self._config.field
+        self._iteration = iteration
         every = round(section.trd_every * self._config.train.iterations)
         if section.trd_steps > 0 and every > 0 and iteration % every == 0:
             rows = self.movers(gaussians)
@@ -183,12 +194,14 @@ class FieldRepresentation:
         named = {n: p.detach() for n, p in self.params.items()}
         tracks = self._tracks
         named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
+        named["field.iteration"] = torch.tensor(self._iteration)
         return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
         _load(self.motion, tensors)
         self.light = tensors["light"].clone().requires_grad_(True)
+        self._iteration = int(tensors["field.iteration"])
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
@@ -207,7 +220,7 @@ class FieldRepresentation:
         return field_baking.observed_motion(
             motion,
             gaussians,
-            _movers(gaussians["motion_ids"], int(tensors["field.bodies"]), config),
+            _movers(gaussians["motion_ids"], int(tensors["field.bodies"]), tensors["field.times"].numpy(), config),
             labels,
             object_ids,
             observed,
@@ -228,14 +241,20 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
     section = config.field
     first, last = float(times[0]), float(times[-1])
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    clock = Clock.of(times)
+    if section.horizon and len(times) > 1 and not first < section.horizon <= last:
+        raise ConfigError(
+            f"field.horizon: expected a time after the first observed one, {first:g}, and up to the last, {last:g}; "
+            f"got {section.horizon:g}"
+        )
     generator = torch.Generator().manual_seed(config.train.seed)
     return Motion(
         deformation.DeformationField(deformation.SHAPES[section.size], generator),
         TRD(TRD_SHAPES[section.size], generator),
-        Clock.of(times),
+        clock,
         first,
         min(section.horizon or first + HORIZON * (last - first), last),
-        section.step or 2 * spacing,
+        section.step * clock.scale or 2 * spacing,
         section.chunk,
     )
 
@@ -253,9 +272,9 @@ def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
         parameter.copy_(tensors[name])
 
 
-def _movers(motion_ids: Tensor, bodies: int, config: Config) -> Tensor:
-    """Rows that the networks move; none where the user says that nothing does. [R] int64"""
-    if config.needs.tracks == "off":
+def _movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -> Tensor:
+    """Rows that the networks move; none at a single time, and where the user says that nothing does. [R] int64"""
+    if config.needs.tracks == "off" or len(times) < 2:
         return torch.zeros(0, dtype=torch.int64)
     if config.field.movers == "all" or bodies < 2:
         return torch.arange(len(motion_ids))
@@ -306,6 +325,7 @@ def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tenso
             return
         sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
         vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
+        sh = spherical_harmonics.rotate(sh, turns)
         sh, vectors = shading.rebind(sh, vectors, turns, light.double().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
         gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))

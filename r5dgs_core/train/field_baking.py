@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..model import spherical_harmonics
 from ..motion import poses, rotations, se3
 from . import shading
 from .field_motion import Motion
@@ -69,6 +70,7 @@ def observed_motion(
         bind[name][rows.numpy()] = value
     sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows.numpy()]
     since = states[-1].quats.numpy().astype(np.float64)
+    sh = spherical_harmonics.rotate(sh, since)
     sh, vectors = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), since, light)
     for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
         bind[name][rows.numpy()] = value

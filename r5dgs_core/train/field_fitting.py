@@ -16,10 +16,10 @@ from ..model.tracks import Tracks
 from ..model.trd import MotionState
 from ..motion import rotations
 from .field_motion import Motion
+from .rigidity import QUAT_WEIGHT
 
 ROWS = 512  # Gaussians per step of a fit
 RATE = 2e-3
-QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 
 
 def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tensor]) -> None:

@@ -15,8 +15,6 @@ from ..model import deformation
 from ..model.trd import TRD, MotionState
 from ..motion import dynamics, rotations
 
-PLAYBACK_STEP = 1 / 60  # scene time per step of the TRD where a picture is wanted
-
 
 @dataclass(frozen=True)
 class Clock:
@@ -29,9 +27,8 @@ class Clock:
     def of(times: np.ndarray) -> Clock:
         """The clock of the observed times: the identity where they lie in [0, 1] and fill a quarter of it."""
         first, last = float(times[0]), float(times[-1])
-        if first >= 0 and last <= 1 and last - first >= 0.25:
-            return Clock(0.0, 1.0)
-        return Clock(first, max(last - first, 1e-9))
+        scale = dynamics.time_unit(first, last)
+        return Clock(0.0 if scale == 1.0 else first, scale)
 
     def __call__(self, t: float) -> float:
         return (t - self.origin) / self.scale
@@ -91,7 +88,8 @@ class Motion:
     def at(self, means: Tensor, t: float) -> deformation.Deltas:
         """Where Gaussians are at any time: by the field up to T, by the TRD from there on."""
         deltas = self.deltas(means, t)
-        return deltas if t <= self.horizon else self.through(means, self.horizon, t, PLAYBACK_STEP)
+        step = dynamics.TRACE_STEP * self.clock.scale
+        return deltas if t <= self.horizon else self.through(means, self.horizon, t, step)
 
     def through(self, means: Tensor, start: float, t: float, step: float) -> deformation.Deltas:
         """By the field to ``start``, by the TRD from there to ``t``. The TRD's start has no gradient."""

@@ -120,10 +120,12 @@ def start(
         carved = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         clouds.append((*carved, row + 1))
     scenes = sweep.backdrops(views)
-    search = sweep.Sweep(scenes, init.background_points, init.sweep_depths)
+    # Points at random need the sweep for the sky and the plane alone.
+    swept = min(init.background_points, 5000) if at_random else init.background_points
+    search = sweep.Sweep(scenes, swept, init.sweep_depths)
     eyes = np.stack([v.camera.center for v in views])
     plane = supporting_plane(search.distinct_points(), places, eyes, rng)
-    placed = search.place(init.background_points, plane, find_sky, rng)
+    placed = search.place(swept, plane, find_sky, rng)
     where, shade = placed.points, placed.colors
     if at_random:
         where, shade = scatter.everywhere(scenes, init.background_points, rng)

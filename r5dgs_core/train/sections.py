@@ -136,8 +136,10 @@ class FieldSection:
         size: Networks: ``complex`` (8 x 256 and 10 x 256, the paper's), ``light`` (6 x 128 and 8 x 128) or ``small``
             (4 x 128 and 5 x 64, for processors).
         horizon: Scene time up to which the deformation field reaches; later observed frames supervise the
-            extrapolation. 0 takes 14/15 of the last observed time, as 0.70 of 0.75.
-        step: Scene time that the TRD bridges in a training step; 0 takes two observed intervals.
+            extrapolation. 0 leaves out the last fifteenth of the observed span, as 0.70 of 0.75.
+        step: Time that the TRD bridges in a training step: plain where times lie in [0, 1], else as a share of the
+            observed span; 0 takes two observed intervals.
+        warm_up: Steps without deformation, so that the first time is the canonical state.
         trd_share: Share of the steps within the horizon that go through the TRD; 1 is TRACE's scheme.
         movers: Gaussians that the networks move: ``all``, or ``labelled``: those that the masks put on an object
             or in its shadow; the others stand still exactly.
@@ -155,6 +157,7 @@ class FieldSection:
     size: str = "small"
     horizon: float = 0.0
     step: float = 0.0
+    warm_up: int = 0
     trd_share: float = 0.5
     movers: str = "labelled"
     place_steps: int = 300

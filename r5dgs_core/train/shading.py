@@ -18,7 +18,7 @@ def rebind(sh: np.ndarray, shading: np.ndarray, quats: np.ndarray, light: np.nda
     """Colours and shading vectors as seen from a turned state.
 
     Args:
-        sh: Harmonics. [N, K, 3]
+        sh: Harmonics, in the frame of the new state already (`spherical_harmonics.rotate`). [N, K, 3]
         shading: The vectors g. [N, 3]
         quats: Rotation Q from the old state to the new one, unit wxyz, one for all or one for each. [4] or [N, 4]
         light: The vector l. [3]

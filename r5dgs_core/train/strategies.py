@@ -5,7 +5,6 @@ Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import torch
@@ -170,6 +169,5 @@ def make(config: Config, conditions: Conditions, count: int) -> densification.St
     if config.densify.strategy == "mcmc":
         return mcmc.MCMC(config.densify_mcmc, conditions)
     if config.densify.strategy == "default":
-        white = conditions.white or config.train.background == "white"
-        return Adaptive(config.densify_default, dataclasses.replace(conditions, white=white), count)
+        return Adaptive(config.densify_default, conditions, count)
     return Share(config.densify, conditions, count)

@@ -116,6 +116,7 @@ class Trainer:
             extent=densification.extent_of(eyes),
             eyes=eyes,
             generator=self.generator,
+            white=behind is not None and bool((behind == 1).all()),
         )
         self.growth = strategies.make(config, conditions, len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
@@ -389,7 +390,9 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        if state.representation == field.FieldRepresentation.name and isinstance(self.motion, TracksRepresentation):
+        asked = self.config.train.representation == field.FieldRepresentation.name
+        if asked and state.representation == self.config.train.representation != self.motion.name:
+            assert isinstance(self.motion, TracksRepresentation)
             self.motion = field.FieldRepresentation(self.motion.tracks, self.first_time, self.config)
         if state.representation != self.motion.name:
             raise CheckpointError(

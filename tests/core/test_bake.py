@@ -66,6 +66,9 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
         draws = torch.Generator().manual_seed(1)
         rest = state.tensors["gaussians.sh_rest"]
         rest += 0.2 * torch.randn(rest.shape, generator=draws)
+        base = state.tensors["tracks.base_quats"]  # and bodies that have turned far at t_max
+        angles = torch.linspace(0.4, 1.9, base.shape[1])[:, None] * torch.tensor([0.3, 0.5, 0.8])
+        base[1:] = rotations.multiply(rotations.rotvecs_to_quats(angles), base[1:])
         checkpoint.save(made.folder, state)
     scene = bake.bake(made)
     assert not scene.provenance["train"]["finished"] and scene.identities is None

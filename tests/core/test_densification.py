@@ -241,15 +241,6 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
     assert found == expected
 
 
-@pytest.mark.parametrize("background", ["auto", "learned", "black", "white"])
-def test_a_run_before_white_tells_the_default_strategy(background):
-    config = Config().replace(**{"densify.strategy": "default", "train.background": background})
-    strategy = strategies.make(config, conditions(), 40)
-    assert strategy.conditions.white == (background == "white")
-    told = dataclasses.replace(conditions(), white=True)  # as where images are transparent
-    assert strategies.make(config, told, 40).conditions.white
-
-
 def test_rounds_come_when_the_section_says():
     section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
     strategy = strategies.Adaptive(section, conditions(cap=10**6), 40)

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.trd import MotionState
 from r5dgs_core.motion import rotations
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import playback, validation
-from r5dgs_core.train import bake, checkpoint, field, field_fitting, run
+from r5dgs_core.train import bake, checkpoint, config, field, field_fitting, run
 from r5dgs_core.train.field_motion import Clock
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
@@ -252,6 +253,51 @@ def test_nothing_moves_where_the_user_says_that_nothing_does(tiny):
     assert torch.equal(early, late) and torch.equal(early, trainer.gaussians.means)
 
 
+def test_the_paper_trains_the_canonical_state_first(tiny):
+    trainer = make(tiny, "field.warm_up=6", "train.iterations=20", "field.place_steps=0", "field.trd_steps=0")
+    start = {n: p.detach().clone() for n, p in trainer.motion.params.items()}
+    for _ in range(6):
+        trainer.step()
+    assert all(torch.equal(start[n], p) for n, p in trainer.motion.params.items() if n != "light")
+    state = trainer.state()
+    other = make(tiny, "field.warm_up=6", "train.iterations=20", "field.place_steps=0", "field.trd_steps=0")
+    other.restore(state)
+    for _ in range(2):
+        trainer.step()
+        other.step()
+    assert any(not torch.equal(start[n], p) for n, p in trainer.motion.params.items())
+    assert all(torch.equal(p, other.motion.params[n]) for n, p in trainer.motion.params.items())
+
+
+@pytest.mark.parametrize("horizon", [-0.1, 0.9])
+def test_a_horizon_outside_the_observed_times_is_refused(tiny, horizon):
+    settings = config.from_dict({"train": {"representation": "field"}})
+    with pytest.raises(ConfigError, match="field.horizon"):
+        field._motion_of(
+            np.linspace(0, 0.75, 6),
+            dataclasses.replace(settings, field=dataclasses.replace(settings.field, horizon=horizon)),
+        )
+
+
+def test_harmonics_of_what_moves_turn_with_it(tiny, tmp_path):
+    """The scene plays colours that depend on the view as the trainer draws them, also of bodies that turned."""
+    settings = tiny_datasets.settings(*FIELD, "train.sh_degree=2", "train.shading=false", "train.iterations=60")
+    made = run.train(tiny.root, tmp_path / "run", settings)
+    state = checkpoint.load(made.folder)
+    rest = state.tensors["gaussians.sh_rest"]
+    rest += 0.2 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(1))
+    checkpoint.save(made.folder, state)
+    scene = bake.bake(made, datasets.read(tiny.root))
+    trainer = Trainer(datasets.read(tiny.root), made.config)
+    trainer.restore(checkpoint.load(made.folder))
+    view = trainer.views[0]
+    camera = trainer.dataset.train[0].camera
+    with torch.no_grad():
+        expected = trainer.render(view.camera, scene.t_max).numpy()
+    shown = scene_render.render_frame(scene, playback.frame(scene, scene.t_max), camera).color.numpy()
+    assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
+
+
 def test_at_a_single_time_a_field_is_a_still_scene(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path)
     known = datasets.read(data.root)
@@ -259,7 +305,9 @@ def test_at_a_single_time_a_field_is_a_still_scene(tmp_path):
     trainer = Trainer(once, tiny_datasets.settings(*FIELD, "train.iterations=30"))
     while not trainer.done:
         trainer.step()
-    assert torch.isfinite(trainer.gaussians.means).all()
+    with torch.no_grad():
+        early, late = (trainer.splats(trainer.views[0].camera, t).means for t in (-1.0, 50.0))
+    assert torch.equal(early, late) and torch.isfinite(late).all()
 
 
 def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):

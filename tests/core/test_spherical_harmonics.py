@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from r5dgs_core.model import spherical_harmonics as harmonics
+from r5dgs_core.motion import rotations
 
 
 def sphere_quadrature(n=16):
@@ -76,3 +77,17 @@ def test_other_counts_are_refused():
         harmonics.evaluate(np.zeros((2, 5, 3)), np.zeros((2, 3)))
     with pytest.raises(ValueError, match="0 to 3, got 4"):
         harmonics.basis(np.zeros((2, 3)), 4)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_turned_coefficients_show_from_a_turned_direction_what_the_old_ones_showed(degree):
+    draws = np.random.default_rng(degree)
+    sh = draws.normal(size=(5, (degree + 1) ** 2, 3))
+    quats = rotations.normalize(draws.normal(size=(5, 4)))
+    directions = draws.normal(size=(5, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = harmonics.rotate(sh, quats)
+    seen = harmonics.evaluate(turned, rotations.rotate(quats, directions))
+    np.testing.assert_allclose(seen, harmonics.evaluate(sh, directions), atol=1e-12)
+    one = harmonics.rotate(sh, quats[2])
+    np.testing.assert_allclose(one[2], turned[2], atol=1e-12)
