@@ -17,6 +17,7 @@ from ..scene.scene import MotionGroup
 from .groups import PointMotion
 from .normalization import Normalization
 
+AT_ONCE = 8192  # Gaussians that are related to their groups at once; bounds memory
 VISIBLE = 1e-4  # residuals below this share of the scene's size, and below this angle or log scale, are left out
 
 
@@ -50,31 +51,42 @@ def members(
         result["dynamics"] = (points.dynamics * linear)[order].astype(np.float32)
         if points.canonical is not None:
             result["canonical_means"] = norm.points_to_world(points.canonical)[order].astype(np.float32)
-    ids = motion_ids[points.rows]
-    quats, shifts = track_poses[ids, :, :4], track_poses[ids, :, 4:]
-    pivot = pivots[ids][:, None]
-    world = norm.points_to_world(points.means)
-    back = rotations.conjugate(quats)
-    before = pivot + rotations.rotate(back, world - pivot - shifts)
-    offsets = before - world[:, -1:]
-    turns = rotations.multiply(rotations.multiply(back, points.quats), rotations.conjugate(points.quats[:, -1:]))
-    turns = rotations.normalize(turns)
-    growths = points.log_scales - points.log_scales[:, -1:]
+    rank = np.argsort(order)[points.rows]
+    parts = []
+    for chosen in np.array_split(np.argsort(rank), max(1, -(-len(rank) // AT_ONCE))):  # in the scene's order
+        ids = motion_ids[points.rows[chosen]]
+        offsets, turns, growths = _relative(points, chosen, norm, track_poses[ids], pivots[ids])
+        seen = np.abs(offsets).max((1, 2), initial=0.0) > VISIBLE * extent
+        seen |= np.abs(growths).max((1, 2), initial=0.0) > VISIBLE
+        seen |= rotations.angle_between(turns, turns[:, -1:]).max(1, initial=0.0) > VISIBLE
+        stored = (offsets[seen], turns[seen], growths[seen])
+        parts.append((rank[chosen[seen]].astype(np.int32), *(part.astype(np.float32) for part in stored)))
+    names = ("residual_rows", "residual_offsets", "residual_quats", "residual_log_scales")
+    found = {name: np.concatenate(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
+    return result | found if len(found["residual_rows"]) else result
+
+
+def _relative(
+    points: PointMotion, chosen: np.ndarray, norm: Normalization, poses: np.ndarray, pivots: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals of some Gaussians: offsets [R, S, 3], rotations with continuous signs [R, S, 4], growths [R, S, 3].
+
+    Args:
+        points: States at the knots, training coordinates.
+        chosen: Which of its rows. [R]
+        norm: From training coordinates to the world.
+        poses: Of their groups, relative to the bind state. [R, S, 7]
+        pivots: Of their groups, world. [R, 3]
+    """
+    pivot, world = pivots[:, None], norm.points_to_world(points.means[chosen])
+    back = rotations.conjugate(poses[..., :4])
+    offsets = pivot + rotations.rotate(back, world - pivot - poses[..., 4:]) - world[:, -1:]
+    quats = points.quats[chosen]
+    turns = rotations.normalize(rotations.multiply(rotations.multiply(back, quats), rotations.conjugate(quats[:, -1:])))
+    growths = points.log_scales[chosen] - points.log_scales[chosen][:, -1:]
     offsets[:, -1], growths[:, -1], turns[:, -1] = 0.0, 0.0, [1.0, 0, 0, 0]
-    seen = np.abs(offsets).max((1, 2)) > VISIBLE * extent
-    seen |= np.abs(growths).max((1, 2)) > VISIBLE
-    seen |= rotations.angle_between(turns, turns[:, -1:]).max(1) > VISIBLE
-    if not seen.any():
-        return result
-    rank = np.argsort(order)[points.rows[seen]]
-    increasing = np.argsort(rank)
-    kept = np.flatnonzero(seen)[increasing]
-    flat = np.moveaxis(rotations.make_continuous(np.moveaxis(turns[kept][:, ::-1], 1, 0)), 0, 1)[:, ::-1]
-    result["residual_rows"] = rank[increasing].astype(np.int32)
-    result["residual_offsets"] = offsets[kept].astype(np.float32)
-    result["residual_quats"] = np.ascontiguousarray(flat).astype(np.float32)
-    result["residual_log_scales"] = growths[kept].astype(np.float32)
-    return result
+    backwards = np.moveaxis(turns[:, ::-1], 1, 0)  # signs go on from the last knot, the identity
+    return offsets, np.moveaxis(rotations.make_continuous(backwards), 0, 1)[:, ::-1], growths
 
 
 def departures(
