@@ -76,7 +76,7 @@ def is_on(table: Sequence[dict[str, Any]], name: str) -> bool:
 
 def decide(
     groups: Sequence[MotionGroup],
-    track_poses: Sequence[np.ndarray],
+    track_poses: Sequence[np.ndarray] | np.ndarray,
     motion_ids: np.ndarray,
     shading: np.ndarray,
     light: np.ndarray,
