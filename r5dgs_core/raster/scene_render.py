@@ -274,4 +274,4 @@ def _shading(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray:
         return np.ones(rows.stop - rows.start, np.float32)
     light = np.asarray(scene.light_direction, np.float64)
     change = (rotation.T @ light - light).astype(np.float32)
-    return np.maximum(1 + scene.shading[rows] @ change, 0)
+    return np.maximum(playback.rest_factors(scene)[rows] + scene.shading[rows] @ change, 0)

@@ -177,8 +177,14 @@ def _relight(scene: Scene, posed: Frame, rows: np.ndarray, turns: np.ndarray) ->
         return posed
     change = rotations.rotate(rotations.conjugate(turns), light) - light
     factor = posed.shading_factor.copy()
-    factor[rows] = np.maximum(1 + (vectors[rows] * change).sum(-1), 0)
+    factor[rows] = np.maximum(rest_factors(scene)[rows] + (vectors[rows] * change).sum(-1), 0)
     return dataclasses.replace(posed, shading_factor=factor)
+
+
+def rest_factors(scene: Scene) -> np.ndarray:
+    """Factor of each Gaussian's colour in the bind state, before it is bounded at 0. [N] float32"""
+    rest = scene.shading_rest
+    return np.ones(len(scene.means), np.float32) if rest is None else rest
 
 
 def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:
@@ -192,7 +198,8 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
     """
     means, quats = scene.means, scene.quats
     gradients, light = scene.shading, scene.light_direction
-    shading = None if gradients is None or light is None else np.ones(len(means), np.float32)
+    rest = rest_factors(scene)
+    shading = None if gradients is None or light is None else np.maximum(rest, 0)
     rotmats = rotations.quats_to_rotmats(group_quats)
     moved = np.flatnonzero((group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1))
     if len(moved):
@@ -206,7 +213,7 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         turn_quats(scene.quats[rows], group_quats[g], quats[rows])
         if shading is not None and gradients is not None and light is not None:
             change = (rotmats[g].T @ light - light).astype(np.float32)
-            shading[rows] = np.maximum(1 + gradients[rows] @ change, 0)
+            shading[rows] = np.maximum(rest[rows] + gradients[rows] @ change, 0)
     return Frame(
         t=float(t),
         means=means,

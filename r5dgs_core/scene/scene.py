@@ -111,7 +111,10 @@ class Scene:
         dynamics: Motion of each Gaussian on its own past t_max, for mode "standard": velocity of its centre, angular
             velocity and the rates of both, about its centre at t_max. [N, 12] float32 or None
         canonical_means: Centres in the canonical state, for mode "rigid_paper", world. [N, 3] float32 or None
-        shading: How the colour changes as the group turns: factor 1 + (R^T l - l) . g. [N, 3] float32 or None
+        shading: How the colour changes as the group turns: factor rest + (R^T l - l) . g, not below 0. [N, 3] float32
+            or None
+        shading_rest: That factor in the bind state; None where it is 1 for all. A Gaussian that is unlit at t_max has
+            one below 0. [N] float32 or None
         light_direction: l above, unit, world. [3]
         embeddings: One row per object of ``objects``, unit. [M, D] or None
         vocabulary: Words with stored embeddings.
@@ -148,6 +151,7 @@ class Scene:
     dynamics: np.ndarray | None = None
     canonical_means: np.ndarray | None = None
     shading: np.ndarray | None = None
+    shading_rest: np.ndarray | None = None
     light_direction: np.ndarray | None = None
     embeddings: np.ndarray | None = None
     vocabulary: tuple[str, ...] = ()

@@ -49,6 +49,7 @@ _MEMORY_DTYPES: dict[str, type] = {
     "dynamics": np.float32,
     "canonical_means": np.float32,
     "shading": np.float32,
+    "shading_rest": np.float32,
     "embeddings": np.float32,
     "vocabulary_embeddings": np.float32,
 }
@@ -63,6 +64,7 @@ _OPTIONAL = (
     "dynamics",
     "canonical_means",
     "shading",
+    "shading_rest",
     "embeddings",
     "vocabulary_embeddings",
 )

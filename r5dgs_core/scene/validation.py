@@ -49,6 +49,7 @@ def check(scene: Scene, place: str) -> None:
         "dynamics": ((count, 12), np.float32),
         "canonical_means": ((count, 3), np.float32),
         "shading": ((count, 3), np.float32),
+        "shading_rest": ((count,), np.float32),
         "light_direction": ((3,), None),
         "embeddings": ((len(scene.objects), None), None),
         "vocabulary_embeddings": ((len(scene.vocabulary), None), None),
@@ -123,6 +124,8 @@ def _check_units(scene: Scene, place: str) -> None:
             _fail(place, name, "unit quaternions wxyz", f"norm {norms[off[0]]:.6g} in row {off[0]}")
     if scene.light_direction is not None and abs(np.linalg.norm(scene.light_direction) - 1) > _UNIT_TOLERANCE:
         _fail(place, "light_direction", "a unit vector", scene.light_direction)
+    if scene.shading_rest is not None and scene.shading is None:
+        _fail(place, "shading", "an array beside 'shading_rest'", "none")
     if scene.shading is not None and scene.light_direction is None:
         _fail(place, "light_direction", "a unit vector beside 'shading'", "none")
 

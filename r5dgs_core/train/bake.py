@@ -106,6 +106,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         classifier_weight=tensors["classifier.weight"].numpy() if identities is not None else None,
         classifier_bias=tensors["classifier.bias"].numpy() if identities is not None else None,
         shading=cloud.shading[order].astype(np.float32) if keep_shading else None,
+        shading_rest=cloud.rest[order].astype(np.float32) if keep_shading and (cloud.rest != 1).any() else None,
         light_direction=light if keep_shading else None,
         provenance={
             "config": run.config.to_dict(),
@@ -135,6 +136,7 @@ class _Cloud:
         opacity_logits: [N]
         sh: [N, K, 3] float64
         shading: [N, 3] float64
+        rest: Factor of the colour at rest. [N] float64
         motion_ids: [N] int32
         object_ids: [N] int32
         identities: [N, 16] or None
@@ -146,6 +148,7 @@ class _Cloud:
     opacity_logits: np.ndarray
     sh: np.ndarray
     shading: np.ndarray
+    rest: np.ndarray
     motion_ids: np.ndarray
     object_ids: np.ndarray
     identities: np.ndarray | None
@@ -186,6 +189,7 @@ def _observed(
         opacity_logits=g["opacity_logits"],
         sh=sh[:, :1] if wanted.view_dependent_colour == "off" else sh,
         shading=g["shading"].astype(np.float64),
+        rest=g.get("shading_rest", np.ones(len(g["means"]))).astype(np.float64),
         motion_ids=g["motion_ids"].astype(np.int32),
         object_ids=present[labels].astype(np.int32),
         identities=identities,
@@ -212,7 +216,9 @@ def _bind(
         cloud.means[members] = center + rotations.rotate(q, cloud.means[members] - center) + d
         cloud.quats[members] = rotations.multiply(q, cloud.quats[members])
         turned = spherical_harmonics.rotate(cloud.sh[members], q)
-        cloud.sh[members], cloud.shading[members] = shading_vectors.rebind(turned, cloud.shading[members], q, light)
+        cloud.sh[members], cloud.shading[members], cloud.rest[members] = shading_vectors.rebind(
+            turned, cloud.shading[members], cloud.rest[members], q, light
+        )
         pivot = _pivot(cloud.means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
         if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen

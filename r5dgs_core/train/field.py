@@ -326,7 +326,8 @@ def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tenso
         sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
         vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
         sh = spherical_harmonics.rotate(sh, turns)
-        sh, vectors = shading.rebind(sh, vectors, turns, light.double().numpy())
+        # What is unlit at that time starts dark; training goes on from there with factors of 1 at rest.
+        sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
         gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))
         gaussians.shading.copy_(torch.from_numpy(vectors))

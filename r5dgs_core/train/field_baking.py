@@ -71,7 +71,10 @@ def observed_motion(
     sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows.numpy()]
     since = states[-1].quats.numpy().astype(np.float64)
     sh = spherical_harmonics.rotate(sh, since)
-    sh, vectors = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), since, light)
+    ones = np.ones(len(sh))
+    sh, vectors, lit = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), ones, since, light)
+    bind["shading_rest"] = np.ones(len(labels))
+    bind["shading_rest"][rows.numpy()] = lit
     for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
         bind[name][rows.numpy()] = value
     motion_ids = np.zeros(len(labels), np.int64)

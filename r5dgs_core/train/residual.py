@@ -221,7 +221,10 @@ def point_motion(
         if s == len(tracks.times) - 1:
             sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1)[rows]
             since, light = change.quats.numpy().astype(np.float64), tensors["light"].numpy().astype(np.float64)
-            sh, vectors = shading_vectors.rebind(sh, bind["shading"][rows], since, light)
+            ones = np.ones(len(rows))
+            sh, vectors, lit = shading_vectors.rebind(sh, bind["shading"][rows], ones, since, light)
+            bind["shading_rest"] = np.ones(len(bind["means"]))
+            bind["shading_rest"][rows] = lit
             state = {"means": means.numpy(), "quats": quats.numpy(), "log_scales": sizes.numpy()}
             for name, value in (state | {"sh": sh[:, :1], "sh_rest": sh[:, 1:], "shading": vectors}).items():
                 bind[name][rows] = value
