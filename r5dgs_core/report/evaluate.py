@@ -6,6 +6,7 @@ to 8 bits before they are measured, as a file would hold them.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import optimize
 
 from ..data import dataset as datasets
 from ..data import images
@@ -197,6 +199,8 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
     times = ground_truth.times
     observed = (times <= scene.t_max + 1e-9) & (times >= scene.track_times[0] - 1e-9)
     poses = [playback.group_poses(scene, float(t)) for t in times]
+    if scene.provenance.get("discovered"):
+        ground_truth = _renumbered(scene, ground_truth)
     for object_id, name, truth in zip(ground_truth.object_ids, ground_truth.names, ground_truth.matrices, strict=True):
         row = rows.setdefault(
             object_id, {"id": object_id, "name": name, "position_error": None, "rotation_error_deg": None}
@@ -210,6 +214,27 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
         position, angle = metrics.aligned_pose_error(motion, truth, seen if seen.any() else observed, group.pivot)
         row["position_error"], row["rotation_error_deg"] = position, angle
     return [rows[key] for key in sorted(rows)]
+
+
+def _renumbered(scene: Scene, ground_truth: datasets.GroundTruth) -> datasets.GroundTruth:
+    """The ground truth of those objects that a scene found by itself, with the ids that they have there.
+
+    Nobody named what was found, so places decide: at the time of the truth that is nearest to the bind state each
+    object is the one that is nearest to it, no further off than the radius of that group.
+    """
+    bodies = [group for group in scene.groups if group.role == "body" and group.object_id > 0]
+    at = int(np.argmin(np.abs(ground_truth.times - scene.t_max)))
+    places = ground_truth.matrices[:, at, :3, 3]
+    pivots = np.array([group.pivot for group in bodies]).reshape(-1, 3)
+    distances = np.linalg.norm(places[:, None] - pivots, axis=-1)  # [true objects, bodies]
+    pairs = zip(*optimize.linear_sum_assignment(distances), strict=True)
+    kept = [(i, k) for i, k in pairs if distances[i, k] <= bodies[k].model.radius]
+    return dataclasses.replace(
+        ground_truth,
+        object_ids=tuple(bodies[k].object_id for _, k in kept),
+        names=tuple(ground_truth.names[i] for i, _ in kept),
+        matrices=ground_truth.matrices[[i for i, _ in kept]],
+    )
 
 
 def _body(scene: Scene, object_id: int) -> MotionGroup | None:

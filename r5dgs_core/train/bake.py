@@ -23,7 +23,7 @@ from ..model import spherical_harmonics
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, needs, point_baking, representation, residual
+from . import checkpoint, groups, mask_stack, needs, point_baking, representation, residual
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -45,6 +45,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     dataset = dataset if dataset is not None else datasets.read(run.data())
     state = checkpoint.load(run.folder)
     tensors, wanted = state.tensors, run.config.needs
+    found = mask_stack.NAME in tensors  # objects that nobody named: their ids mean nothing to the data set
+    if found:
+        dataset = dataclasses.replace(dataset, object_names={}, object_aliases={})
     norm = Normalization(np.array(state.origin), state.scale)
     cloud, motion = _observed(run, state, norm)
     light, strength = _unit(motion.light)
@@ -112,6 +115,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
             "config": run.config.to_dict(),
             "dataset_digest": run.digest,
             "versions": run.versions,
+            "discovered": found,
             "train": {
                 "seconds": state.seconds,
                 "iterations": state.iteration,

@@ -28,6 +28,7 @@ from .sections import (
     DensifyDefaultSection,
     DensifyMcmcSection,
     DensifySection,
+    DiscoverySection,
     FieldSection,
     IdentitySection,
     InitSection,
@@ -52,6 +53,7 @@ class Config:
     densify: DensifySection = dataclasses.field(default_factory=DensifySection)
     densify_default: DensifyDefaultSection = dataclasses.field(default_factory=DensifyDefaultSection)
     densify_mcmc: DensifyMcmcSection = dataclasses.field(default_factory=DensifyMcmcSection)
+    discovery: DiscoverySection = dataclasses.field(default_factory=DiscoverySection)
     residual: ResidualSection = dataclasses.field(default_factory=ResidualSection)
     identity: IdentitySection = dataclasses.field(default_factory=IdentitySection)
     needs: NeedsSection = dataclasses.field(default_factory=NeedsSection)
@@ -173,11 +175,11 @@ def _validate(config: Config) -> None:
     """Raise ConfigError naming the first key whose value no run can use."""
     if config.train.representation == "field" and config.needs.rotation == "off":
         raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
-    wanted = (config.train.representation, config.field.movers, config.field.tracks_share)
-    if config.init.placement == "random" and wanted != ("field", "all", 0.0):
+    everything = config.train.representation == "field" and config.field.movers in ("all", "measured")
+    if config.init.placement == "random" and (not everything or config.field.tracks_share > 0):
         raise ConfigError(
             "init.placement: random places nothing on objects, so it needs train.representation='field', "
-            "field.movers='all' and field.tracks_share=0"
+            "field.movers='all' or 'measured', and field.tracks_share=0"
         )
     for name, good, expected in _RULES:
         section, key = name.split(".")
@@ -216,6 +218,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("field.variant", lambda value: value in VARIANTS, " or ".join(VARIANTS)),
     ("field.size", lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),
     ("field.movers", lambda value: value in MOVERS, " or ".join(MOVERS)),
+    ("field.gate", *_SHARE),
     ("field.trd_share", *_SHARE),
     ("field.trd_every", *_SHARE),
     ("field.tracks_share", lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
@@ -246,6 +249,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("curriculum.newest", *_SHARE),
     ("init.placement", lambda value: value in PLACEMENTS, " or ".join(PLACEMENTS)),
     ("densify.strategy", lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
+    ("discovery.gate", *_SHARE),
+    ("discovery.fewest", *_AT_LEAST_1),
     ("residual.start", *_SHARE),
     ("residual.trial_steps", *_AT_LEAST_1),
     ("residual.nodes", *_AT_LEAST_1),

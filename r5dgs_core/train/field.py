@@ -13,6 +13,7 @@ loss are ours.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,11 +30,13 @@ from ..model.trd import TRD
 from ..motion import rotations
 from ..raster import harmonics
 from ..scene.cameras import Camera
-from . import field_baking, field_fitting, posing, rigidity, shading
+from . import field_baking, field_fitting, gating, posing, rigidity, shading
 from .config import Config
 from .field_motion import Clock, Motion
 from .groups import ObservedMotion
 from .tracks_representation import TracksRepresentation
+
+log = logging.getLogger(__name__)
 
 HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
 
@@ -83,11 +86,15 @@ class FieldRepresentation:
         """Weights of both networks, and the light of the shading."""
         return {**_parameters(self.motion), "light": self.light}
 
+    @property
+    def _measured(self) -> bool:
+        return gating.kind(self._tracks.bodies, self._config) == "measured"
+
     def movers(self, gaussians: Gaussians) -> Tensor:
         """Rows that the networks move, none while training warms up. [R] int64"""
         if self._iteration < self._config.field.warm_up:
             return torch.zeros(0, dtype=torch.int64)
-        return _movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
+        return gating.movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -134,12 +141,21 @@ class FieldRepresentation:
         """Fit field and TRD to the places of the objects, before the first image is looked at."""
         section = self._config.field
         self._iteration = 0
+        gating.release(gaussians, self._tracks, self._config)
         if self._tracks.bodies < 2 or section.place_steps == 0:
             return
+        self.fit(gaussians, self._tracks, section.place_steps, section.trd_steps, draw)
+
+    def fit(
+        self, gaussians: Gaussians, tracks: Tracks, field_steps: int, trd_steps: int, draw: torch.Generator
+    ) -> None:
+        """Fit field and TRD to the motion of tracks, without images; what belongs to no body is fitted to rest."""
         rows = self.movers(gaussians)
-        means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
-        field_fitting.fit_field(self.motion, means, groups, self._tracks, self._first, section.place_steps, draw)
-        field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
+        means, ids = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+        groups = gating.bodies_of(ids, tracks, 0)
+        field_fitting.fit_field(self.motion, means, groups, tracks, self._first, field_steps, draw)
+        groups = gating.bodies_of(ids, tracks, field_fitting.ALONE)
+        field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
     def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> Moved:
         """Where the movers are at a time: in training by a drawn path through field and TRD, else by the rule."""
@@ -159,11 +175,17 @@ class FieldRepresentation:
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Stiffness of the groups, and L_rigid in the variant that has it."""
+        """Distance from rest until the gate closes, stiffness of the groups, and L_rigid in the variant that has it."""
         moved, self._last = self._last, None
-        if moved is None or self._tracks.bodies < 2 or len(moved.rows) == 0:
+        if moved is None or len(moved.rows) == 0:
             return None
-        groups, terms = gaussians.motion_ids[moved.rows], []
+        terms: list[Tensor] = []
+        calm = self._config.field.calm
+        if calm > 0 and self._measured and iteration < gating.gate_step(self._config):
+            terms.append(calm * gating.restlessness(moved.offsets, moved.quats, moved.log_scales))
+        if self._tracks.bodies < 2:
+            return terms[0] if terms else None
+        groups = gating.bodies_of(gaussians.motion_ids[moved.rows], self._tracks, 0)
         if self._config.field.stiffness > 0:
             after = moved.before + moved.offsets
             bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups)
@@ -180,13 +202,18 @@ class FieldRepresentation:
         """A field reaches all times already."""
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Fit the TRD to the motion that the field has by now."""
+        """Set still what rests, once, where movers are measured; fit the TRD to the motion that there is by now."""
         section = self._config.field
         self._iteration = iteration
+        if self._measured and iteration == gating.gate_step(self._config):
+            rows = self.movers(gaussians)
+            still = gating.settle(gaussians, rows, self.motion, self.times, section.still)
+            log.info("step %d: %d of %d Gaussians rest", iteration, len(still), len(gaussians))
         every = round(section.trd_every * self._config.train.iterations)
         if section.trd_steps > 0 and every > 0 and iteration % every == 0:
             rows = self.movers(gaussians)
-            means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+            means = gaussians.means.detach()[rows]
+            groups = gating.bodies_of(gaussians.motion_ids[rows], self._tracks, field_fitting.ALONE)
             field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -205,9 +232,9 @@ class FieldRepresentation:
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
-        """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
-        shadows = len(tensors["field.casters"])
-        return np.concatenate([np.arange(int(tensors["field.bodies"])), np.zeros(shadows, np.int64)])
+        """See `Representation.group_classes`: a body's object; those of a shadow or of no body are background."""
+        others = len(tensors["field.casters"]) + 1
+        return np.concatenate([np.arange(int(tensors["field.bodies"])), np.zeros(others, np.int64)])
 
     @staticmethod
     def observed_motion(
@@ -220,7 +247,9 @@ class FieldRepresentation:
         return field_baking.observed_motion(
             motion,
             gaussians,
-            _movers(gaussians["motion_ids"], int(tensors["field.bodies"]), tensors["field.times"].numpy(), config),
+            gating.movers(
+                gaussians["motion_ids"], int(tensors["field.bodies"]), tensors["field.times"].numpy(), config
+            ),
             labels,
             object_ids,
             observed,
@@ -272,15 +301,6 @@ def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
         parameter.copy_(tensors[name])
 
 
-def _movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -> Tensor:
-    """Rows that the networks move; none at a single time, and where the user says that nothing does. [R] int64"""
-    if config.needs.tracks == "off" or len(times) < 2:
-        return torch.zeros(0, dtype=torch.int64)
-    if config.field.movers == "all" or bodies < 2:
-        return torch.arange(len(motion_ids))
-    return (motion_ids > 0).nonzero()[:, 0]
-
-
 def from_tracks(
     source: TracksRepresentation, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
 ) -> FieldRepresentation:
@@ -297,11 +317,8 @@ def from_tracks(
     with torch.no_grad():
         made.light.copy_(source.light)
     bring_together(gaussians, source.tracks, first, source.light.detach())
-    rows = made.movers(gaussians)
-    means, groups = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
-    section = config.field
-    field_fitting.fit_field(made.motion, means, groups, source.tracks, first, section.distill_steps, draw)
-    field_fitting.fit_trd(made.motion, means, groups, section.distill_steps, section.twist, draw)
+    gating.release(gaussians, source.tracks, config)
+    made.fit(gaussians, source.tracks, config.field.distill_steps, config.field.distill_steps, draw)
     return made
 
 

@@ -79,9 +79,12 @@ def observed_motion(
         bind[name][rows.numpy()] = value
     motion_ids = np.zeros(len(labels), np.int64)
     own = gaussians["motion_ids"].numpy()[rows.numpy()]
+    own = np.where(own == len(object_ids) + len(shadows), labels[rows.numpy()], own)  # what moves in no group
     if not own.any():  # nobody said what belongs to what before training: the labels do
         own = labels[rows.numpy()].astype(np.int64)
     motion_ids[rows.numpy()] = own
+    resting = ~np.isin(labels, own)  # objects of which nothing moves are groups all the same
+    motion_ids[resting] = labels[resting]
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
     still = rotations.identity(len(at)), np.zeros((len(at), 3))

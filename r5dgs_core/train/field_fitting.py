@@ -20,6 +20,7 @@ from .rigidity import QUAT_WEIGHT
 
 ROWS = 512  # Gaussians per step of a fit
 RATE = 2e-3
+ALONE = -1  # group of Gaussians that move each on its own: none carries another
 
 
 def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tensor]) -> None:
@@ -90,7 +91,7 @@ def fit_trd(
     Args:
         motion: Its TRD is changed in place.
         means: Canonical centres of the movers. [R, 3]
-        groups: Their motion groups, for the twist loss. [R]
+        groups: Their motion groups, for the twist loss; `ALONE` where one is in none. [R]
         steps: Steps of the fit.
         twist: Weight of the cross-Gaussian twist loss.
         generator: Source of the draws.
@@ -147,11 +148,11 @@ def cross_twist(
 
 
 def _partners(groups: Tensor, generator: torch.Generator) -> Tensor:
-    """For each row a row of the same group, drawn by a random shift within the group. [R] int64"""
+    """For each row a row of the same group, drawn by a random shift within the group; itself if alone. [R] int64"""
     order = torch.argsort(groups, stable=True)
-    partner = torch.empty_like(order)
-    counts = torch.bincount(groups)
-    start = 0
+    partner = torch.arange(len(groups))
+    start = int((groups == ALONE).sum())
+    counts = torch.bincount(groups[groups != ALONE])
     for count in counts[counts > 0].tolist():
         rows = order[start : start + count]
         shift = int(torch.randint(0, count, (1,), generator=generator))

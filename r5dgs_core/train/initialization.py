@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
 SAME_TIME = 0.1  # share of a camera's step in time within which the times of cameras are one
+FEWEST_EYES = 3  # cameras that place a scene from the images of one time
 SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
 
 
@@ -96,8 +97,10 @@ def start(
     init = config.init
     times = observed_times(views)
     places = triangulation.locate(views, times, init.min_mask_pixels)
-    if all(v.mask is None for v in views):
-        if config.train.representation == "field":
+    unmasked = all(v.mask is None for v in views)
+    by_field = config.train.representation == "field"
+    if unmasked:
+        if by_field:
             log.warning("no masks: the field moves every Gaussian, and there are no objects. %s", MASKS)
         else:
             log.warning(
@@ -106,6 +109,8 @@ def start(
     elif len(times) == 1:
         log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
+    if unmasked and by_field and config.curriculum.start != "first":
+        first = (len(times) - 1) // 2
     bodies = len(places.object_ids) + 1
     centers = np.zeros((bodies, 3))
     translations = np.zeros((bodies, len(times), 3))
@@ -119,7 +124,7 @@ def start(
         count = 0 if at_random else init.object_points
         carved = hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         clouds.append((*carved, row + 1))
-    scenes = sweep.backdrops(views)
+    scenes = sweep.backdrops(_at_once(views, times, first) if unmasked and by_field else views)
     # Points at random need the sweep for the sky and the plane alone.
     swept = min(init.background_points, 5000) if at_random else init.background_points
     search = sweep.Sweep(scenes, swept, init.sweep_depths)
@@ -210,6 +215,12 @@ def supporting_plane(
     normal = np.linalg.svd(inliers - inliers.mean(0), full_matrices=False)[2][2]
     normal = normal if np.median((inside - middle) @ normal) > 0 else -normal
     return normal, float(np.median(inliers @ normal))
+
+
+def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
+    """Views of one observed time, which show what moves at one place; all where few cameras look at that time."""
+    then = [v for v in views if nearest_knot(times, v.t) == knot]
+    return then if len({sweep.camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
 
 
 def _first_time(places: triangulation.Places, count: int) -> int:

@@ -38,6 +38,7 @@ HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
 MIN_PIXELS = 50  # on these together, below which nothing is said of a body
 SEED_STEP = 2  # the trial draws from a generator of its own
 PREFIX = "residual."
+GAINS = f"{PREFIX}gains"  # of a checkpoint; nan where what a body gains cannot be said
 
 
 def decision_step(config: Config, all_entered: int) -> int | None:
@@ -64,7 +65,7 @@ def decide(trainer: Trainer) -> None:
     before = trainer.state()
     field, gains = _try(trainer)
     kept = flexible(gains, field, trainer.config)
-    added = {f"{PREFIX}gains": torch.from_numpy(gains)}
+    added = {GAINS: torch.from_numpy(gains)}
     if kept:
         added |= tensors_of(field.only(kept))
     trainer.restore(dataclasses.replace(before, tensors=before.tensors | added))
@@ -248,10 +249,10 @@ def need(
         there: Whether the scene has residuals.
     """
     threshold, field = config.residual.threshold, residual_of(tensors)
-    if f"{PREFIX}gains" not in tensors:
+    if GAINS not in tensors:
         reason = "every Gaussian moves by the deformation field" if there else "gain by bending, dB; none was tried"
         return 0.0, threshold, there, reason
-    gains, ids = tensors[f"{PREFIX}gains"].numpy(), tensors["object_ids"].numpy()
+    gains, ids = tensors[GAINS].numpy(), tensors["object_ids"].numpy()
     kept = [] if field is None else field.bodies
     largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
     bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)

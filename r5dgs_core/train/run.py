@@ -11,13 +11,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
 import torch
 
 from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, probing, stopping
+from . import checkpoint, curves, discovery, identity, mask_stack, probing, residual, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -108,7 +109,7 @@ def train(
         progress({"event": "prepare", "text": "kernels; the first run compiles them"})
         warm_up()
         progress({"event": "prepare", "text": "images, objects, background"})
-        trainer = Trainer(dataset, run.config)
+        trainer = Trainer(dataset, run.config, _found_masks(dataset, run.config, state, progress))
         probe = _probe(trainer)
     if replaces:
         run = checkpoint.create_run(folder, dataset, config)
@@ -123,6 +124,16 @@ def train(
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
     return run
+
+
+def _found_masks(
+    dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: Progress
+) -> list[np.ndarray] | None:
+    """Masks of what moves where the data set has none: those that the run began with, or found now."""
+    if state is None:
+        return discovery.find(dataset, config, progress)
+    sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
+    return mask_stack.unpack(state.tensors[mask_stack.NAME], sizes) if mask_stack.NAME in state.tensors else None
 
 
 def _probe(trainer: Trainer) -> probing.Probe | None:
@@ -270,7 +281,8 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
-    bad = [name for name, tensor in tensors.items() if tensor.is_floating_point() and not tensor.isfinite().all()]
+    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name != residual.GAINS}
+    bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(
             f"step {state.iteration}: {', '.join(bad)} is not finite; the last checkpoint is kept. "

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 REPRESENTATIONS = ("tracks", "field")
 VARIANTS = ("5dgs", "r5dgs", "r5dgs_extra")
 FIELD_SIZES = ("complex", "light", "small")
-MOVERS = ("all", "labelled")
+MOVERS = ("all", "labelled", "measured")
 CURRICULA = ("best", "first")
 PLACEMENTS = ("scene", "random")
 IDENTITY_TRAINING = ("after", "joint", "detached", "off")
@@ -141,8 +141,12 @@ class FieldSection:
             observed span; 0 takes two observed intervals.
         warm_up: Steps without deformation, so that the first time is the canonical state.
         trd_share: Share of the steps within the horizon that go through the TRD; 1 is TRACE's scheme.
-        movers: Gaussians that the networks move: ``all``, or ``labelled``: those that the masks put on an object
-            or in its shadow; the others stand still exactly.
+        movers: Gaussians that the networks move: ``all``; ``labelled``: those that the masks put on an object or in its
+            shadow; or ``measured``: all until those that rest are set still exactly. ``labelled`` is ``measured`` where
+            there are no masks.
+        gate: Share of the field's run after which ``measured`` looks for what rests; not before every time takes part.
+        still: What leaves its place by less over the observed times rests; normalised units.
+        calm: Weight of the mean distance from the canonical state until then, so that what no image moves rests.
         place_steps: Steps that fit the field to the triangulated places of the objects before the first image.
         tracks_share: Share of the run that is one of ``tracks``, from which the field then starts; 0 for none.
         distill_steps: Steps that fit field and TRD to the motion of those tracks.
@@ -160,6 +164,9 @@ class FieldSection:
     warm_up: int = 0
     trd_share: float = 0.5
     movers: str = "labelled"
+    gate: float = 0.3
+    still: float = 0.01
+    calm: float = 0.01
     place_steps: int = 300
     tracks_share: float = 0.0
     distill_steps: int = 600
@@ -204,6 +211,11 @@ class CurriculumSection:
     grow: int = 400
     stages: int = 0
     newest: float = 0.4
+
+    def steps(self, iterations: int) -> tuple[int, int]:
+        """Steps on the first time alone, and step at which all times have entered, in a run of some length."""
+        scale = min(1.0, iterations / 2000)
+        return int(self.first * scale), int((self.first + self.grow) * scale)
 
 
 @dataclass(frozen=True)
@@ -293,6 +305,23 @@ class DensifyMcmcSection:
     noise: float = 5e5
     opacity: float = 0.01
     scale: float = 0.01
+
+
+@dataclass(frozen=True)
+class DiscoverySection:
+    """What moves where there are no masks (`discovery.py`): a short run of a field, and its rigidly moving parts.
+
+    Attributes:
+        iterations: Steps of that run; 0 trains data without masks as one static scene.
+        gate: Share of it after which what rests is set still.
+        still: What leaves its place by less rests; normalised units.
+        fewest: Parts of fewer Gaussians are left to the background.
+    """
+
+    iterations: int = 1200
+    gate: float = 0.5
+    still: float = 0.03
+    fewest: int = 20
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,10 @@ resumed run ends with the numbers of an unbroken one.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -27,6 +29,7 @@ from . import (
     identity,
     initialization,
     losses,
+    mask_stack,
     needs,
     normalization,
     posing,
@@ -57,12 +60,13 @@ class Trainer:
     Args:
         dataset: The data set.
         config: The run's configuration.
+        found: Masks that were found for the training views where the data set has none; they serve the start alone.
 
     Raises:
         DatasetError: The training split is empty or cannot be read.
     """
 
-    def __init__(self, dataset: Dataset, config: Config):
+    def __init__(self, dataset: Dataset, config: Config, found: Sequence[np.ndarray] | None = None):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
         self.config = config = needs.resolve(config)
@@ -70,19 +74,23 @@ class Trainer:
         behind = self._fixed_background()
         self.views = views.load(dataset, self.normalization, behind)
         rng = np.random.default_rng(config.train.seed)
-        start = initialization.start(self.views, config, behind is None, rng, self._cloud())
+        self.found = None if found is None else mask_stack.pack(found)
+        shown = self.views if found is None else views.with_masks(self.views, found)
+        start = initialization.start(shown, config, behind is None, rng, self._cloud())
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
                 "camera alone or is all sky. Remedy: give masks, or more cameras"
             )
         missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
-        if missing and len(start.object_ids) > 1:
+        if missing and len(start.object_ids) > 1 and found is None:
             named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
             log.warning("no training mask shows object %s: it is left out. Remedy: check ids in objects.json", named)
         self.behind = behind
         most = config.densify.max_gaussians
-        self.gaussians: Gaussians = thinning.thin(start.gaussians, most, rng) if most else start.gaussians
+        if most:
+            start = dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng))
+        self.gaussians: Gaussians = start.gaussians
         self.motion = representation.make(start, config)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
@@ -286,9 +294,7 @@ class Trainer:
 
     def _curriculum(self) -> tuple[int, int]:
         """Steps on the first time alone, and step at which all times have entered."""
-        scale = min(1.0, self.config.train.iterations / 2000)
-        section = self.config.curriculum
-        return int(section.first * scale), int((section.first + section.grow) * scale)
+        return self.config.curriculum.steps(self.config.train.iterations)
 
     def _grow_times(self) -> None:
         first, full = self._curriculum()
@@ -367,6 +373,8 @@ class Trainer:
         tensors |= self.motion.tensors()
         if self.identity is not None:
             tensors |= self.identity.tensors(self.gaussians)
+        if self.found is not None:
+            tensors[mask_stack.NAME] = self.found
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()

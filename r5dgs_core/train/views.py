@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -62,6 +63,11 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
         small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint8 if mask.max() < 256 else np.uint16)
         views.append(TrainView(view.name, camera, view.t, image, small, alpha))
     return views
+
+
+def with_masks(views: Sequence[TrainView], masks: Sequence[np.ndarray]) -> list[TrainView]:
+    """The views with other masks. Of [H, W]"""
+    return [dataclasses.replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
 
 
 def spread(items: Sequence[Item], limit: int) -> list[Item]:

@@ -175,7 +175,7 @@ def test_a_baked_scene_survives_its_file(baked, tmp_path):
 
 def test_without_masks_the_scene_is_all_background(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path / "data", masks=False)
-    scene = bake.bake(train_briefly(data, tmp_path / "run"))
+    scene = bake.bake(train_briefly(data, tmp_path / "run", "discovery.iterations=0"))
     validation.check(scene, "scene")
     assert [o.id for o in scene.objects] == [0] and (scene.object_ids == 0).all()
     assert {row["name"]: row["decision"] for row in scene.needs}["tracks"] == "off"

@@ -1,0 +1,200 @@
+"""Objects without masks: a short run of a field shows what moves, and what moves rigidly together is an object.
+
+The field's Gaussians that move are sorted into rigidly moving parts (`motion_clusters.py`), and each part's picture in
+each view is its mask. From there a run of tracks starts as one with masks does; the masks found serve its start alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from ..data.dataset import Dataset
+from ..motion import rotations
+from ..raster import rasterize_splats
+from . import gating, motion_clusters
+from .config import Config
+from .field import FieldRepresentation
+from .posing import Splats
+from .trainer import Trainer
+from .views import TrainView, spread
+
+log = logging.getLogger(__name__)
+
+JUDGES = 20  # views that say whether a part has to move
+GAIN = 2.0  # by how much worse they are drawn where it rests, dB
+OPAQUE = 0.3  # fainter Gaussians do not say what moves
+TOLERANCE = 0.02  # distance from a rigid motion that points which hardly travel may have, normalised units
+SPECK = 0.1  # smaller pieces of a mask are dropped, as a share of its largest piece
+CAP = 12000  # Gaussians of the short run
+
+
+def wanted(dataset: Dataset, config: Config) -> bool:
+    """Whether a run looks for what moves: it starts with tracks, there is no mask, and there are several times."""
+    tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
+    unmasked = all(view.mask_path is None for view in dataset.train)
+    several = len({view.t for view in dataset.train}) > 1
+    return tracks and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
+
+
+def find(
+    dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
+) -> list[np.ndarray] | None:
+    """Masks of what moves, for the training views.
+
+    Args:
+        dataset: The data set.
+        config: Configuration of the run that the masks are for.
+        progress: Called with an event when it begins and when it ends.
+
+    Returns:
+        Ids per pixel, 0 for what rests [H, W], for each training view; None where `wanted` says no or nothing moves.
+
+    Raises:
+        DatasetError, TrainingError: As of a run.
+    """
+    if not wanted(dataset, config):
+        return None
+    progress = progress or (lambda event: None)
+    progress({"event": "prepare", "text": "no masks: looking for what moves"})
+    trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
+    while not trainer.done:
+        trainer.step()
+    labels = parts(trainer, config)
+    count = int(labels.max(initial=-1)) + 1
+    progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
+    return masks(trainer, labels) if count > 0 else None
+
+
+def _short(config: Config, last: float) -> Config:
+    """The configuration of the short run: a small field on few Gaussians, without what only pictures need.
+
+    Args:
+        config: That of the run that it is for.
+        last: The last observed time, up to which the field reaches.
+    """
+    cap = config.densify.max_gaussians
+    return config.replace(
+        **{
+            "train.representation": "field",
+            "train.iterations": config.discovery.iterations,
+            "train.sh_degree": 0,
+            "train.shading": False,
+            "train.shadows": False,
+            "init.placement": "scene",
+            "densify.strategy": "share",
+            "densify.max_gaussians": min(cap, CAP) if cap else 0,
+            "field.size": "small",
+            "field.horizon": max(round(last, 9), 0.0),
+            "field.trd_share": 0.0,
+            "field.trd_steps": 0,
+            "field.place_steps": 0,
+            "field.tracks_share": 0.0,
+            "field.movers": "measured",
+            "field.gate": config.discovery.gate,
+            "field.still": config.discovery.still,
+            "identity.training": "off",
+        }
+        | {f"needs.{f.name}": "auto" for f in dataclasses.fields(config.needs)}
+    )
+
+
+@torch.no_grad()
+def parts(trainer: Trainer, config: Config) -> np.ndarray:
+    """Rigidly moving part of each Gaussian of a field, -1 for none. [N]"""
+    motion, gaussians = trainer.motion, trainer.gaussians
+    assert isinstance(motion, FieldRepresentation)
+    rows = motion.movers(gaussians)
+    opacities = torch.sigmoid(gaussians.opacity_logits[rows])
+    rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
+    means = gaussians.means[rows]
+    paths = torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1)
+    rng = np.random.default_rng(config.train.seed)
+    found = motion_clusters.find(
+        paths.double().numpy(), opacities.double().numpy(), TOLERANCE, config.discovery.fewest, rng
+    )
+    labels = np.full(len(gaussians), -1)
+    labels[rows.numpy()] = found
+    return needed(trainer, labels)
+
+
+@torch.no_grad()
+def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
+    """The labels without parts that might as well rest: fields also move what looks the same wherever it is. [N]
+
+    Each part is drawn as it moves and in its mean place; where it shows in either, the images decide.
+    """
+    count = int(labels.max(initial=-1)) + 1
+    errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)
+    motion, gaussians = trainer.motion, trainer.gaussians
+    assert isinstance(motion, FieldRepresentation)
+    mean = gating.rest(motion.motion, gaussians.means, gaussians.log_scales, trainer.times)
+    means, scales = gaussians.means + mean.offsets, (gaussians.log_scales + mean.log_scales).exp()
+    quats = rotations.multiply(mean.quats, gaussians.quats)
+    for view in spread(trainer.views, JUDGES):
+        moving = trainer.splats(view.camera, view.t)
+        error, ids = _drawn(trainer, view, moving, parts_of)
+        for k in range(count):
+            rests = (parts_of == k)[:, None]
+            resting = dataclasses.replace(
+                moving,
+                means=torch.where(rests, means, moving.means),
+                quats=torch.where(rests, quats, moving.quats),
+                scales=torch.where(rests, scales, moving.scales),
+            )
+            error_at_rest, ids_at_rest = _drawn(trainer, view, resting, parts_of)
+            region = (ids == k) | (ids_at_rest == k)
+            errors[:, k] += float(error[region].sum()), float(error_at_rest[region].sum())
+    gains = 10 * np.log10(np.maximum(errors[1], 1e-12) / np.maximum(errors[0], 1e-12))
+    log.info("parts: %s dB by moving", np.round(gains, 1))
+    kept = gains > GAIN
+    ranks = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+    return ranks[labels]
+
+
+def _drawn(trainer: Trainer, view: TrainView, splats: Splats, parts_of: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared error of a view's pixels, and the part that each of them shows. [H, W], [H, W]"""
+    shown = rasterize_splats(
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        splats.colors,
+        view.camera,
+        trainer.background.image(view.camera),
+        labels=parts_of,
+    )
+    assert shown.ids is not None
+    truth = torch.from_numpy(view.image).float() / 255
+    return (shown.image - truth).square().mean(-1), shown.ids
+
+
+@torch.no_grad()
+def masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
+    """Picture of the parts in each training view: the part k shows as k + 1, what rests as 0. [H, W]"""
+    kind = np.uint8 if labels.max() < 255 else np.uint16
+    result = []
+    for view in trainer.views:
+        _, ids = _drawn(trainer, view, trainer.splats(view.camera, view.t), torch.from_numpy(labels))
+        result.append(_without_specks((ids.numpy() + 1).clip(min=0).astype(kind)))
+    return result
+
+
+def _without_specks(mask: np.ndarray) -> np.ndarray:
+    """The mask without small pieces that lie apart from the largest of their id. [H, W]"""
+    kept = np.zeros_like(mask)
+    for k in range(1, int(mask.max()) + 1):
+        pieces = np.zeros(mask.shape, np.int32)
+        ndimage.label(mask == k, output=pieces)
+        sizes = np.bincount(pieces.ravel())
+        good = sizes >= SPECK * sizes[1:].max(initial=0)
+        good[0] = False
+        kept[good[pieces]] = k
+    return kept

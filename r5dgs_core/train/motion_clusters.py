@@ -1,0 +1,201 @@
+"""Rigidly moving parts among paths of points: what moves as one body, without masks.
+
+Points that are neighbours at all times and keep their distances are likely of one body. Small neighbourhoods propose
+rigid motions; the proposal that explains most points connected with it is fitted again to all of them and taken away,
+until too few are left. Parts that one rigid motion explains are then joined, and points near a part that move with it
+are added.
+
+Notation: R points, S times, H proposals, K neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import KDTree
+
+SHARE = 0.12  # residual that is allowed, as a share of how far a point travels: fields bend rigid motions a little
+PROPOSALS = 48  # per part
+NEIGHBOURHOOD = 24  # points that propose a motion
+LINKS = 8  # neighbours of a point that it may be connected with
+REACH = 4.0  # longest connection, in median distances of a point to its nearest ones
+REFITS = 4
+JOINT = 0.7  # share of both parts that one motion must explain for them to be joined
+LOOSE = 1.5  # how much more residual it is allowed then
+LATE = 1.5  # how much more residual is allowed to points that are added in the end
+MOST = 4000  # points that are looked at; a spread of them where there are more
+
+
+@dataclass(frozen=True)
+class RigidPath:
+    """A rigid motion x -> R_s x + t_s of the points at the reference time: rotations [S, 3, 3], shifts [S, 3]."""
+
+    rotmats: np.ndarray
+    shifts: np.ndarray
+
+    def residuals(self, paths: np.ndarray, reference: int) -> np.ndarray:
+        """Root mean squared distance over the times of points from where the motion puts them. [R, S, 3] -> [R]"""
+        put = np.einsum("sij,rj->rsi", self.rotmats, paths[:, reference]) + self.shifts
+        return np.sqrt(((put - paths) ** 2).sum(-1).mean(-1))
+
+
+def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, rng: np.random.Generator) -> np.ndarray:
+    """Label points by the rigid part that they belong to.
+
+    Args:
+        paths: Places of the points over time. [R, S, 3]
+        weights: How much each counts. [R]
+        tolerance: Residual that is allowed to points that hardly travel, units of the paths.
+        fewest: Smaller parts are dropped, in points.
+        rng: Source of the draws.
+
+    Returns:
+        Part of each point, 0 for the heaviest, -1 for none. [R]
+    """
+    labels = np.full(len(paths), -1)
+    if len(paths) < max(fewest, 4) or paths.shape[1] < 2:
+        return labels
+    reference = paths.shape[1] // 2
+    allowed = tolerance + SHARE * np.linalg.norm(paths - paths.mean(1, keepdims=True), axis=-1).max(1)
+    sampled = rng.permutation(len(paths))[:MOST]
+    parts = _parts(paths[sampled], weights[sampled], allowed[sampled], reference, fewest, rng)
+    parts = _joined(paths[sampled], weights[sampled], allowed[sampled], reference, parts)
+    parts.sort(key=lambda rows: -weights[sampled][rows].sum())
+    motions = []
+    for k, rows in enumerate(parts):
+        labels[sampled[rows]] = k
+        motions.append(fit(paths[sampled[rows]], weights[sampled[rows]], reference))
+    return _attached(paths, allowed, reference, labels, motions)
+
+
+def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
+    """Least-squares rigid motion of points from their places at one time to those at each (Kabsch).
+
+    Args:
+        paths: Places over time. [..., R, S, 3]
+        weights: Of the points, with a positive sum. [..., R]
+        reference: Index of the time that the motion starts from.
+
+    Returns:
+        The motion, with the leading dimensions of ``paths``.
+    """
+    share = (weights / weights.sum(-1, keepdims=True))[..., None, None]
+    centers = (share * paths).sum(-3)  # [..., S, 3]
+    arms = paths - centers[..., None, :, :]
+    spread = np.einsum("...rsi,...rj->...sij", share * arms, arms[..., reference, :])
+    u, _, vt = np.linalg.svd(spread)
+    u[..., 2] *= np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)[..., None]
+    rotmats = u @ vt
+    home = centers[..., reference, :]
+    return RigidPath(rotmats, centers - np.einsum("...sij,...j->...si", rotmats, home))
+
+
+def _parts(
+    paths: np.ndarray, weights: np.ndarray, allowed: np.ndarray, reference: int, fewest: int, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Connected sets of points that one rigid motion explains, one after the other. Rows of each."""
+    features = _features(paths)
+    graph = _graph(features)
+    left = np.ones(len(paths), bool)
+    parts: list[np.ndarray] = []
+    while left.sum() >= max(fewest, 4):
+        rows = np.flatnonzero(left)
+        count = min(NEIGHBOURHOOD, len(rows))
+        seeds = rng.choice(len(rows), min(PROPOSALS, len(rows)), replace=False)
+        near = np.reshape(KDTree(features[rows]).query(features[rows[seeds]], k=count)[1], (len(seeds), count))
+        proposed = fit(paths[rows[near]], weights[rows[near]], reference)
+        best, most = np.zeros(0, np.int64), 0.0
+        for h, seed in enumerate(rows[seeds]):
+            motion = RigidPath(proposed.rotmats[h], proposed.shifts[h])
+            explained = left & (motion.residuals(paths, reference) < allowed)
+            if weights[explained].sum() <= most:
+                continue
+            members = _connected(graph, explained, seed)
+            for _ in range(REFITS):
+                if len(members) < 4:
+                    break
+                motion = fit(paths[members], weights[members], reference)
+                members = _connected(graph, left & (motion.residuals(paths, reference) < allowed), seed)
+            if weights[members].sum() > most:
+                best, most = members, float(weights[members].sum())
+        if len(best) < fewest:
+            break
+        parts.append(best)
+        left[best] = False
+    return parts
+
+
+def _features(paths: np.ndarray) -> np.ndarray:
+    """Points of which the distances are the root mean squared ones over time. [R, S * 3]"""
+    return paths.reshape(len(paths), -1) / np.sqrt(paths.shape[1])
+
+
+def _graph(features: np.ndarray) -> sparse.csr_matrix:
+    """Which points are neighbours at all times. [R, R]"""
+    count = min(LINKS + 1, len(features))
+    found = KDTree(features).query(features, k=count)
+    distance, index = np.asarray(found[0]), np.asarray(found[1])
+    longest = REACH * np.median(distance[:, 1:])
+    rows = np.repeat(np.arange(len(features)), count - 1)
+    good = distance[:, 1:].ravel() <= longest
+    shape = (len(features), len(features))
+    graph = sparse.csr_matrix((np.ones(good.sum()), (rows[good], index[:, 1:].ravel()[good])), shape=shape)
+    return (graph + graph.T).tocsr()
+
+
+def _connected(graph: sparse.csr_matrix, members: np.ndarray, seed: int) -> np.ndarray:
+    """Rows of the members [R] bool that are connected with the seed through members."""
+    rows = np.flatnonzero(members)
+    if not members[seed]:
+        return rows[:0]
+    _, labels = csgraph.connected_components(graph[rows][:, rows], directed=False)
+    return rows[labels == labels[np.searchsorted(rows, seed)]]
+
+
+def _joined(
+    paths: np.ndarray, weights: np.ndarray, allowed: np.ndarray, reference: int, parts: list[np.ndarray]
+) -> list[np.ndarray]:
+    """The parts, those joined that are near each other and that one motion explains."""
+    parts = list(parts)
+    features = _features(paths)
+    spacing = REACH * np.median(KDTree(features).query(features, k=2)[0][:, 1])
+    k = 0
+    while k < len(parts):
+        for other in range(k + 1, len(parts)):
+            pair = (parts[k], parts[other])
+            both = np.concatenate(pair)
+            gap = KDTree(features[parts[k]]).query(features[parts[other]])[0].min()
+            if gap > spacing:
+                continue
+            balance = np.concatenate([np.full(len(p), 1 / weights[p].sum()) for p in pair])
+            motion = fit(paths[both], weights[both] * balance, reference)
+            if all((motion.residuals(paths[p], reference) < LOOSE * allowed[p]).mean() > JOINT for p in pair):
+                parts[k] = both
+                del parts[other]
+                break
+        else:
+            k += 1
+    return parts
+
+
+def _attached(
+    paths: np.ndarray, allowed: np.ndarray, reference: int, labels: np.ndarray, motions: list[RigidPath]
+) -> np.ndarray:
+    """The labels, with those of points near a part that move about as it does. [R]"""
+    labels = labels.copy()
+    open_rows, features = np.flatnonzero(labels < 0), _features(paths)
+    if len(open_rows) == 0 or not motions:
+        return labels
+    best = np.full(len(open_rows), np.inf)
+    for k, motion in enumerate(motions):
+        members = np.flatnonzero(labels == k)
+        tree = KDTree(features[members])
+        spacing = np.median(tree.query(features[members], k=min(2, len(members)))[0][..., -1])
+        off = motion.residuals(paths[open_rows], reference) / allowed[open_rows]
+        near = tree.query(features[open_rows])[0] < 2 * REACH * spacing
+        chosen = near & (off < LATE) & (off < best)
+        labels[open_rows[chosen]], best[chosen] = k, off[chosen]
+    return labels
