@@ -221,7 +221,8 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add_settings(p: argparse.ArgumentParser) -> None:
-        p.add_argument("--preset", metavar="NAME", help="named settings; --config and --set win over them")
+        named = "named settings: fast (a first look), cpu or paper (the deformation field); --config and --set win"
+        p.add_argument("--preset", metavar="NAME", help=named)
         p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
         p.add_argument(
             "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override a key; may be repeated"

@@ -16,7 +16,7 @@ from r5dgs_core.bench import variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import files, scene_file
-from r5dgs_core.train import checkpoint
+from r5dgs_core.train import checkpoint, presets
 from tests import datasets as tiny_datasets
 
 OPTIONS = [
@@ -307,3 +307,10 @@ def test_a_reader_that_goes_away_is_no_traceback(made):
     command = f"{shlex.quote(sys.executable)} -m r5dgs_core.cli info {shlex.quote(str(made[1]))} | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(cli.__file__).parents[1])
     assert "Traceback" not in done.stderr
+
+
+def test_the_help_of_train_names_every_preset(capsys):
+    with pytest.raises(SystemExit):
+        cli.parser().parse_args(["train", "--help"])
+    text = capsys.readouterr().out
+    assert all(f"{name} " in text or f"{name}\n" in text for name in presets.PRESETS)
