@@ -48,7 +48,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
     failures: list[dict[str, Any]] = []
     result: dict[str, Any] = {}
     with make_progress(progress_kind) as progress, stopping.at_once("stopped; give the same command to go on"):
-        progress({"event": "prepare", "text": "kernels; the first run compiles them"})
+        progress({"event": "prepare", "text": "kernels"})
         warming.warm_up()
         for index, case in enumerate(planned):
             progress({"event": "case", "text": f"{case.title} ({index + 1} of {len(planned)})"})

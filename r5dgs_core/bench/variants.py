@@ -8,8 +8,9 @@ from typing import Any
 from ..train import config as configs
 from ..train.presets import PRESETS
 
-# The method has its identities trained with the geometry (docs/field.md), at a weight that does not harm it.
-_IDENTITIES = {"identity.training": "joint", "identity.weight": "0.05", "identity.spatial": "2.0"}
+# The method has its identities trained with the geometry (docs/field.md). All their losses at a twentieth: the
+# encodings, whose optimizer does not feel the scale, learn as at the paper's weights, and the geometry is not harmed.
+_IDENTITIES = {"identity.training": "joint", "identity.weight": "0.05", "identity.spatial": "0.1"}
 _FIELD = {"train.representation": "field", **_IDENTITIES}
 # Whoever starts from tracks needs objects in their places.
 _PLACED = {"init.placement": "scene"}
@@ -17,7 +18,7 @@ _PLACED = {"init.placement": "scene"}
 VARIANTS: dict[str, dict[str, str]] = {
     "5dgs": {**_FIELD, "field.variant": "5dgs"},
     "r5dgs": {**_FIELD, "field.variant": "r5dgs"},
-    "r5dgs_extra": {**_FIELD, "field.variant": "r5dgs_extra", "identity.majority": "0.5"},
+    "r5dgs_extra": {**_FIELD, "field.variant": "r5dgs_extra", "identity.majority": "0.025"},
     "from_tracks": {
         "train.representation": "field",
         "field.variant": "r5dgs",
@@ -29,8 +30,8 @@ VARIANTS: dict[str, dict[str, str]] = {
 }
 # `5dgs` is trained as `r5dgs` is and differs only in how it is played, so its row comes from the checkpoint of `r5dgs`.
 DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "from_tracks", "tracks")
-# Preset `paper` has the paper's weight, which its variants keep.
-KEPT = {"paper": ("identity.weight",)}
+# Preset `paper` has the paper's weights, which its variants keep.
+KEPT = {"paper": ("identity.weight", "identity.spatial", "identity.majority")}
 # What a preset for the field says of these (sections or keys) does not suit tracks; they keep their defaults.
 UNSUITED = {
     "from_tracks": ("init", "curriculum", "train.shading", "train.shadows"),

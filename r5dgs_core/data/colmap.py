@@ -116,16 +116,11 @@ def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
     times = content
     if isinstance(content.get("times"), dict):
         times = content["times"]
-        more = {key: _number(path, key, content[key]) for key in ("t_max", "frames_per_unit") if key in content}
+        given = (key for key in ("t_max", "frames_per_unit") if key in content)
+        more = {key: transforms.finite(str(path), key, content[key]) for key in given}
     if not times:
         raise errors.DatasetError(f"{path}: expected image names and times, found none")
-    return {str(name).replace("\\", "/"): _number(path, name, t) for name, t in times.items()}, more
-
-
-def _number(path: Path, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise errors.DatasetError(f"{path}: {key!r}: expected a finite number, found {value!r}")
-    return float(value)
+    return {str(name).replace("\\", "/"): transforms.finite(str(path), name, t) for name, t in times.items()}, more
 
 
 def _timed(root: Path, registered: tuple[Registered, ...], times: dict[str, float], path: Path) -> list[_Frame]:

@@ -145,9 +145,9 @@ def _read_frames(place: str, frames: list, common: dict, shared_matrix: Any, cam
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise errors.DatasetError(f"{at}: expected an object with a 'file_path'")
         at = f"{at} ({frame['file_path']})"
-        t = _number(at, "time", frame["time"]) if "time" in frame else i / max(len(frames) - 1, 1)
+        t = finite(at, "time", frame["time"]) if "time" in frame else i / max(len(frames) - 1, 1)
         lens = {
-            key: _number(at, key, value)
+            key: finite(at, key, value)
             for source in (common, frame)
             for key, value in _lens_keys(source).items()
             if value is not None
@@ -206,7 +206,8 @@ def _lens_keys(source: dict) -> dict[str, Any]:
     return {names.get(key, key): source[key] for key in keys if key in source}
 
 
-def _number(place: str, key: str, value: Any) -> float:
+def finite(place: str, key: str, value: Any) -> float:
+    """The value of a key as a float; DatasetError naming place and key where it is none or not finite."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise errors.DatasetError(f"{place}: '{key}' must be a finite number, found {value!r}")
     return float(value)

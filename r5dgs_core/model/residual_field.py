@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..motion import rotations
+from .gaussians import SEEN_OPACITY
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def spread(
     Args:
         means: Canonical centres of all Gaussians. [N, 3]
         motion_ids: Their motion groups. [N] int64
-        opacities: Members fainter than 0.3 carry no node where others do. [N]
+        opacities: Members fainter than `SEEN_OPACITY` carry no node where others do. [N]
         bodies: Motion groups that get nodes; those without members get none.
         count: Nodes of each body, at most.
         knots: Number of knots S.
@@ -162,7 +163,7 @@ def spread(
     nodes, owners = [means.new_zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
     for body in bodies:
         members = motion_ids == body
-        seen = members & (opacities > 0.3)
+        seen = members & (opacities > SEEN_OPACITY)
         points = means.detach()[seen if seen.any() else members]
         if len(points) == 0:
             continue

@@ -20,6 +20,7 @@ from ..data import dataset as datasets
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
+from ..model.gaussians import SEEN_OPACITY
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
@@ -273,7 +274,7 @@ def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: n
 
 def _voters(opacities: np.ndarray) -> np.ndarray:
     """Members that say where a group is: those that can be seen, or all where none can. [N] bool"""
-    seen = opacities > 0.3
+    seen = opacities > SEEN_OPACITY
     return seen if seen.any() else np.ones(len(opacities), bool)
 
 

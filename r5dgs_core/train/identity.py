@@ -174,7 +174,8 @@ class JointIdentity:
         self.rates = {"identities": self._section.rate, "classifier": self._section.classifier_rate}
         self._neighbourhood: identity_losses.Neighbourhood | None = None
         self._found_at = 0
-        self._found_for: Tensor | None = None  # the parameter `means` then; a new one has other rows
+        # The tensors `means` and `motion_ids` then: new ones have other rows, or stand for Gaussians that were moved.
+        self._found_for: tuple[Tensor, Tensor] | None = None
 
     def _set_classifier(self, weight: Tensor, bias: Tensor) -> None:
         named = {"classifier.weight": weight, "classifier.bias": bias}
@@ -251,12 +252,16 @@ class JointIdentity:
         return total
 
     def _neighbours(self, gaussians: Gaussians, iteration: int) -> identity_losses.Neighbourhood:
-        means = gaussians.means
-        stale = self._found_for is not means or iteration - self._found_at >= NEIGHBOURS_EVERY
+        stale = not self._current(gaussians) or iteration - self._found_at >= NEIGHBOURS_EVERY
         if self._neighbourhood is None or stale:
-            self._neighbourhood = identity_losses.Neighbourhood(means)
-            self._found_at, self._found_for = iteration, means
+            self._neighbourhood = identity_losses.Neighbourhood(gaussians.means)
+            self._found_at, self._found_for = iteration, (gaussians.means, gaussians.motion_ids)
         return self._neighbourhood
+
+    def _current(self, gaussians: Gaussians) -> bool:
+        """Whether the neighbours were found for these Gaussians, row by row."""
+        known = self._found_for
+        return known is not None and known[0] is gaussians.means and known[1] is gaussians.motion_ids
 
     @torch.no_grad()
     def labels(self, gaussians: Gaussians) -> Tensor:
@@ -276,7 +281,7 @@ class JointIdentity:
         """Everything that the next step depends on beside the Gaussians, by name."""
         named = {f"identity.{name}": tensor.detach() for name, tensor in self.params.items()}
         named["identity.generator"] = self._generator.get_state()
-        if self._neighbourhood is not None and self._found_for is gaussians.means:
+        if self._neighbourhood is not None and self._current(gaussians):
             named["identity.points"] = self._neighbourhood.points
             named["identity.found_at"] = torch.tensor(self._found_at)
         return named
@@ -288,7 +293,8 @@ class JointIdentity:
         self._neighbourhood, self._found_for = None, None
         if "identity.points" in tensors:
             self._neighbourhood = identity_losses.Neighbourhood(tensors["identity.points"])
-            self._found_at, self._found_for = int(tensors["identity.found_at"]), gaussians.means
+            self._found_at = int(tensors["identity.found_at"])
+            self._found_for = (gaussians.means, gaussians.motion_ids)
 
 
 def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..model.gaussians import SEEN_OPACITY
 from ..motion import rotations
 
-SEEN_OPACITY = 0.3  # fainter Gaussians do not say where an object is
 QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 SOFTENING = 1e-6  # length that keeps the slope of a distance finite at 0
 

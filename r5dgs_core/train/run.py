@@ -106,7 +106,7 @@ def train(
         return run
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
     with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
-        progress({"event": "prepare", "text": "kernels; the first run compiles them"})
+        progress({"event": "prepare", "text": "kernels"})
         warm_up()
         progress({"event": "prepare", "text": "images, objects, background"})
         trainer = Trainer(dataset, run.config, _found_masks(dataset, run.config, state, progress))

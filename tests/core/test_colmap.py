@@ -258,7 +258,7 @@ def test_an_unknown_lens_is_named(flat):
     [
         ([1, 2], "times.json: expected image names and times, found list"),
         ({}, "expected image names and times, found none"),
-        ({"img_00.png": "early"}, "'img_00.png': expected a finite number, found 'early'"),
+        ({"img_00.png": "early"}, "'img_00.png' must be a finite number, found 'early'"),
         ({"img_99.png": 0.0}, "'img_99.png': expected a registered image"),
         ({"times": {"img_00.png": 0.5}, "t_max": 0.1}, "t_max 0.1 of times.json: expected images up to it"),
     ],

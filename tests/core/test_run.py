@@ -105,7 +105,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(tiny, unbroken, t
 @pytest.mark.parametrize(
     ("moment", "number"),
     [
-        ({"event": "prepare", "text": "kernels; the first run compiles them"}, signal.SIGTERM),
+        ({"event": "prepare", "text": "kernels"}, signal.SIGTERM),
         ({"event": "prepare", "text": "images, objects, background"}, signal.SIGINT),
         ({"event": "prepare", "text": "labels, by a vote of the masks"}, signal.SIGINT),
         ({"event": "identity", "iteration": 10}, signal.SIGTERM),
