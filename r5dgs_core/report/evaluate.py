@@ -6,7 +6,7 @@ to 8 bits before they are measured, as a file would hold them.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import json
 import math
 import time
@@ -16,17 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import optimize
 
 from ..data import dataset as datasets
 from ..data import images
 from ..errors import ConfigError
-from ..motion import rotations
 from ..raster import scene_render
 from ..scene import files, playback
 from ..scene.cameras import Camera
-from ..scene.scene import MotionGroup, Scene
-from . import metrics
+from ..scene.scene import Scene
+from . import metrics, true_poses
 
 METRICS = (
     "psnr",
@@ -96,16 +94,21 @@ def evaluate(
         result["splits"][split] = {}
         views = dataset.views(split)
         for mode in modes:
-            tally = _Tally([item.id for item in scene.objects if item.id > 0])
-            if views:
-                render(scene, views[0].camera, views[0].t, mode, backend=backend)  # compiles; not timed
-            for view in views:
-                rendering = render(scene, view.camera, view.t, mode, backend=backend)
-                tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view))
+
+            def count() -> None:
+                nonlocal done
                 done += 1
                 if progress is not None:
                     progress(done, total)
-            result["splits"][split][mode] = tally.result()
+
+            result["splits"][split][mode] = measure(
+                scene,
+                views,
+                functools.partial(playback.frame, scene, mode=mode),
+                background=background,
+                backend=backend,
+                measured=count,
+            )
     given = train if train is not None else scene.provenance.get("train", {})
     result["train"] = {
         "seconds": given.get("seconds"),
@@ -113,6 +116,40 @@ def evaluate(
         "gaussians": given.get("gaussians", len(scene.means)),
     }
     return result
+
+
+def measure(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    move: Callable[[float], playback.Frame],
+    *,
+    background: np.ndarray | None = None,
+    backend: str = "auto",
+    measured: Callable[[], None] | None = None,
+) -> dict[str, Any]:
+    """Measure pictures of a scene that is moved in any way.
+
+    Args:
+        scene: The scene.
+        views: Cameras, times and true images.
+        move: The scene's Gaussians at a time.
+        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        backend: Rasterizer.
+        measured: Called after each image.
+
+    Returns:
+        METRICS; what could not be computed is None.
+    """
+    background = truth_background(scene) if background is None else background
+    tally = _Tally([item.id for item in scene.objects if item.id > 0])
+    if views:
+        draw(scene, views[0].camera, views[0].t, move, backend=backend)  # compiles; not timed
+    for view in views:
+        rendering = draw(scene, view.camera, view.t, move, backend=backend)
+        tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view))
+        if measured is not None:
+            measured()
+    return tally.result()
 
 
 def write(evaluation: dict[str, Any], path: Path) -> Path:
@@ -129,13 +166,20 @@ def write(evaluation: dict[str, Any], path: Path) -> Path:
 
 
 def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
-    """Render colour and object ids of a scene at a time, with the milliseconds that it took.
+    """Render colour and object ids of a scene at a time; see `draw`."""
+    return draw(scene, camera, t, functools.partial(playback.frame, scene, mode=mode), backend=backend)
+
+
+def draw(
+    scene: Scene, camera: Camera, t: float, move: Callable[[float], playback.Frame], *, backend: str = "auto"
+) -> Rendering:
+    """Render colour and object ids of a scene moved in any way, with the milliseconds that it took.
 
     The id of a pixel is the classifier's answer to the blended identities where the scene has both, else the object
     with the largest weight in the pixel.
     """
     start = time.perf_counter()
-    frame = playback.frame(scene, t, mode)
+    frame = move(t)
     moved = time.perf_counter()
     classified = scene.identities is not None and scene.classifier_weight is not None
     output = scene_render.render_frame(
@@ -183,81 +227,28 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
     """Error of each object's predicted pose at the last time of the ground truth.
 
     The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times
-    at which the object was seen decide (`metrics.aligned_pose_error`).
+    at which the object was seen decide (`true_poses.bodies`).
 
     Returns:
         Per object ``id name position_error rotation_error_deg``: world units and degrees, None where the object has no
         true pose or no motion group. Without ground truth, one row per object of the scene.
     """
-    rows = {
-        item.id: {"id": item.id, "name": item.name, "position_error": None, "rotation_error_deg": None}
-        for item in scene.objects
-        if item.id > 0
+    named = {item.id: item.name for item in scene.objects if item.id > 0}
+    known: tuple[true_poses.Body, ...] = ()
+    if ground_truth is not None:
+        known = true_poses.bodies(scene, ground_truth)
+        if not scene.provenance.get("discovered"):  # else the ids of the truth mean nothing here
+            named = dict(zip(ground_truth.object_ids, ground_truth.names, strict=True)) | named
+    rows: dict[int, dict[str, Any]] = {
+        key: {"id": key, "name": name, "position_error": None, "rotation_error_deg": None}
+        for key, name in named.items()
     }
-    if ground_truth is None:
-        return list(rows.values())
-    times = ground_truth.times
-    observed = (times <= scene.t_max + 1e-9) & (times >= scene.track_times[0] - 1e-9)
-    poses = [playback.group_poses(scene, float(t)) for t in times]
-    if scene.provenance.get("discovered"):
-        ground_truth = _renumbered(scene, ground_truth)
-    for object_id, name, truth in zip(ground_truth.object_ids, ground_truth.names, ground_truth.matrices, strict=True):
-        row = rows.setdefault(
-            object_id, {"id": object_id, "name": name, "position_error": None, "rotation_error_deg": None}
-        )
-        group = _body(scene, object_id)
-        if group is None or not observed.any():
-            continue
-        first, last = group.seen or (-np.inf, np.inf)
-        seen = observed & (times >= first - 1e-9) & (times <= last + 1e-9)
-        motion = np.stack([_matrix(group, quats[group.id], moves[group.id]) for quats, moves in poses])
-        position, angle = metrics.aligned_pose_error(motion, truth, seen if seen.any() else observed, group.pivot)
-        row["position_error"], row["rotation_error_deg"] = position, angle
+    for body in known:
+        predicted = true_poses.motion(scene, [body.group], body.times[-1:])[0]
+        position, angle = metrics.pose_errors(predicted, body.motion[-1:], body.group.pivot)
+        errors = {"position_error": float(position[0]), "rotation_error_deg": float(angle[0])}
+        rows[body.object_id].update(errors)
     return [rows[key] for key in sorted(rows)]
-
-
-def _renumbered(scene: Scene, ground_truth: datasets.GroundTruth) -> datasets.GroundTruth:
-    """The ground truth of those objects that a scene found by itself, with the ids that they have there.
-
-    Nobody named what was found, so places decide: at the time of the truth that is nearest to the bind state each
-    object is the one that is nearest to it, no further off than the radius of that group.
-    """
-    bodies = [group for group in scene.groups if group.role == "body" and group.object_id > 0]
-    at = int(np.argmin(np.abs(ground_truth.times - scene.t_max)))
-    places = ground_truth.matrices[:, at, :3, 3]
-    pivots = np.array([group.pivot for group in bodies]).reshape(-1, 3)
-    distances = np.linalg.norm(places[:, None] - pivots, axis=-1)  # [true objects, bodies]
-    pairs = zip(*optimize.linear_sum_assignment(distances), strict=True)
-    kept = [(i, k) for i, k in pairs if distances[i, k] <= bodies[k].model.radius]
-    return dataclasses.replace(
-        ground_truth,
-        object_ids=tuple(bodies[k].object_id for _, k in kept),
-        names=tuple(ground_truth.names[i] for i, _ in kept),
-        matrices=ground_truth.matrices[[i for i, _ in kept]],
-    )
-
-
-def _body(scene: Scene, object_id: int) -> MotionGroup | None:
-    """The motion group that carries most of an object's Gaussians; shadows do not count."""
-    candidates = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
-    if not candidates:  # an object at rest may be a member of the pinned group
-        pinned = scene.groups[0] if scene.groups else None
-        mine = scene.means[scene.object_ids == object_id]
-        if pinned is None or not len(mine):
-            return None
-        center = mine.mean(axis=0).astype(np.float64)
-        return MotionGroup(pinned.id, object_id, "pinned", -1, center, pinned.model)
-    members = [int(((scene.object_ids == object_id) & (scene.motion_ids == group.id)).sum()) for group in candidates]
-    return candidates[int(np.argmax(members))]
-
-
-def _matrix(group: MotionGroup, quat: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Map from the bind state to the world: x -> p + R (x - p) + d. [4, 4]"""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotations.quats_to_rotmats(quat)
-    pivot = np.asarray(group.pivot, np.float64)
-    matrix[:3, 3] = pivot + displacement - matrix[:3, :3] @ pivot
-    return matrix
 
 
 class _Tally:

@@ -186,17 +186,34 @@ def aligned_pose_error(
 ) -> tuple[float, float]:
     """Error at the last time of a predicted motion against true poses given in another frame of the object.
 
+    Args:
+        predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
+        truth: Object to world at the same times; scale is removed. [T, 4, 4]
+        observed: Times that the offset between the frames may use, at least one. [T] bool
+        center: Centre of the object in the bind state; its distance is measured. [3]
+
+    Returns:
+        Distance of the centres at the last time in world units, and angle between the rotations in degrees.
+    """
+    motion = true_motion(predicted, truth, observed, center)
+    distances, angles = pose_errors(predicted[-1:], motion[-1:], center)
+    return float(distances[0]), float(angles[0])
+
+
+def true_motion(predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """True motion of a bind state, from true poses given in another frame of the object.
+
     The constant rigid offset A between both frames is the mean of P(t)^-1 T(t) over the observed times (chordal mean of
-    the rotations), so that what is left at the last time is error of the motion alone.
+    the rotations), so that what differs later is error of the motion alone.
 
     Args:
         predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
         truth: Object to world at the same times; scale is removed. [T, 4, 4]
         observed: Times that the offset may use, at least one. [T] bool
-        center: Centre of the object in the bind state; its distance is measured. [3]
+        center: Centre of the object in the bind state. [3]
 
     Returns:
-        Distance of the centres at the last time in world units, and angle between the rotations in degrees.
+        Map from the bind state to the world at each time, T(t) A^-1. [T, 4, 4]
     """
     if not observed.any():
         raise ValueError("observed: expected at least one time")
@@ -207,10 +224,13 @@ def aligned_pose_error(
     # The translation is averaged at the centre, not at the object's origin, which may lie far off.
     p_object = np.einsum("tij,tj->ti", np.linalg.inv(offsets), np.append(center, 1.0)[None].repeat(len(offsets), 0))
     align[:3, 3] = np.asarray(center) - align[:3, :3] @ p_object.mean(axis=0)[:3]
-    last = predicted[-1] @ align
-    p_center = np.linalg.inv(align) @ np.append(center, 1.0)
-    distance = np.linalg.norm(((last - poses[-1]) @ p_center)[:3])
-    return float(distance), float(rotation_angle_deg(last[:3, :3], poses[-1, :3, :3]))
+    return poses @ np.linalg.inv(align)
+
+
+def pose_errors(predicted: np.ndarray, motion: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of the centres in world units and angles in degrees between two motions. [T, 4, 4] -> [T], [T]"""
+    distances = np.linalg.norm(((predicted - motion) @ np.append(center, 1.0))[..., :3], axis=-1)
+    return distances, rotation_angle_deg(predicted[..., :3, :3], motion[..., :3, :3])
 
 
 def _check_pair(image: np.ndarray, truth: np.ndarray) -> None:
