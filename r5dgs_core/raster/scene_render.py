@@ -8,6 +8,7 @@ sky, the spherical harmonics `Scene.background_sh` along each pixel's ray, withi
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,6 +55,7 @@ class PosedScene:
         view_maps: Linear maps that bring world directions into the bind frame, up to length. [P, 3, 3]
         pose_ids: Pose of each Gaussian, a row of ``view_maps``. [N] int64
         shading_factor: Factor on the colour, or None. [N] float32
+        origin: Point of the world that ``means`` are relative to. [3] float64
     """
 
     means: np.ndarray
@@ -65,10 +67,15 @@ class PosedScene:
     view_maps: np.ndarray
     pose_ids: np.ndarray
     shading_factor: np.ndarray | None
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
 
 
 def pose_frame(scene: Scene, frame: playback.Frame) -> PosedScene:
     """The Gaussians of a frame of `playback`."""
+    view_maps, pose_ids = playback.sh_rotations(frame.group_quats), frame.motion_ids.astype(np.int64)
+    if frame.turned_rows is not None and frame.turned_quats is not None and frame.sh.shape[1] > 1:
+        pose_ids[frame.turned_rows] = len(view_maps) + np.arange(len(frame.turned_rows))
+        view_maps = np.concatenate([view_maps, playback.sh_rotations(frame.turned_quats)])
     return PosedScene(
         means=frame.means,
         quats=frame.quats,
@@ -76,9 +83,10 @@ def pose_frame(scene: Scene, frame: playback.Frame) -> PosedScene:
         opacity_logits=frame.opacity_logits,
         sh=frame.sh,
         object_ids=frame.object_ids,
-        view_maps=playback.sh_rotations(frame.group_quats),
-        pose_ids=frame.motion_ids.astype(np.int64),
+        view_maps=view_maps,
+        pose_ids=pose_ids,
         shading_factor=frame.shading_factor,
+        origin=frame.origin,
     )
 
 
@@ -163,7 +171,7 @@ def render_frame(
     with torch.no_grad():
         return rasterize(
             PosedGaussians(posed),
-            camera,
+            _relative(camera, posed.origin),
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
             None if background is None else tensor(background),
             colors=tensor(colors(posed, camera)),
@@ -190,7 +198,7 @@ def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
         seen = harmonics.seen_colors(
             tensor(posed.means),
             tensor(posed.sh),
-            camera.center,
+            camera.center - posed.origin,
             view_maps=posed.view_maps,
             pose_ids=posed.pose_ids,
             factor=None if factor is None else tensor(factor),
@@ -202,6 +210,15 @@ def behind(scene: Scene, camera: Camera) -> np.ndarray:
     """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
     image = sky(scene, camera)
     return image[0, 0] if len(scene.background_sh) == 1 else image
+
+
+def _relative(camera: Camera, origin: np.ndarray) -> Camera:
+    """The camera of a world whose origin is a point of ours; itself where that is our origin."""
+    if not origin.any():
+        return camera
+    T_cam_world = camera.T_cam_world.copy()
+    T_cam_world[:3, 3] += T_cam_world[:3, :3] @ origin
+    return dataclasses.replace(camera, T_cam_world=T_cam_world)
 
 
 def to_numpy(value: Any, dtype: type) -> np.ndarray:

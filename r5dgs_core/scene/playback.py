@@ -3,23 +3,46 @@
 Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
 (the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours.
 Blender's Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce
-playback at sub-frames. Before the first knot the pose is held; past t_max it is the motion model's, or what another
-mode says (`modes`).
+playback at sub-frames. Before the first knot the pose is held; past t_max it is what the mode says.
+
+A mode is one string, BASE or BASE/VARIANT; the first of `VARIANTS` is meant where none is given. Up to t_max all modes
+are the same. Past it:
+
+- "rigid" moves every Gaussian with its group. The variant is the source of the group's motion (`group_dynamics`).
+- "hybrid" does, too, except for Gaussians that no group's motion explains (`residuals.unexplained`): they move by their
+  own dynamics.
+- "standard" moves every Gaussian by its own dynamics.
+- "rigid_paper" is Eq. 6 and 7 to the letter; "pinned" leaves what belongs to no body in its place, "anchored" gives it
+  a representative, as the paper's text does.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import keyframes, models, rotations
+from ..motion import propagation, rotations
 from ..motion.keyframes import slopes
-from . import residuals
+from . import group_dynamics, posing
+from .group_dynamics import knots
+from .posing import move_points, rest_factors, runs, turn_quats
+from .residuals import Literal, OwnMotion, Residuals, unexplained
 from .scene import Scene
 
-MODES = ("rigid", "standard", "rigid_paper")
+__all__ = (
+    "MODES", "VARIANTS", "Frame", "Player", "available", "frame", "group_poses", "knot_slopes", "knots", "modes",
+    "move_points", "pose", "rest_factors", "runs", "sh_rotations", "slopes", "split", "turn_quats",
+)  # fmt: skip
+
+MODES = ("rigid", "hybrid", "standard", "rigid_paper")
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "rigid": group_dynamics.SOURCES,
+    "hybrid": group_dynamics.SOURCES,
+    "standard": (),
+    "rigid_paper": ("pinned", "anchored"),
+}
 
 
 @dataclass(frozen=True)
@@ -27,13 +50,13 @@ class Frame:
     """The Gaussians of a scene at time t.
 
     `sh` stays in the frame of the bind state: a renderer turns each viewing direction back by the group's rotation
-    (`sh_rotations`) instead of turning the coefficients.
+    (`sh_rotations`), or by the Gaussian's own, instead of turning the coefficients.
 
     Attributes:
         t: Scene time.
-        means: Centres, world. [N, 3] float32
+        means: Centres relative to ``origin``, along the world's axes. [N, 3] float32
         quats: Unit wxyz. [N, 4] float32
-        log_scales: As in the scene. [N, 3] float32
+        log_scales: [N, 3] float32
         opacity_logits: As in the scene. [N] float32
         sh: As in the scene, bind frame. [N, K, 3] float32
         shading_factor: Factor on the colour, >= 0, or None without shading. [N] float32
@@ -41,6 +64,9 @@ class Frame:
         motion_ids: [N] int32
         group_quats: Rotation of each motion group since the bind state, unit wxyz. [G, 4] float64
         group_displacements: Displacement of each group's pivot, world. [G, 3] float64
+        origin: Point of the world that ``means`` are relative to. [3] float64
+        turned_rows: Gaussians that turned otherwise than their group, or None. [R] int64
+        turned_quats: Their rotations since the bind state, unit wxyz, or None. [R, 4] float64
     """
 
     t: float
@@ -54,18 +80,198 @@ class Frame:
     motion_ids: np.ndarray
     group_quats: np.ndarray
     group_displacements: np.ndarray
+    origin: np.ndarray
+    turned_rows: np.ndarray | None = None
+    turned_quats: np.ndarray | None = None
 
 
-def knots(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Poses at the observed times with signs chosen so that quaternions are continuous and end at (1, 0, 0, 0).
+def split(mode: str) -> tuple[str, str]:
+    """Base and variant of a mode; the variant is the first one where none is given, "" where there are none.
+
+    Raises:
+        ValueError: There is no such mode.
+    """
+    base, slash, variant = mode.partition("/") if isinstance(mode, str) else ("", "", "")
+    if base not in MODES:
+        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+    variants = VARIANTS[base]
+    if slash and variant not in variants:
+        known = ", ".join(f"{base}/{name}" for name in variants) or base
+        raise ValueError(f"mode: expected one of {known}, got {mode!r}")
+    return base, variant or next(iter(variants), "")
+
+
+def modes(scene: Scene) -> tuple[str, ...]:
+    """All modes that a scene holds data for, each once: `rigid` always, the others where it carries dynamics."""
+    return tuple(mode for mode in _ALL if available(scene, mode))
+
+
+def available(scene: Scene, mode: str) -> bool:
+    """Whether a scene holds data for a mode. Raises ValueError where there is no such mode."""
+    base, variant = split(mode)
+    if base == "rigid_paper":
+        return scene.dynamics is not None and scene.canonical_means is not None
+    return scene.dynamics is not None or (base == "rigid" and variant == "fitted")
+
+
+_ALL = tuple(
+    mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:]))
+)  # the first variant is the base itself
+
+
+class Player:
+    """A scene in one mode, ready for any time; what does not depend on the time is computed once, when it is needed.
+
+    Args:
+        scene: The scene; its arrays must not change.
+        mode: Of `modes`.
+
+    Raises:
+        ValueError: There is no such mode, or the scene holds no data for it.
+    """
+
+    def __init__(self, scene: Scene, mode: str = "rigid"):
+        self.scene, self.mode = scene, mode
+        self._base, self._variant = split(mode)
+        if not available(scene, mode):
+            raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
+        self._poser = posing.Poser(scene)
+        source = self._variant if self._base in ("rigid", "hybrid") else "fitted"
+        self._groups = group_dynamics.GroupMotion(scene, source)
+
+    @functools.cached_property
+    def _residuals(self) -> Residuals:
+        return Residuals(self.scene)
+
+    @functools.cached_property
+    def _own(self) -> OwnMotion | None:
+        if self._base == "standard":
+            return OwnMotion(self.scene)
+        rows = unexplained(self.scene) if self._base == "hybrid" else ()
+        return OwnMotion(self.scene, np.asarray(rows)) if len(rows) else None
+
+    @functools.cached_property
+    def _literal(self) -> Literal:
+        return Literal(self.scene, self._variant == "anchored")
+
+    def group_poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of every motion group that this mode's Gaussians are moved by, relative to the bind state.
+
+        Returns:
+            Unit quaternions wxyz [G, 4] and displacements of the pivots (of the representatives in mode "rigid_paper"),
+            world [G, 3], float64; those at rest in mode "standard".
+        """
+        if t <= self.scene.t_max or self._base in ("rigid", "hybrid"):
+            return self._groups.poses(t)
+        if self._base == "rigid_paper":
+            return self._literal.at(t - self.scene.t_max)
+        return rotations.identity(len(self.scene.groups)), np.zeros((len(self.scene.groups), 3))
+
+    def frame(self, t: float, origin: np.ndarray | None = None) -> Frame:
+        """The scene's Gaussians at a time.
+
+        Args:
+            t: Scene time.
+            origin: Point of the world that the centres are to be relative to, such as the camera's; the world's own
+                where None. Single precision is sharp near it. [3]
+
+        Returns:
+            The frame. Gaussians that did not move are equal to the bind state to the bit where there is no origin.
+        """
+        scene, poser = self.scene, self._poser
+        center = np.zeros(3) if origin is None else np.array(origin, np.float64)
+        if center.shape != (3,) or not np.isfinite(center).all():
+            raise ValueError(f"origin: expected three finite numbers, got {origin!r}")
+        quats, displacements = self.group_poses(t)
+        past = t > scene.t_max
+        if past and self._base == "rigid_paper":
+            means = self._literal.means(poser, quats, displacements, center)
+        else:
+            means = poser.means(quats, displacements, center)
+        moved = _Moved(means, poser.quats(quats), scene.log_scales, poser.shading(quats))
+        if not past:
+            self._bend(moved, t, quats, displacements, center)
+        elif self._own is not None:
+            self._part(moved, t - scene.t_max, center)
+        return Frame(
+            t=float(t),
+            means=moved.means,
+            quats=moved.quats,
+            log_scales=moved.log_scales,
+            opacity_logits=scene.opacity_logits,
+            sh=scene.sh,
+            shading_factor=moved.shading,
+            object_ids=scene.object_ids,
+            motion_ids=scene.motion_ids,
+            group_quats=quats,
+            group_displacements=displacements,
+            origin=center,
+            turned_rows=moved.rows,
+            turned_quats=moved.turns,
+        )
+
+    def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:
+        """Residuals of the observed time, in the bind state before the group moves it."""
+        found = self._residuals.at(t)
+        if found is None:
+            return
+        offsets, turns, growths = found
+        rows, scene = self._residuals.rows, self.scene
+        arms = self._poser.arms[rows]
+        arms[:, :3] += offsets
+        maps = self._poser.maps(quats, displacements, origin)
+        for start, stop, g in self._residuals.runs:
+            moved.means[rows[start:stop]] = arms[start:stop] @ maps[g]
+        since = propagation.multiply(quats.T[:, scene.motion_ids[rows]], turns.T)
+        moved.turn(rows, since, propagation.multiply(since, scene.quats[rows].T), scene)
+        moved.log_scales = scene.log_scales.copy()
+        moved.log_scales[rows] += growths
+        self._poser.relight(moved.shading, rows, since)
+
+    def _part(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:
+        """Gaussians that leave their groups past t_max."""
+        assert self._own is not None
+        means, quats, turns = self._own.at(tau, origin)
+        moved.means[self._own.rows] = means.T
+        moved.turn(self._own.rows, turns, quats, self.scene)
+        self._poser.relight(moved.shading, self._own.rows, turns)
+
+
+@dataclass
+class _Moved:
+    """What becomes a frame. means [N, 3], quats [N, 4], log_scales [N, 3], shading [N]; rows [R], turns [R, 4]"""
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    shading: np.ndarray | None
+    rows: np.ndarray | None = None
+    turns: np.ndarray | None = None
+
+    def turn(self, rows: np.ndarray, since: np.ndarray, quats: np.ndarray, scene: Scene) -> None:
+        """Take rotations of some Gaussians since the bind state, and what they turned: by column, [4, R]."""
+        if self.quats is scene.quats:
+            self.quats = scene.quats.copy()
+        self.quats[rows] = quats.T
+        self.rows, self.turns = rows, since.T
+
+
+def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | None = None) -> Frame:
+    """The scene's Gaussians at time t. Whoever asks for many times keeps a `Player`.
+
+    Args:
+        scene: The scene.
+        t: Scene time.
+        mode: How Gaussians move past t_max, of `modes`.
+        origin: Point of the world that the centres are to be relative to, or None. [3]
 
     Returns:
-        Quaternions [G, S, 4] and displacements [G, S, 3], float64.
+        As `Player.frame`.
+
+    Raises:
+        ValueError: There is no such mode, or the scene holds no data for it.
     """
-    quats = np.moveaxis(np.asarray(scene.track_poses[..., :4], np.float64), 1, 0)
-    quats = rotations.make_continuous(quats[::-1])[::-1]
-    quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
-    return np.moveaxis(quats, 0, 1), np.asarray(scene.track_poses[..., 4:], np.float64)
+    return Player(scene, mode).frame(t, origin)
 
 
 def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +281,7 @@ def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of every motion group relative to the bind state.
+    """Pose of every motion group relative to the bind state, in mode "rigid".
 
     Args:
         scene: The scene.
@@ -85,106 +291,12 @@ def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
         Unit quaternions wxyz [G, 4] and displacements of the pivots, world [G, 3], float64. At t_max exactly the
         identity; a group that `follows` another takes its displacement through `follow_matrix` past t_max.
     """
-    if not np.isfinite(t):
-        raise ValueError(f"t: expected a finite scene time, got {t}")
-    if t < scene.t_max:
-        return _observed_poses(scene, t)
-    count = len(scene.groups)
-    quats, displacements = rotations.identity(count), np.zeros((count, 3))
-    tau = t - scene.t_max
-    leaders = [g for g, group in enumerate(scene.groups) if group.follows is None]
-    quats[leaders], displacements[leaders] = models.evaluate_all([scene.groups[g].model for g in leaders], tau)
-    for g, group in enumerate(scene.groups):
-        if group.follows is not None and group.follow_matrix is not None:
-            displacements[g] = group.follow_matrix @ displacements[group.follows]
-    return quats, displacements
-
-
-def _observed_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
-    times = scene.track_times
-    quats, displacements = knots(scene)
-    if t <= times[0]:
-        return rotations.normalize(quats[:, 0]), displacements[:, 0].copy()
-    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
-    h = times[k + 1] - times[k]
-    u = (t - times[k]) / h
-    quat_slopes, displacement_slopes = slopes(times, quats), slopes(times, displacements)
-    q = keyframes.hermite(quats[:, k], quats[:, k + 1], quat_slopes[:, k], quat_slopes[:, k + 1], h, u)
-    d = keyframes.hermite(
-        displacements[:, k], displacements[:, k + 1], displacement_slopes[:, k], displacement_slopes[:, k + 1], h, u
-    )
-    return rotations.normalize(q), d
+    return group_dynamics.GroupMotion(scene).poses(t)
 
 
 def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
     """Matrices that bring world directions into each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
     return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
-
-
-def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
-    """Stretches of equal ids as (start, stop, id). [N]"""
-    if len(ids) == 0:
-        return []
-    cuts = np.flatnonzero(ids[1:] != ids[:-1]) + 1
-    starts = np.concatenate([[0], cuts])
-    stops = np.concatenate([cuts, [len(ids)]])
-    return [(int(a), int(b), int(ids[a])) for a, b in zip(starts, stops, strict=True)]
-
-
-def modes(scene: Scene) -> tuple[str, ...]:
-    """The modes that a scene holds data for: `rigid` always, the others where it carries dynamics of its Gaussians."""
-    present = (True, scene.dynamics is not None, scene.dynamics is not None and scene.canonical_means is not None)
-    return tuple(mode for mode, there in zip(MODES, present, strict=True) if there)
-
-
-def frame(scene: Scene, t: float, mode: str = "rigid") -> Frame:
-    """The scene's Gaussians at time t.
-
-    Args:
-        scene: The scene.
-        t: Scene time.
-        mode: How Gaussians move past t_max. "rigid": with their motion group; "standard": each by its own dynamics;
-            "rigid_paper": Eq. 6 and 7 to the letter. Up to t_max all are the same.
-
-    Returns:
-        The frame. Gaussians that did not move are equal to the bind state to the bit.
-
-    Raises:
-        ValueError: There is no such mode, or the scene holds no data for it (`modes`).
-    """
-    if mode not in MODES:
-        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
-    if mode not in modes(scene):
-        raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
-    if mode == "rigid" or t <= scene.t_max:
-        group_quats, group_displacements = group_poses(scene, t)
-        bind, turns = residuals.deformed(scene, t)
-        posed = pose(bind, group_quats, group_displacements, t)
-        if turns is None or scene.residual_rows is None:
-            return posed
-        rows = scene.residual_rows
-        return _relight(scene, posed, rows, rotations.multiply(group_quats[scene.motion_ids[rows]], turns))
-    move = residuals.standard if mode == "standard" else residuals.literal
-    means, quats, turns = move(scene, t - scene.t_max)
-    bind = pose(scene, rotations.identity(len(scene.groups)), np.zeros((len(scene.groups), 3)), t)
-    return _relight(scene, dataclasses.replace(bind, means=means, quats=quats), np.arange(len(means)), turns)
-
-
-def _relight(scene: Scene, posed: Frame, rows: np.ndarray, turns: np.ndarray) -> Frame:
-    """The frame with the shading of Gaussians that turned on their own. rows [R], turns since t_max [R, 4]"""
-    vectors, light = scene.shading, scene.light_direction
-    if posed.shading_factor is None or vectors is None or light is None:
-        return posed
-    change = rotations.rotate(rotations.conjugate(turns), light) - light
-    factor = posed.shading_factor.copy()
-    factor[rows] = np.maximum(rest_factors(scene)[rows] + (vectors[rows] * change).sum(-1), 0)
-    return dataclasses.replace(posed, shading_factor=factor)
-
-
-def rest_factors(scene: Scene) -> np.ndarray:
-    """Factor of each Gaussian's colour in the bind state, before it is bounded at 0. [N] float32"""
-    rest = scene.shading_rest
-    return np.ones(len(scene.means), np.float32) if rest is None else rest
 
 
 def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:
@@ -196,60 +308,18 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         group_displacements: Displacement of each pivot, world. [G, 3]
         t: Time written into the frame.
     """
-    means, quats = scene.means, scene.quats
-    gradients, light = scene.shading, scene.light_direction
-    rest = rest_factors(scene)
-    shading = None if gradients is None or light is None else np.maximum(rest, 0)
-    rotmats = rotations.quats_to_rotmats(group_quats)
-    moved = np.flatnonzero((group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1))
-    if len(moved):
-        means, quats = means.copy(), quats.copy()
-    for start, stop, g in runs(scene.motion_ids):
-        if g not in moved:
-            continue
-        rows, pivot = slice(start, stop), np.asarray(scene.groups[g].pivot, np.float64)
-        shift = pivot + group_displacements[g] - rotmats[g] @ pivot
-        move_points(scene.means[rows], rotmats[g], shift, means[rows])
-        turn_quats(scene.quats[rows], group_quats[g], quats[rows])
-        if shading is not None and gradients is not None and light is not None:
-            change = (rotmats[g].T @ light - light).astype(np.float32)
-            shading[rows] = np.maximum(rest[rows] + gradients[rows] @ change, 0)
+    poser, center = posing.Poser(scene), np.zeros(3)
     return Frame(
         t=float(t),
-        means=means,
-        quats=quats,
+        means=poser.means(group_quats, group_displacements, center),
+        quats=poser.quats(group_quats),
         log_scales=scene.log_scales,
         opacity_logits=scene.opacity_logits,
         sh=scene.sh,
-        shading_factor=shading,
+        shading_factor=poser.shading(group_quats),
         object_ids=scene.object_ids,
         motion_ids=scene.motion_ids,
         group_quats=group_quats,
         group_displacements=group_displacements,
+        origin=center,
     )
-
-
-def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:
-    """Write ``linear p + shift`` for each point p to ``result``, computed in float64.
-
-    Args:
-        points: [N, 3] float32
-        linear: [3, 3] float64
-        shift: [3] float64
-        result: Not ``points``. [N, 3] float32
-    """
-    turned = points.astype(np.float64) @ linear.T
-    for axis in range(3):  # a column at a time: numpy is slow at rows of three
-        np.add(turned[:, axis], shift[axis], out=result[:, axis], casting="same_kind")
-
-
-def turn_quats(quats: np.ndarray, turn: np.ndarray, result: np.ndarray) -> None:
-    """Write the products ``turn q`` to ``result``, computed in float64.
-
-    Args:
-        quats: Unit wxyz. [N, 4] float32
-        turn: Unit wxyz. [4] float64
-        result: Not ``quats``. [N, 4] float32
-    """
-    # Linear in q: row k of the matrix is the product with the k-th unit quaternion.
-    result[:] = quats.astype(np.float64) @ rotations.multiply(turn, np.eye(4))

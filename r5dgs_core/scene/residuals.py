@@ -7,84 +7,143 @@ q -> turn q, log scale -> log scale + growth; its group moves the result. Betwee
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from ..motion import dynamics, keyframes, rotations
+from ..motion import dynamics, keyframes, propagation, rotations, stepping
+from . import group_dynamics
+from .posing import Poser, runs
 from .scene import Scene
 
 TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
+ANGLE_TOLERANCE = 1e-3  # error of its rotations, rad
+UNEXPLAINED = 0.1  # of the group's radius: residuals from there on belong to no motion of a group
 
 
-def deformed(scene: Scene, t: float) -> tuple[Scene, np.ndarray | None]:
-    """The scene with its bind state as the residuals have it at a time up to t_max.
+class Residuals:
+    """What the residuals of a scene say at any time; the coefficients of the last interval are kept.
 
-    Returns:
-        The scene, itself where it has no residuals then, and their rotations, unit wxyz [R, 4], or None.
+    Attributes:
+        rows: Gaussians that have some, increasing. [R]
+        runs: Stretches of ``rows`` of one motion group: start, stop, group.
     """
-    rows = scene.residual_rows
-    parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
-    if rows is None or len(rows) == 0 or t >= scene.t_max or any(part is None for part in parts):
-        return scene, None
-    offsets, turns, growths = (_at(scene.track_times, part, t) for part in parts if part is not None)
-    means, quats, log_scales = scene.means.copy(), scene.quats.copy(), scene.log_scales.copy()
-    means[rows] += offsets
-    turns = rotations.normalize(turns)
-    quats[rows] = rotations.multiply(turns, quats[rows].astype(np.float64))
-    log_scales[rows] += growths
-    return dataclasses.replace(scene, means=means, quats=quats, log_scales=log_scales), turns
+
+    def __init__(self, scene: Scene):
+        parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
+        rows = scene.residual_rows
+        there = rows is not None and len(rows) > 0 and all(part is not None for part in parts)
+        self.rows = np.asarray(rows, np.int64) if there and rows is not None else np.zeros(0, np.int64)
+        self._parts = tuple(part for part in parts if part is not None) if there else ()
+        self.runs = runs(scene.motion_ids[self.rows])
+        self._times, self._t_max = scene.track_times, scene.t_max
+        self._interval: tuple[int, list[tuple[np.ndarray, ...]]] | None = None
+
+    def at(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Offsets [R, 3], unit quaternions wxyz [R, 4] and changes of log scales [R, 3] at a time, float64.
+
+        Returns:
+            The three, as before the first knot held, or None where there are none: from t_max on.
+        """
+        if len(self.rows) == 0 or t >= self._t_max:
+            return None
+        times = self._times
+        if t <= times[0]:
+            offsets, turns, growths = (part[:, 0].astype(np.float64) for part in self._parts)
+            return offsets, rotations.normalize(turns), growths
+        k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+        if self._interval is None or self._interval[0] != k:
+            self._interval = k, [_cubic(times, part, k) for part in self._parts]
+        h = times[k + 1] - times[k]
+        offsets, turns, growths = (keyframes.hermite(*ends, h, (t - times[k]) / h) for ends in self._interval[1])
+        return offsets, rotations.normalize(turns), growths
 
 
-def _at(times: np.ndarray, values: np.ndarray, t: float) -> np.ndarray:
-    """Curves through knots at a time, held before the first one. [R, S, C] -> [R, C] float64"""
-    if t <= times[0] or len(times) == 1:
-        return values[:, 0].astype(np.float64)
-    k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+    """Values and slopes at the ends of interval k of curves through knots. [R, S, C] -> four times [R, C] float64"""
     window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope asks for the neighbours of its knot alone
     near = values[:, window].astype(np.float64)
     if values.shape[-1] == 4:
         flip = np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(-1) < 0, -1.0, 1.0), axis=1)
         near[:, 1:] *= flip[..., None]
-    rates = keyframes.slopes(times[window], near)
-    i, h = k - window.start, times[k + 1] - times[k]
-    return keyframes.hermite(near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1], h, (t - times[k]) / h)
+    rates, i = keyframes.slopes(times[window], near), k - window.start
+    return tuple(np.ascontiguousarray(part) for part in (near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1]))
 
 
-def standard(scene: Scene, tau: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every Gaussian by its own dynamics, ``tau`` after t_max.
+def unexplained(scene: Scene) -> np.ndarray:
+    """Gaussians that the motion of no group explains, for mode "hybrid": increasing rows. [H] int64
 
-    Returns:
-        Means [N, 3] float32, quats [N, 4] float32, and rotations since t_max [N, 4] float64.
+    Their residuals leave the motion of their group by more than `UNEXPLAINED` of its radius (root mean square over the
+    knots). Of a group that rests by rule, every residual does.
     """
-    assert scene.dynamics is not None
-    turns, moves = dynamics.propagate(scene.dynamics, tau, TOLERANCE * scene.extent)
-    means = (scene.means + moves).astype(np.float32)
-    return means, rotations.multiply(turns, scene.quats.astype(np.float64)).astype(np.float32), turns
+    rows, offsets = scene.residual_rows, scene.residual_offsets
+    if rows is None or offsets is None or len(rows) == 0:
+        return np.zeros(0, np.int64)
+    limits = np.array([0.0 if g.role == "pinned" else UNEXPLAINED * g.model.radius for g in scene.groups])
+    away = np.sqrt(np.einsum("rsc,rsc->r", offsets, offsets, dtype=np.float64) / offsets.shape[1])
+    return rows[away > limits[scene.motion_ids[rows]]].astype(np.int64)
 
 
-def literal(scene: Scene, tau: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eq. 6 and 7 of the paper to the letter, ``tau`` after t_max; groups that are no bodies stay.
+class OwnMotion:
+    """Gaussians that move by their own dynamics past t_max.
+
+    Args:
+        scene: The scene, with `dynamics`.
+        rows: Those that do; all where None.
+    """
+
+    def __init__(self, scene: Scene, rows: np.ndarray | None = None):
+        assert scene.dynamics is not None
+        chosen = np.arange(len(scene.means)) if rows is None else rows
+        tolerance = TOLERANCE * scene.extent
+        self._propagator = propagation.Propagator(scene.dynamics[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE)
+        self.rows = chosen[self._propagator.rows]
+        self._means = np.ascontiguousarray(scene.means[self.rows].T, np.float64)
+        self._quats = np.ascontiguousarray(scene.quats[self.rows].T, np.float64)
+
+    def at(self, tau: float, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means relative to the origin [3, R], quats [4, R] and rotations since t_max [4, R] by column, float64."""
+        turns, moves = self._propagator.columns(tau)
+        moves += self._means
+        moves -= origin[:, None]
+        return moves, propagation.multiply(turns, self._quats), turns
+
+
+class Literal:
+    """Eq. 6 and 7 of the paper to the letter.
 
     x_i = y_i + (p_r - y_r) + (R - I) (x_i - x_r) with y the state at t_max, x the canonical one and r the group's
     representative, which moves by its own dynamics and TRACE's integrator. This is not rigid where the object turned
     between the canonical time and t_max; `playback` has the form that is.
 
-    Returns:
-        As `standard`.
+    Args:
+        scene: The scene, with `dynamics` and `canonical_means`.
+        anchored: Whether what belongs to no body has a representative, too, as in the paper's text; else it stays.
     """
-    assert scene.dynamics is not None and scene.canonical_means is not None
-    means, quats = scene.means.astype(np.float64), scene.quats.astype(np.float64)
-    turns = rotations.identity(len(means))
-    step = dynamics.TRACE_STEP * dynamics.time_unit(float(scene.track_times[0]), scene.t_max)
-    for group in scene.groups:
-        rows = np.flatnonzero(scene.motion_ids == group.id)
-        r = group.anchor_index
-        if group.role != "body" or r < 0:
-            continue
-        v, w, a, e = np.split(scene.dynamics[r].astype(np.float64), 4)
-        moved, turn = dynamics.rk2(np.zeros(3), v, w, a, e, tau, step)
-        offsets = scene.canonical_means[rows].astype(np.float64) - scene.canonical_means[r]
-        means[rows] += moved + rotations.rotate(turn, offsets) - offsets
-        turns[rows] = turn
-    return means.astype(np.float32), rotations.multiply(turns, quats).astype(np.float32), turns
+
+    def __init__(self, scene: Scene, anchored: bool = False):
+        assert scene.dynamics is not None and scene.canonical_means is not None
+        anchors = np.array([g.anchor_index if g.role == "body" else -1 for g in scene.groups])
+        loose = np.flatnonzero(np.isin(scene.motion_ids, [g.id for g in scene.groups if g.role != "body"]))
+        if anchored and len(loose):
+            anchors[[g.role != "body" for g in scene.groups]] = group_dynamics.representative(scene, loose)
+        self._moving = np.flatnonzero(anchors >= 0)
+        self._anchors = anchors[self._moving]
+        v, w, a, e = np.split(scene.dynamics[self._anchors].astype(np.float64), 4, axis=-1)
+        step = dynamics.TRACE_STEP * dynamics.time_unit(float(scene.track_times[0]), scene.t_max)
+        self._path = stepping.SteppedPath(np.zeros_like(v), v, w, a, e, step)
+        canonical = scene.canonical_means.astype(np.float64)
+        self._offsets = np.ones((len(canonical), 4))
+        self._offsets[:, :3] = canonical - canonical[np.maximum(anchors, 0)[scene.motion_ids]]
+        self._count = len(scene.groups)
+
+    def at(self, tau: float) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [G, 4] and displacements [G, 3] of the representatives."""
+        quats, displacements = rotations.identity(self._count), np.zeros((self._count, 3))
+        displacements[self._moving], quats[self._moving] = self._path.at(tau)
+        return quats, displacements
+
+    def means(self, poser: Poser, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Centres relative to an origin, for what `at` gives. [N, 3] float32"""
+        maps = np.empty((self._count, 4, 3))
+        maps[:, :3] = np.swapaxes(rotations.quats_to_rotmats(quats), -1, -2) - np.eye(3)
+        maps[:, 3] = displacements
+        return poser.shift(self._offsets, maps, origin)

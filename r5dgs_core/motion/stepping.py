@@ -1,0 +1,44 @@
+"""TRACE's midpoint steps for random access: whole steps that were taken once are kept."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import dynamics, rotations
+
+
+class SteppedPath:
+    """`dynamics.rk2` of the same points at many times, to the bit.
+
+    Args:
+        points: Where the points start. [..., 3]
+        v: Velocity of the point at the origin. [..., 3]
+        w: Angular velocity, rad per unit. [..., 3]
+        a: Rate of v. [..., 3]
+        e: Rate of w. [..., 3]
+        step: Longest step, > 0.
+    """
+
+    def __init__(self, points: np.ndarray, v: np.ndarray, w: np.ndarray, a: np.ndarray, e: np.ndarray, step: float):
+        self._rates, self._step = (a, e), step
+        self._states = [(points, rotations.rotvecs_to_quats(0 * points), v, w)]
+
+    def at(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
+        """Points [..., 3] and rotations since the start, unit wxyz [..., 4], at a time >= 0."""
+        if duration < 0:
+            raise ValueError(f"duration: expected a time >= 0, got {duration}")
+        if duration == 0:
+            return self._states[0][:2]
+        count = max(1, math.ceil(duration / self._step - 1e-9))
+        while len(self._states) < count:
+            self._states.append(self._next(self._states[-1], self._step))
+        return self._next(self._states[count - 1], duration - self._step * (count - 1))[:2]
+
+    def _next(self, state: tuple[np.ndarray, ...], h: float) -> tuple[np.ndarray, ...]:
+        """Points, rotations and twist a step later."""
+        (points, quats, v, w), (a, e) = state, self._rates
+        points, turn = dynamics.rk2(points, v, w, a, e, h, h)
+        half_v, half_w = 0.5 * h * a, 0.5 * h * e
+        return points, rotations.multiply(turn, quats), v + half_v + half_v, w + half_w + half_w
