@@ -44,11 +44,16 @@ def run_train(
 
 
 def run_bake(run_folder: Path, out: Path, data: Path | None, overrides: Sequence[str] = ()) -> None:
-    """Turn a run into a scene file (see `train.bake.run_bake`)."""
+    """Turn a run into a scene file (see `train.bake.run_bake`) and say what the scene needs."""
+    from rich.console import Console
+
+    from .report import table
     from .train import bake
 
     _check_scene_name(out)
-    _tell_scene(bake.run_bake(run_folder, out, data, overrides), out)
+    scene = bake.run_bake(run_folder, out, data, overrides)
+    _tell_scene(scene, out)
+    Console().print(table.needs(scene.needs))
 
 
 def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **options: Any) -> None:

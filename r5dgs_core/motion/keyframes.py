@@ -15,6 +15,7 @@ import numpy as np
 
 from . import models, rotations
 
+_ROUNDING = 1e-9  # of the largest value
 MAX_STEP_RAD = math.radians(120.0)
 _FINER = 4  # points of the checking grid per possible key time
 _FIRST_INTERVALS = 64
@@ -110,7 +111,7 @@ def join(first: Curves, second: Curves) -> Curves:
     """Curves of two motions that meet: the end of ``first`` is the start of ``second``; the kink between them stays.
 
     A curve of one key is constant: it is held until the other motion starts, and stays one key where that is constant
-    too.
+    too. The key at the meeting goes where it changes nothing: a straight and steady path has two keys in all.
     """
 
     def chain(a: Keys, b: Keys, flip: float) -> Keys:
@@ -135,7 +136,22 @@ def join(first: Curves, second: Curves) -> Curves:
         )
 
     flip = -1.0 if float(first.rotation.values[-1] @ second.rotation.values[0]) < 0 else 1.0
-    return Curves(chain(first.location, second.location, 1.0), chain(first.rotation, second.rotation, flip))
+    joint = float(second.location.times[0])
+    location = _without(chain(first.location, second.location, 1.0), joint)
+    return Curves(location, _without(chain(first.rotation, second.rotation, flip), joint))
+
+
+def _without(keys: Keys, time: float) -> Keys:
+    """The keys without the one at a time, if the cubic between its neighbours is the same curve to rounding."""
+    k = int(np.searchsorted(keys.times, time))
+    if not 0 < k < len(keys.times) - 1 or keys.times[k] != time:
+        return keys
+    rows = np.delete(np.arange(len(keys.times)), k)
+    fewer = Keys(keys.times[rows], keys.values[rows], keys.left_slopes[rows], keys.right_slopes[rows])
+    between = np.linspace(keys.times[k - 1], keys.times[k + 1], 17)
+    sides = np.abs(keys.left_slopes[k] - keys.right_slopes[k]).max() * (between[-1] - between[0])
+    change = max(float(np.abs(evaluate(fewer, between) - evaluate(keys, between)).max()), float(sides))
+    return fewer if change <= _ROUNDING * max(float(np.abs(keys.values).max()), 1e-300) else keys
 
 
 def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""An evaluation as one table for the terminal."""
+"""An evaluation, and what a scene needs, as tables for the terminal."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.table import Table
@@ -55,6 +56,32 @@ def make(evaluation: dict[str, Any]) -> Table:
     for row in rows:
         position, angle = f"{row['position_error']:.4f}", f"{row['rotation_error_deg']:.2f} deg"
         table.add_row(f"{row['name']} ({row['id']})", position, angle, *rest)
+    return table
+
+
+def needs(rows: Sequence[dict[str, Any]]) -> Table:
+    """The needs table of a scene: of the whole, then object by object.
+
+    Args:
+        rows: ``Scene.needs``.
+
+    Returns:
+        The table, to print with rich.
+    """
+    table = Table(title="what the scene needs", title_justify="left")
+    for name, side in (("", "left"), ("need", "left"), ("value", "right"), ("threshold", "right"), ("", "left")):
+        table.add_column(name, justify=side)  # type: ignore[arg-type]
+    table.add_column("what the value is", overflow="fold")
+    owner = None
+    for row in rows:
+        if row.get("object") != owner:
+            table.add_section()
+        shown = "" if row.get("object") == owner else row.get("object", "")
+        owner = row.get("object")
+        numbers = (f"{float(row.get(key, float('nan'))):.4g}" for key in ("value", "threshold"))
+        table.add_row(
+            shown, str(row.get("name", "")), *numbers, str(row.get("decision", "")), str(row.get("reason", ""))
+        )
     return table
 
 

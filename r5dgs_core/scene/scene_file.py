@@ -153,6 +153,7 @@ def info(scene: Scene) -> dict[str, Any]:
         "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),
         "modes": list(playback.modes(scene)),
         "vocabulary": len(scene.vocabulary),
+        "needs": list(scene.needs),
     }
 
 

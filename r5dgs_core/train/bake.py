@@ -24,7 +24,7 @@ from ..model.gaussians import SEEN_OPACITY
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, mask_stack, needs, point_baking, representation, residual
+from . import checkpoint, groups, mask_stack, needs, plain_motion, point_baking, representation, residual
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -53,15 +53,16 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     cloud, motion = _observed(run, state, norm)
     light, strength = _unit(motion.light)
     cloud.shading *= strength
-    rows, true_poses, track_poses = _bind(cloud, motion, norm, light, wanted)
+    names = {int(i): dataset.object_names.get(int(i), f"object {i}") for i in tensors["object_ids"]}
+    bound = _bind(cloud, motion, norm, light, wanted, names)
+    rows, track_poses = bound.rows, bound.played
     order = np.lexsort((cloud.motion_ids, cloud.object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
     single: dict[str, Any] = {}
     if motion.points is not None and wanted.tracks != "off":
-        pivots = np.stack([row.pivot for row in rows])
         extent = float(np.ptp(np.quantile(cloud.means, [0.01, 0.99], axis=0), axis=0).max())
         # Relative to what the groups really did: what the user switches off must not come back as residuals.
-        single = point_baking.members(motion.points, norm, cloud.motion_ids, true_poses, pivots, order, extent)
+        single = point_baking.members(motion.points, norm, cloud.motion_ids, bound.trained, bound.pivots, order, extent)
     bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
     bases, classified = cloud.sh.shape[1], cloud.identities is not None
     decisions = needs.decide(
@@ -124,7 +125,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
                 "finished": state.finished,
             },
         },
-        needs=decisions,
+        needs=(*decisions, *bound.of_objects),
         near_plane=NEAR_PLANE * norm.scale,
         **single,
     )
@@ -157,6 +158,25 @@ class _Cloud:
     motion_ids: np.ndarray
     object_ids: np.ndarray
     identities: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """What `_bind` finds.
+
+    Attributes:
+        rows: The scene's groups.
+        trained: Their poses relative to the bind state as they were trained. [G, S, 7]
+        pivots: Points that these turn about. [G, 3]
+        played: As the scene plays them, without what is still, switched off or noise. [G, S, 7]
+        of_objects: Rows of the needs table for each object.
+    """
+
+    rows: list[MotionGroup]
+    trained: np.ndarray
+    pivots: np.ndarray
+    played: np.ndarray
+    of_objects: list[dict[str, Any]]
 
 
 def _observed(
@@ -203,15 +223,15 @@ def _observed(
 
 
 def _bind(
-    cloud: _Cloud, motion: groups.ObservedMotion, norm: Normalization, light: np.ndarray, wanted: NeedsSection
-) -> tuple[list[MotionGroup], np.ndarray, np.ndarray]:
-    """Bring the Gaussians to the bind state, in place, and fit the motion of their groups.
-
-    Returns:
-        The scene's groups; their poses relative to the bind state as they were trained, and as the scene plays them,
-        without what is still or switched off. [G, S, 7] each
-    """
-    rows, trained, played = [], [], []
+    cloud: _Cloud,
+    motion: groups.ObservedMotion,
+    norm: Normalization,
+    light: np.ndarray,
+    wanted: NeedsSection,
+    names: dict[int, str],
+) -> _Bound:
+    """Bring the Gaussians to the bind state, in place, and fit the motion of their groups."""
+    rows, trained, pivots, played, of_objects = [], [], [], [], []
     opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     for index, group in enumerate(motion.groups):
         members = cloud.motion_ids == index
@@ -230,15 +250,24 @@ def _bind(
             first = int(np.argmax(group.observed))
             poses[:first] = poses[first]
         trained.append(poses.copy())
+        pivots.append(pivot)
         radius = _radius(cloud.means[members], opacities[members], pivot)
         if wanted.rotation == "off":
             poses[:, :4] = needs.STILL_QUAT
         if needs.is_pinned(group.role, poses, radius, wanted):
             poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
+        model = MotionModel(radius=radius)
+        if group.role == "body" and np.any(poses[:, 1:] != 0):
+            seen = group.observed.astype(np.float64)
+            fit = fitting.fit(motion.times, poses[:, :4], poses[:, 4:], radius=radius, weights=seen)
+            plain = plain_motion.reduce(names[group.object_id], motion.times, poses, fit)
+            poses, model, pivot = plain.poses, plain.model, pivot + plain.shift
+            cloud.means[members] += plain.shift
+            of_objects += plain.rows
         played.append(poses)
         anchor = _anchor(np.flatnonzero(members), cloud.means[members], opacities[members], pivot)
-        rows.append(_motion_group(index, group, motion.times, poses, pivot, radius, anchor))
-    return rows, np.stack(trained), np.stack(played)
+        rows.append(_motion_group(index, group, motion.times, pivot, model, anchor))
+    return _Bound(rows, np.stack(trained), np.stack(pivots), np.stack(played), of_objects)
 
 
 def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np.ndarray) -> np.ndarray:
@@ -282,17 +311,11 @@ def _motion_group(
     index: int,
     group: groups.GroupTrack,
     times: np.ndarray,
-    poses: np.ndarray,
     pivot: np.ndarray,
-    radius: float,
+    model: MotionModel,
     anchor: int,
 ) -> MotionGroup:
     """A row of the scene's table of groups, as of one whose members all move rigidly with it."""
-    if group.role == "body" and np.any(poses[:, 1:] != 0):
-        fit = fitting.fit(times, poses[:, :4], poses[:, 4:], radius=radius, weights=group.observed.astype(np.float64))
-        model = fit.model
-    else:
-        model = MotionModel(radius=radius)
     seen = times[group.observed]
     return MotionGroup(
         index,

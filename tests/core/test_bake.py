@@ -82,6 +82,9 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
     norm = normalization.Normalization(np.array(state.origin), state.scale)
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
+    rows = [row for row in baked.needs if row.get("object") and row["name"] == "rotation"]
+    plain = {row["object"] for row in rows if row["decision"] == "off"}
+    assert plain == {"ball"}  # it is thrown without a spin: what its track turns is noise
     for t in tracks.times:
         quats, displacements = playback.group_poses(baked, float(t))
         with torch.no_grad():
@@ -98,7 +101,9 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
                 for pose in (now, last)
             ]
             played = rotations.rotate(quats[g], moved[1] - group.pivot) + group.pivot + displacements[g]
-            np.testing.assert_allclose(played, moved[0], atol=1e-5 * baked.extent)
+            noise = 0.01 if baked.object(group.object_id).name in plain else 0.0  # rad
+            arms = np.linalg.norm(moved[1] - group.pivot, axis=1)
+            assert (np.linalg.norm(played - moved[0], axis=1) <= 1e-5 * baked.extent + noise * arms).all()
 
 
 def test_at_t_max_nothing_is_moved(baked):
