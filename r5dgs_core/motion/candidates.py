@@ -7,11 +7,11 @@ P parameters, B parameter vectors evaluated at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from . import models, rotations, se3
+from . import models, rotations, se3, top
 
 _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
 # Priors as standard deviations, in radii and spans: far wider than what observed motions show; they only close
@@ -40,6 +40,7 @@ class Candidate:
         tau_mid: Middle of the window, for "kappa".
         frequencies: Lowest and highest W of a motion with "pace". Less than a quarter of a period in the window cannot
             be told from a steady acceleration.
+        inertia: Of a "free_top", in the bind state. [3, 3]
     """
 
     name: str
@@ -47,6 +48,7 @@ class Candidate:
     blocks: tuple[str, ...]
     tau_mid: float = -0.5
     frequencies: tuple[float, float] = (0.5 * np.pi, 8 * np.pi)
+    inertia: np.ndarray | None = field(default=None, compare=False)
 
     @property
     def parameters(self) -> int:
@@ -94,6 +96,8 @@ class Candidate:
         """Poses of the fitted curve. [B, P], [S] -> quaternions [B, S, 4], displacements [B, S, 3]"""
         p = {name: part[..., None, :] for name, part in self.unpack(theta).items()}
         span = tau[:, None]
+        if self.kind == "free_top":
+            return self._tumbling(theta, tau)
         if self.kind == "constant_twist":
             quats, d = models.twist_poses(p["v"], p["w"], span)
         elif self.kind == "world_twist":
@@ -101,6 +105,18 @@ class Candidate:
         else:
             quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], p["frequency"], span)
         return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
+
+    def _tumbling(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`poses` of a free top, whose inertia turns with the pose at t_max: R = exp(r) R_top(exp(-r) w)."""
+        assert self.inertia is not None
+        p = self.unpack(theta)
+        first = rotations.rotvecs_to_quats(p["r"])
+        quats, _ = top.turns(self.inertia, rotations.rotate(rotations.conjugate(first), p["w"]), tau)
+        span = tau[:, None]
+        return (
+            rotations.multiply(first[..., None, :], quats),
+            p["e"][..., None, :] + p["v"][..., None, :] * span + p["a"][..., None, :] * (0.5 * span**2),
+        )
 
 
 def _world_twist(p: dict[str, np.ndarray], tau: np.ndarray) -> se3.Pose:
@@ -131,7 +147,10 @@ FAMILY = (
     Candidate("ballistic + spin, free centre", "ballistic_spin", ("v", "a", "w", "u")),
     Candidate("full, free centre", "ballistic_spin", ("v", "a", "w", "eps", "u")),
 )
-EXTRA = (Candidate("world twist", "world_twist", ("v", "a", "w", "eps")),)
+# The world twist is no member: a falling body that spins is none, as its centre's rate would be quadratic in time, and
+# the hinges and screws that are one are members already. The free top is tried where `fitting` finds reason to.
+FREE_TOP = Candidate("free top", "free_top", ("v", "a", "w"))
+EXTRA = (Candidate("world twist", "world_twist", ("v", "a", "w", "eps")), FREE_TOP)
 BY_NAME = {candidate.name: candidate for candidate in (*FAMILY, *EXTRA)}
 
 

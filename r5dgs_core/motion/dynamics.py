@@ -7,13 +7,18 @@ centre a Gaussian's v and a are those of its centre (`se3.recentre`).
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
 
 import numpy as np
 
 from . import rotations, se3
 
+log = logging.getLogger(__name__)
+
 Array = rotations.Array
+MAX_TURN = 0.1  # radians per midpoint step: beyond, distances grow visibly, by sqrt(1 + x^4 / 4) a step
 MAX_STEPS = 512
 TRACE_STEP = 1 / 60  # TRACE's step at playback, in units of time
 CHUNK = 16384
@@ -40,7 +45,8 @@ def rk2(
     """Midpoint steps of the points, and exponentials of their midpoint spin: the integrator of TRACE.
 
     Points and rotations are integrated apart, so that a body is rigid only to second order in the step; `propagate`
-    is exact in that. The same code serves numpy and torch.
+    is exact in that. The same code serves numpy and torch. Warns once where numpy arrays spin by more than `MAX_TURN`
+    in a step, as playback then shows bodies that grow; training, with tensors, is not asked.
 
     Args:
         points: Where the points start. [..., 3]
@@ -57,7 +63,12 @@ def rk2(
     Source: TRACE's explicit midpoint rule.
     """
     quats = rotations.rotvecs_to_quats(0 * points)
-    for h in _steps(duration, step):
+    steps = step_sizes(duration, step)
+    if steps and rotations.array_namespace(points, w) is np:
+        rates = np.linalg.norm(np.stack(np.broadcast_arrays(w, w + e * duration)), axis=-1)
+        if not abs(steps[0]) * rates.max(initial=0.0) <= MAX_TURN:
+            _warn_of_coarse_steps(abs(steps[0]))
+    for h in steps:
         middle = points + 0.5 * h * (v + rotations.cross(w, points))
         v, w = v + 0.5 * h * a, w + 0.5 * h * e
         points = points + h * (v + rotations.cross(w, middle))
@@ -75,26 +86,56 @@ def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[
         tolerance: Largest allowed error of a point, in the units of its velocity times time.
 
     Returns:
-        Unit quaternions wxyz [N, 4] and displacements [N, 3], float64; the identity to the bit for a duration of 0 and
-        for points at rest.
+        Unit quaternions wxyz [N, 4] and displacements [N, 3], float64; the identity to the bit for a duration of 0, for
+        points at rest, and, with a warning, for points whose dynamics are not finite or go beyond all numbers. What
+        is wrong with one point changes no bit of the others.
     """
     state = np.asarray(dynamics, np.float64)
     quats, displacements = rotations.identity(len(state)), np.zeros((len(state), 3))
-    moving = np.flatnonzero((state != 0).any(-1))
+    sound = np.asarray(np.isfinite(state).all(-1))
+    moving = np.flatnonzero((state != 0).any(-1) & sound)
     for rows in np.array_split(moving, max(1, math.ceil(len(moving) / CHUNK))):
         if duration == 0 or len(rows) == 0:
             continue
         v, w, a, e = np.split(state[rows], 4, axis=-1)
         spans = np.full(len(rows), float(duration))
-        needed = se3.steps_needed(w, v, e, a, spans, 0.0, tolerance)
-        steps = int(min(needed.max(), MAX_STEPS))
-        quats[rows], displacements[rows] = se3.integrate(w, v, e, a, spans, steps)
+        with np.errstate(over="ignore", invalid="ignore"):
+            needed = se3.steps_needed(w, v, e, a, spans, 0.0, tolerance)
+            steps = int(min(needed[needed < se3.MOST_STEPS].max(initial=1), MAX_STEPS))
+            turns, moves = se3.integrate(w, v, e, a, spans, steps)
+            finite = np.isfinite(turns).all(-1) & np.isfinite(moves).all(-1)
+        quats[rows[finite]], displacements[rows[finite]] = turns[finite], moves[finite]
+        sound[rows] = finite
+    if not sound.all():
+        _warn_of_wild_dynamics(int((~sound).sum()), len(state))
     return quats, displacements
 
 
-def _steps(duration: float, step: float) -> list[float]:
+@functools.cache
+def _warn_of_coarse_steps(step: float) -> None:
+    log.warning(
+        "TRACE's midpoint steps of %g are too long for a spin of more than %g rad a step: bodies grow; "
+        "remedy: another mode than rigid_paper, or shorter steps",
+        step,
+        MAX_TURN,
+    )
+
+
+@functools.cache
+def _warn_of_wild_dynamics(bad: int, count: int) -> None:
+    log.warning("%d of %d points have dynamics beyond all numbers and stay where they are at t_max", bad, count)
+
+
+def step_sizes(duration: float, step: float) -> list[float]:
+    """Signed steps that fill a duration: whole ones and a last one that is no longer; none for no duration.
+
+    Their number is counted once, as a time that is added up misses or repeats a step after a while.
+    """
     count = max(1, math.ceil(abs(duration) / step - 1e-9)) if duration != 0 else 0
     if count == 0:
         return []
     whole = math.copysign(step, duration)
     return [whole] * (count - 1) + [duration - whole * (count - 1)]
+
+
+_steps = step_sizes

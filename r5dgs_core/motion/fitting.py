@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from . import candidates as families
-from . import models, rotations
+from . import models, resting, rotations, top
 from .candidates import Candidate, Solution, Track
 
 logger = logging.getLogger(__name__)
@@ -23,15 +23,11 @@ logger = logging.getLogger(__name__)
 HELD_OUT = 0.2
 WITHIN = 1.5
 FADE_PER_SPAN = 0.1 / 0.75
-_SIGMA_FLOOR = 1e-7  # radii and radians: below this noise means rounding
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 _FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
 _LARGEST = families.BY_NAME["full, free centre"]
-_STATIC = families.BY_NAME["static"]
-_TAIL = 5
 FREQUENCY_ERROR = 0.25  # relative standard deviation above which a motion is not called a swing
-STOP_RATIO = 8.0  # distance of the poses before a stop over the scatter of those after it
-STOP_MOTION = 0.02  # radii; less is no motion worth stopping
+PARALLEL_RAD = math.radians(15.0)  # a spin whose rate lies nearer to it needs no tumbling
 
 
 @dataclass(frozen=True)
@@ -85,6 +81,7 @@ def fit(
     radius: float,
     weights: np.ndarray | None = None,  # [S]
     candidates: Sequence[str] | None = None,
+    inertia: np.ndarray | None = None,  # [3, 3]
 ) -> Fit:
     """Fit the family to a pose track and choose.
 
@@ -95,6 +92,9 @@ def fit(
         radius: Of the group, world units, > 0.
         weights: How well each pose was seen, >= 0; 0 leaves a pose out. None for equal ones. [S]
         candidates: Names out of `candidates.BY_NAME` to choose from; None for `candidates.FAMILY`.
+        inertia: Of the group in the bind state, up to a factor (`top.inertia`), or None. With it a body that spins
+            about a changing axis may be a free top: tried only where one of the best others has such a spin, and taken
+            where it predicts the held-out poses better. [3, 3]
 
     Returns:
         The fit. With fewer than four poses of positive weight it is at most a velocity and a spin; with one, static.
@@ -107,7 +107,7 @@ def fit(
     displacements = np.asarray(displacements, np.float64)
     weights = np.ones(len(times)) if weights is None else np.asarray(weights, np.float64)
     _check(times, quats, displacements, weights, radius)
-    family = families.FAMILY if candidates is None else tuple(_named(name) for name in candidates)
+    family = families.FAMILY if candidates is None else tuple(_named(name, inertia) for name in candidates)
     used = weights > 0
     if used.sum() < 2 or times[used][-1] == times[used][0]:
         return _static(radius)
@@ -135,12 +135,20 @@ def fit(
     near = _near(family, scores)
     solutions = {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
     chosen = min(near, key=lambda c: c.parameters)
-    resting = _TAIL if _rests(solutions[chosen.name], track, sigmas) else _stopped(track)
-    rested = resting > 0
+    tail = resting.poses_at_rest(solutions[chosen.name], track, sigmas)
+    rested = tail > 0
+    tops: list[Score] = []
+    if not rested and inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
+        free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
+        held, whole = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
+        tops = [Score(free.name, free.parameters, held, math.sqrt(whole.chi2))]
+        # A plainer motion gives way as among the others; one with a spin that changes freely has more parameters.
+        if held * (1.0 if "eps" in chosen.blocks else WITHIN) < scores[chosen.name]:
+            chosen, solutions[free.name] = free, whole
     solution, evidence = solutions[chosen.name], track
     if rested:
-        evidence = track.rows(slice(-resting, None))
-        solution = families.solve(_STATIC, evidence, sigmas)
+        evidence = track.rows(slice(-tail, None))
+        solution = families.solve(resting.STATIC, evidence, sigmas)
     table = tuple(
         Score(c.name, c.parameters, scores[c.name], math.sqrt(solutions[c.name].chi2) if c in near else math.nan)
         for c in family
@@ -148,7 +156,17 @@ def fit(
     model = _to_model(solution, radius, span, evidence, sigmas)
     near_solutions = [] if rested else list(solutions.values())
     band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
-    return Fit(model, table, solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+    return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
+    """Whether the picked motion needs a spin that changes its axis, and a body of this inertia could do so freely."""
+    if "eps" not in picked.candidate.blocks or picked.candidate.kind != "ballistic_spin":
+        return False
+    p = picked.candidate.unpack(picked.theta)
+    across = np.linalg.norm(np.cross(p["w"], p["eps"]))
+    along = abs(float(p["w"] @ p["eps"]))
+    return bool(np.arctan2(across, along) > PARALLEL_RAD) and top.tumbles(inertia)
 
 
 def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candidate]:
@@ -192,10 +210,12 @@ def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weig
         raise ValueError(f"radius: expected > 0, got {radius}")
 
 
-def _named(name: str) -> Candidate:
+def _named(name: str, inertia: np.ndarray | None) -> Candidate:
     if name not in families.BY_NAME:
         raise ValueError(f"candidates: {name!r} is none of {', '.join(families.BY_NAME)}")
-    return families.BY_NAME[name]
+    if name == families.FREE_TOP.name and inertia is None:
+        raise ValueError(f"candidates: {name!r} needs the inertia")
+    return replace(families.BY_NAME[name], inertia=inertia)
 
 
 def _static(radius: float) -> Fit:
@@ -207,7 +227,7 @@ def _static(radius: float) -> Fit:
 def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float) -> Fit:
     """Two or three poses: the plainest of static, translation, spin and both that explains them to a hundredth."""
     sigmas = (1e-2, 1e-2)
-    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [_STATIC]
+    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [resting.STATIC]
     solutions = [families.solve(c, track, sigmas) for c in allowed]
     roots = [math.sqrt(s.chi2) for s in solutions]
     index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
@@ -225,7 +245,9 @@ def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, fl
     """
     swings = (c for c in family if c.oscillates)
     wide = [c for c in (_FREE_AXIS, _LARGEST, *swings) if c.parameters <= 6 * len(track.tau) - 6] or [
-        max((c for c in family if c.parameters < 6 * len(track.tau)), key=lambda c: c.parameters, default=_STATIC)
+        max(
+            (c for c in family if c.parameters < 6 * len(track.tau)), key=lambda c: c.parameters, default=resting.STATIC
+        )
     ]
     best: tuple[float, Solution, np.ndarray] | None = None
     swung: dict[str, np.ndarray] = {}
@@ -247,7 +269,7 @@ def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, fl
         dof = max(6 * len(track.tau) - solution.candidate.parameters, 1) / (6 * len(track.tau))
         variances = (weights * values**2).sum(0) / (weights.sum() * dof)
         sigma_t, sigma_r = np.sqrt([variances[:3].mean(), variances[3:].mean()]).tolist()
-        sigmas = (max(sigma_t, _SIGMA_FLOOR), max(sigma_r, _SIGMA_FLOOR))
+        sigmas = (max(sigma_t, resting.SIGMA_FLOOR), max(sigma_r, resting.SIGMA_FLOOR))
     assert best is not None
     return sigmas, best[1].robust
 
@@ -265,55 +287,6 @@ def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], o
     weights = (tail.weights * np.maximum(outliers[count - held :], 1e-6))[:, None]
     score = math.sqrt(float((weights * values**2).sum() / (6 * weights.sum())))
     return score if math.isfinite(score) else math.inf
-
-
-def _tail_chi2(values: np.ndarray, parameters: int) -> float:
-    return float((values**2).sum()) / max(values.size - parameters, 1)
-
-
-def _rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
-    """Whether a constant pose explains the last poses and the picked motion misses the whole window.
-
-    Without the second condition slow movers would be frozen.
-    """
-    if picked.candidate.name == "static" or len(track.tau) < 2 * _TAIL:
-        return False
-    tail = track.rows(slice(-_TAIL, None))
-    still = families.residuals(_STATIC, families.solve(_STATIC, tail, sigmas).theta[None], tail, sigmas)[0]
-    moving = families.residuals(picked.candidate, picked.theta[None], tail, sigmas)[0]
-    still_chi2 = _tail_chi2(still, 6)
-    moving_chi2 = max(_tail_chi2(moving, 0), 0.25)
-    whole = families.residuals(picked.candidate, picked.theta[None], track, sigmas)[0]
-    whole_chi2 = _tail_chi2(whole, picked.candidate.parameters)
-    return still_chi2 <= 1.5 * moving_chi2 and whole_chi2 > 2 * max(still_chi2, 0.25)
-
-
-def _stopped(track: Track) -> int:
-    """Number of last poses over which the body clearly stands still after it moved, 0 where it does not.
-
-    Needs no noise estimate, which a stop within the window spoils: the last three to five poses scatter little about
-    their mean, and the two poses before lie far from it, one farther than the other, against that scatter. Steady
-    motion gives a ratio of at most 2.4 and the apex of a throw 4.3, so that neither is taken for a stop.
-    """
-    for count in (5, 4, 3):
-        if len(track.tau) < count + 3:
-            continue
-        tail = track.rows(slice(-count, None))
-        mean_quat = rotations.normalize(tail.quats.mean(0))
-        mean = tail.displacements.mean(0)
-        distance = _pose_distance(tail.quats, tail.displacements, mean_quat, mean)
-        before = track.rows(slice(-count - 2, -count))
-        earlier, just_before = _pose_distance(before.quats, before.displacements, mean_quat, mean)
-        scatter = max(float(np.sqrt((distance**2).mean())), _SIGMA_FLOOR)
-        if just_before > max(STOP_RATIO * scatter, STOP_MOTION) and earlier > just_before:
-            return count
-    return 0
-
-
-def _pose_distance(quats: np.ndarray, displacements: np.ndarray, mean_quat: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Distance of poses from one pose over the points of a sphere of radius one, root mean square. [S]"""
-    angle = rotations.angle_between(quats, mean_quat)
-    return np.sqrt(((displacements - mean) ** 2).sum(-1) + 2 / 3 * angle**2)
 
 
 def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
@@ -341,11 +314,16 @@ def _to_model(
     names = (*_RATES, *(["frequency"] if solution.candidate.oscillates else []))
     slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
     frequency = float(rates.pop("frequency")[0])
+    inertia = None
+    if solution.candidate.inertia is not None and solution.candidate.kind == "free_top":
+        turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rates["offset_rotvec"]))
+        inertia = turn @ solution.candidate.inertia @ turn.T
     covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T
     return models.MotionModel(
         kind=solution.candidate.kind,
         **rates,
         frequency=frequency,
+        inertia=inertia,
         fade_time=FADE_PER_SPAN * span,
         radius=radius,
         covariance=0.5 * (covariance + covariance.T),

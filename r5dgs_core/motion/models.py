@@ -15,6 +15,8 @@ steady motion, tau and tau^2/2, stood. W = 0 is the steady motion to the bit.
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -22,9 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from . import rotations, se3
+from . import rotations, se3, top
 
-KINDS = ("static", "translation", "ballistic_spin", "constant_twist", "world_twist")
+log = logging.getLogger(__name__)
+
+KINDS = ("static", "translation", "ballistic_spin", "constant_twist", "world_twist", "free_top")
 _VECTORS = (
     "velocity",
     "acceleration",
@@ -48,8 +52,9 @@ class MotionModel:
     Attributes:
         kind: "static" (stays), "translation" (d_f = v s1 + a s2), "ballistic_spin" (centroid form:
             d_f = v s1 + a s2 + u - R_f u, R_f = exp(w s1 + eps s2)), "constant_twist" (a screw:
-            R_f = exp(w tau), d_f = V(w tau) v tau) or "world_twist" (v(x) = v + w x (x - p) with v and w linear in
-            time, x in the world; Magnus-4 steps).
+            R_f = exp(w tau), d_f = V(w tau) v tau), "world_twist" (v(x) = v + w x (x - p) with v and w linear in
+            time, x in the world; Magnus-4 steps) or "free_top" (d_f = v tau + a tau^2 / 2, R_f of a body that starts
+            with spin w and tumbles without torque, `top`).
         velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
         acceleration: a, rate of v.
         angular_velocity: w, rad per unit of time.
@@ -62,6 +67,7 @@ class MotionModel:
         radius: Radius of the group, world units: what tolerances refer to.
         frequency: W >= 0, rad per unit of time, of "translation" (a spring) and "ballistic_spin" (a pendulum, with
             v = a = 0 and u on its axis); 0 does not swing.
+        inertia: J of a "free_top" in the world at tau = 0, up to a factor; None for other kinds. [3, 3]
         covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
         covariance_names: Names of its rows, such as "velocity.x"; "frequency" where that was fitted.
     """
@@ -77,6 +83,7 @@ class MotionModel:
     fade_time: float = 0.1
     radius: float = 1.0
     frequency: float = 0.0
+    inertia: np.ndarray | None = None
     covariance: np.ndarray | None = None
     covariance_names: tuple[str, ...] = ()
 
@@ -102,6 +109,15 @@ class MotionModel:
         if not (math.isfinite(frequency) and frequency >= 0):
             raise ValueError(f"frequency: expected a number >= 0, got {frequency}")
         object.__setattr__(self, "frequency", frequency)
+        if (self.inertia is not None) != (self.kind == "free_top"):
+            raise ValueError(f"inertia: expected for the kind 'free_top' alone, got {self.inertia!r} for {self.kind!r}")
+        if self.inertia is not None:
+            inertia = np.array(self.inertia, np.float64)
+            sound = inertia.shape == (3, 3) and np.isfinite(inertia).all()
+            if not (sound and np.allclose(inertia, inertia.T) and np.linalg.eigvalsh(inertia)[0] > 0):
+                raise ValueError(f"inertia: expected a symmetric (3, 3) with positive moments, got {self.inertia!r}")
+            inertia.flags.writeable = False
+            object.__setattr__(self, "inertia", inertia)
         object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
         if self.covariance is not None:
             covariance = np.array(self.covariance, np.float64)
@@ -123,6 +139,8 @@ class MotionModel:
         result.update(fade_time=self.fade_time, radius=self.radius)
         if self.frequency > 0:
             result["frequency"] = self.frequency
+        if self.inertia is not None:
+            result["inertia"] = self.inertia.tolist()
         if self.covariance is not None:
             result.update(covariance=self.covariance.tolist(), covariance_names=list(self.covariance_names))
         return result
@@ -151,7 +169,7 @@ class MotionModel:
     def turns(self) -> bool:
         """Whether `evaluate` ever gives a rotation."""
         spins = self.kind not in ("static", "translation") and (
-            self.angular_velocity.any() or self.angular_acceleration.any()
+            self.angular_velocity.any() or (self.angular_acceleration.any() and self.kind != "free_top")
         )
         return bool(spins or self.offset_rotvec.any())
 
@@ -168,7 +186,7 @@ def evaluate(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, n
 
     Returns:
         Unit quaternions wxyz [..., 4] and displacements of the pivot, world [..., 3], float64. tau = 0 gives exactly
-        (1, 0, 0, 0) and 0.
+        (1, 0, 0, 0) and 0; where a motion leaves the range of numbers the body stays at t_max, with a warning.
     """
     quats, displacements, _, _ = evaluate_with_rates(model, tau)
     return quats, displacements
@@ -184,22 +202,42 @@ def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray,
     stacked = {name: np.array([getattr(model, name) for model in models]) for name in _VECTORS}
     span = np.array([[float(tau)]])
     frequencies = np.array([[model.frequency] for model in models])
-    for kind in {model.kind for model in models} - {"static"}:
-        rows = np.array([g for g, model in enumerate(models) if model.kind == kind])
-        v, a, w, eps, u = (stacked[name][rows] for name in _VECTORS[:5])
-        if kind == "translation":
-            once, twice = clocks(frequencies[rows], span)
-            displacements[rows] = v * once + a * twice
-        elif kind == "ballistic_spin":
-            quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, frequencies[rows], span)
-        elif kind == "constant_twist":
-            quats[rows], displacements[rows] = twist_poses(v, w, span)
-        else:
-            for g in rows:
-                quats[g], displacements[g] = _world_twist(models[g], np.asarray(tau, np.float64))
-    s = -np.expm1(-tau / np.array([[model.fade_time] for model in models]))
-    quats = rotations.multiply(quats, rotations.rotvecs_to_quats(s * stacked["offset_rotvec"]))
-    return quats, displacements + s * stacked["offset_displacement"]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for kind in {model.kind for model in models} - {"static"}:
+            rows = np.array([g for g, model in enumerate(models) if model.kind == kind])
+            v, a, w, eps, u = (stacked[name][rows] for name in _VECTORS[:5])
+            if kind == "translation":
+                once, twice = clocks(frequencies[rows], span)
+                displacements[rows] = v * once + a * twice
+            elif kind == "ballistic_spin":
+                quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, frequencies[rows], span)
+            elif kind == "constant_twist":
+                quats[rows], displacements[rows] = twist_poses(v, w, span)
+            else:
+                for g in rows:
+                    quats[g], displacements[g], _, _ = curve(models[g], tau)
+        s = -np.expm1(-tau / np.array([[model.fade_time] for model in models]))
+        quats = rotations.multiply(quats, rotations.rotvecs_to_quats(s * stacked["offset_rotvec"]))
+        displacements = displacements + s * stacked["offset_displacement"]
+    held = _held(quats, displacements)
+    return held[0], held[1]
+
+
+def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same poses and rates, but those of a body at rest where one of them is not finite."""
+    sound = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
+    if sound.all():
+        return parts
+    _warn_of_wild_motion()
+    still = (rotations.identity(), *([np.zeros(3)] * (len(parts) - 1)))
+    return tuple(np.where(np.expand_dims(sound, -1), part, rest) for part, rest in zip(parts, still, strict=True))
+
+
+@functools.cache
+def _warn_of_wild_motion() -> None:
+    log.warning(
+        "a motion model leaves the range of numbers; its body stays where it is at t_max. Remedy: smaller rates"
+    )
 
 
 def evaluate_with_rates(
@@ -214,16 +252,18 @@ def evaluate_with_rates(
     tau = np.asarray(tau, np.float64)
     if (tau < 0).any():
         raise ValueError(f"tau: expected times since t_max >= 0, got {tau.min()}")
-    quats, displacements, spins, velocities = curve(model, tau)
-    s = -np.expm1(-tau / model.fade_time)[..., None]
-    rate = (1 - s) / model.fade_time
-    blended = rotations.multiply(quats, rotations.rotvecs_to_quats(s * model.offset_rotvec))
-    return (
-        blended,
-        displacements + s * model.offset_displacement,
-        spins + rate * rotations.rotate(quats, np.broadcast_to(model.offset_rotvec, spins.shape)),
-        velocities + rate * model.offset_displacement,
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        quats, displacements, spins, velocities = curve(model, tau)
+        s = -np.expm1(-tau / model.fade_time)[..., None]
+        rate = (1 - s) / model.fade_time
+        blended = rotations.multiply(quats, rotations.rotvecs_to_quats(s * model.offset_rotvec))
+        held = _held(
+            blended,
+            displacements + s * model.offset_displacement,
+            spins + rate * rotations.rotate(quats, np.broadcast_to(model.offset_rotvec, spins.shape)),
+            velocities + rate * model.offset_displacement,
+        )
+    return held[0], held[1], held[2], held[3]
 
 
 def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -255,6 +295,11 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
     if model.kind == "constant_twist":
         quats, d = twist_poses(v, w, span)
         return quats, d, w + zero, rotations.rotate(quats, v + zero)
+    if model.kind == "free_top":
+        assert model.inertia is not None
+        quats, spins = top.turns(model.inertia, w, tau.reshape(-1))
+        quats, spins = quats.reshape(*tau.shape, 4), spins.reshape(*tau.shape, 3)
+        return quats, v * once + a * twice, spins, v * slope + a * once
     quats, d = _world_twist(model, tau)
     spins = w + eps * span
     return quats, d, spins, v + a * span + rotations.cross(spins, d)
@@ -297,15 +342,19 @@ def twist_poses(v: np.ndarray, w: np.ndarray, span: np.ndarray) -> se3.Pose:
 
 
 def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
-    """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need."""
+    """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need. Those that
+    no number of steps would give are NaN.
+    """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
     tolerance = _STEP_TOLERANCE * model.radius
     needed = se3.steps_needed(w, v, eps, a, flat, model.radius, tolerance)
     steps = 1 << np.minimum(np.ceil(np.log2(needed)), 20).astype(np.int64)
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
-    for n in np.unique(steps):
-        rows = np.flatnonzero(steps == n)
+    hopeless = needed >= se3.MOST_STEPS
+    quats[hopeless] = np.nan
+    for n in np.unique(steps[~hopeless]):
+        rows = np.flatnonzero((steps == n) & ~hopeless)
         for block in np.array_split(rows, max(1, len(rows) * int(n) >> 18)):
             quats[block], displacements[block] = se3.integrate(w, v, eps, a, flat[block], int(n))
     return quats.reshape(*tau.shape, 4), displacements.reshape(*tau.shape, 3)

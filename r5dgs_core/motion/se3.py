@@ -1,8 +1,11 @@
-"""Rigid motions from twists: exponential map, Magnus steps, log-depth products and closed forms.
+"""Rigid motions from twists: exponential map, Magnus steps, log-depth products and closed forms, for numpy and torch.
 
 Notation: a twist (w, v) moves the point x with velocity v + w x (x - o), where o is the origin of the coordinates; for
 groups o is their centre at t_max, see `recentre`. The pose (q, d) maps x - o to q (x - o) q* + d. With A, B, C of
 `rotations` and W = [w]_x, exp(w, v) has R = I + A W + B W^2 and d = (I + B W + C W^2) v.
+
+Single poses keep the dtype they are given; whatever takes steps or times computes in float64, as products of many
+float32 poses drift. Tensors carry gradients, finite at w = 0 too.
 """
 
 from __future__ import annotations
@@ -13,10 +16,21 @@ import numpy as np
 
 from . import rotations
 
-Pose = tuple[np.ndarray, np.ndarray]
+Array = rotations.Array
+Pose = tuple[Array, Array]
+MOST_STEPS = 1 << 31  # what `steps_needed` answers where no number of steps would do
 
 
-def v_matrix_times(w: np.ndarray, v: np.ndarray) -> np.ndarray:
+def float64(*arrays: Array) -> tuple[Array, ...]:
+    """The arrays in float64, all of one library: tensors on the device of the first if one is a tensor."""
+    xp = rotations.array_namespace(*arrays)
+    if xp is np:
+        return tuple(np.asarray(array, np.float64) for array in arrays)
+    device = next(array.device for array in arrays if xp.is_tensor(array))
+    return tuple(xp.as_tensor(array, dtype=xp.float64, device=device) for array in arrays)
+
+
+def v_matrix_times(w: Array, v: Array) -> Array:
     """V(w) v = (I + B W + C W^2) v: the integral of exp(w s) v over s in [0, 1]. [..., 3]
 
     It is also the left Jacobian of the rotation exponential: exp(phi(t)) has angular velocity V(phi) phi'.
@@ -27,7 +41,7 @@ def v_matrix_times(w: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v + b * once + c * rotations.cross(w, once)
 
 
-def exp(w: np.ndarray, v: np.ndarray) -> Pose:
+def exp(w: Array, v: Array) -> Pose:
     """Pose after one unit of time under a constant twist; the zero twist gives the identity to the bit.
 
     Args:
@@ -55,12 +69,12 @@ def invert(pose: Pose) -> Pose:
 
 
 def recentre(
-    w: np.ndarray,  # [..., 3]
-    v: np.ndarray,  # [..., 3]
-    eps: np.ndarray,  # [..., 3]
-    a: np.ndarray,  # [..., 3]
-    center: np.ndarray,  # [..., 3]
-) -> tuple[np.ndarray, np.ndarray]:
+    w: Array,  # [..., 3]
+    v: Array,  # [..., 3]
+    eps: Array,  # [..., 3]
+    a: Array,  # [..., 3]
+    center: Array,  # [..., 3]
+) -> tuple[Array, Array]:
     """Rewrite a twist with linear rates about another fixed origin: an exact change of variables.
 
     Args:
@@ -76,33 +90,35 @@ def recentre(
     return v + rotations.cross(w, center), a + rotations.cross(eps, center)
 
 
-def product(quats: np.ndarray, displacements: np.ndarray) -> Pose:
+def product(quats: Array, displacements: Array) -> Pose:
     """Product P_n ... P_1 of the poses along axis 0 by halving, log n deep. ([n, ..., 4], [n, ..., 3])"""
+    xp = rotations.array_namespace(quats, displacements)
     while len(quats) > 1:
         even = len(quats) // 2 * 2
         left = compose((quats[1:even:2], displacements[1:even:2]), (quats[:even:2], displacements[:even:2]))
-        quats = np.concatenate([left[0], quats[even:]])
-        displacements = np.concatenate([left[1], displacements[even:]])
+        quats = xp.concatenate([left[0], quats[even:]])
+        displacements = xp.concatenate([left[1], displacements[even:]])
     return quats[0], displacements[0]
 
 
-def scan(quats: np.ndarray, displacements: np.ndarray) -> Pose:
+def scan(quats: Array, displacements: Array) -> Pose:
     """All prefix products P_i ... P_1 along axis 0 by doubling. ([n, ..., 4], [n, ..., 3]) -> the same shapes"""
+    xp = rotations.array_namespace(quats, displacements)
     stride = 1
     while stride < len(quats):
         later = compose((quats[stride:], displacements[stride:]), (quats[:-stride], displacements[:-stride]))
-        quats = np.concatenate([quats[:stride], later[0]])
-        displacements = np.concatenate([displacements[:stride], later[1]])
+        quats = xp.concatenate([quats[:stride], later[0]])
+        displacements = xp.concatenate([displacements[:stride], later[1]])
         stride *= 2
     return quats, displacements
 
 
 def step_twists(
-    w: np.ndarray,  # [3]
-    v: np.ndarray,  # [3]
-    eps: np.ndarray,  # [3]
-    a: np.ndarray,  # [3]
-    durations: np.ndarray,  # [...]
+    w: Array,  # [3]
+    v: Array,  # [3]
+    eps: Array,  # [3]
+    a: Array,  # [3]
+    durations: Array,  # [...]
     steps: int,
     order: int = 4,
 ) -> Pose:
@@ -122,21 +138,20 @@ def step_twists(
 
     Source: Magnus expansion; for a linear twist Omega_1 = h m and Omega_2 = -h^3/12 [m, b] need no quadrature.
     """
-    h = (np.asarray(durations, np.float64) / steps)[None, ..., None]
-    middles = (np.arange(steps) + 0.5).reshape(steps, *([1] * (h.ndim - 1))) * h
+    w, v, eps, a, durations = float64(w, v, eps, a, durations)
+    h = (durations / steps)[None, ..., None]
+    numbers, _ = float64(np.arange(steps), h)
+    middles = (numbers + 0.5).reshape(steps, *([1] * (h.ndim - 1))) * h
     mw, mv = w + middles * eps, v + middles * a
     if order == 2:
         return h * mw, h * mv
     if order != 4:
         raise ValueError(f"order: expected 2 or 4, got {order}")
-    bracket_w = rotations.cross(mw, np.broadcast_to(eps, mw.shape))
-    bracket_v = rotations.cross(mw, np.broadcast_to(a, mv.shape)) - rotations.cross(np.broadcast_to(eps, mw.shape), mv)
-    return h * mw - h**3 / 12 * bracket_w, h * mv - h**3 / 12 * bracket_v
+    bracket = _bracket((mw, mv), (eps + 0 * mw, a + 0 * mv))
+    return h * mw - h**3 / 12 * bracket[0], h * mv - h**3 / 12 * bracket[1]
 
 
-def integrate(
-    w: np.ndarray, v: np.ndarray, eps: np.ndarray, a: np.ndarray, durations: np.ndarray, steps: int, order: int = 4
-) -> Pose:
+def integrate(w: Array, v: Array, eps: Array, a: Array, durations: Array, steps: int, order: int = 4) -> Pose:
     """Poses after ``durations`` under a twist that is linear in time, by ``steps`` Magnus steps each.
 
     Rigid to rounding and reversible at any step size; arguments as in `step_twists`.
@@ -149,7 +164,7 @@ def integrate(
 
 
 def steps_needed(
-    w: np.ndarray, v: np.ndarray, eps: np.ndarray, a: np.ndarray, durations: np.ndarray, radius: float, tolerance: float
+    w: Array, v: Array, eps: Array, a: Array, durations: Array, radius: float, tolerance: float
 ) -> np.ndarray:
     """Magnus-4 steps that keep the error of every point of a body under ``tolerance``.
 
@@ -163,12 +178,13 @@ def steps_needed(
         tolerance: Largest allowed distance, in the units of radius.
 
     Returns:
-        n >= 1 for each duration; 1 where twist and rate commute, which one step solves exactly. [...] int64
+        n >= 1 for each duration, numpy; 1 where twist and rate commute, which one step solves exactly, `MOST_STEPS`
+        where even that many would not do, or rates are not finite. [...] int64
 
     Source: leading omitted term D = [C1, a2]/240 + [a1, [a1, C1]]/720 with C1 = [a1, a2], a1 = m, a2 = b at h = 1:
         n = ceil((c T^5 / tol)^(1/4)), c the mean over [0, T] of radius |D_w| + |D_v|; at least |w| T / 2 steps.
     """
-    durations = np.asarray(durations, np.float64)
+    w, v, eps, a, durations = (_numbers(x) for x in (w, v, eps, a, durations))
     times = np.linspace(np.zeros_like(durations), durations, 5)[..., None]
     a1 = (w + times * eps, v + times * a)
     a2 = (eps + 0 * times, a + 0 * times)
@@ -179,7 +195,13 @@ def steps_needed(
     by_error = np.ceil((omitted * span**5 / tolerance) ** 0.25)
     by_turn = np.ceil(np.linalg.norm(a1[0], axis=-1).max(axis=0) * span / 2)
     commutes = omitted * span**5 <= 1e-15 * _reach(a1, radius) * span
-    return np.where(commutes, 1, np.maximum(1, np.maximum(by_error, by_turn))).astype(np.int64)
+    count = np.where(commutes, 1, np.maximum(1, np.maximum(by_error, by_turn)))
+    return np.nan_to_num(np.minimum(count, MOST_STEPS), nan=MOST_STEPS).astype(np.int64)
+
+
+def _numbers(values: Array) -> np.ndarray:
+    """The values as float64 numpy, without gradients."""
+    return float64(values)[0] if rotations.array_namespace(values) is np else values.detach().cpu().double().numpy()
 
 
 def _reach(twist: Pose, radius: float) -> np.ndarray:
@@ -192,22 +214,23 @@ def _bracket(x: Pose, y: Pose) -> Pose:
     return rotations.cross(x[0], y[0]), rotations.cross(x[0], y[1]) - rotations.cross(y[0], x[1])
 
 
-def phi_2_times(w: np.ndarray, v: np.ndarray) -> np.ndarray:
+def phi_2_times(w: Array, v: Array) -> Array:
     """phi_2([w]) v = (I/2 + C W + D W^2) v, the double integral of exp(w s) v over 0 <= s <= s' <= 1. [..., 3]
 
     With D = (x^2/2 - 1 + cos x)/x^4, x = |w|.
     """
+    xp = rotations.array_namespace(w)
     angle2 = (w * w).sum(-1)[..., None]
     c = rotations.remainder_ratio(angle2)
     small = angle2 < 1.0
-    low, high = np.where(small, angle2, 0.0), np.where(small, 1.0, angle2)
+    low, high = xp.where(small, angle2, 0 * angle2), xp.where(small, 1 + 0 * angle2, angle2)
     series = sum((-low) ** k / math.factorial(2 * k + 4) for k in range(9))
-    d = np.where(small, series, (0.5 - rotations.versine_ratio(high)) / high)
+    d = xp.where(small, series, (0.5 - rotations.versine_ratio(high)) / high)
     once = rotations.cross(w, v)
     return 0.5 * v + c * once + d * rotations.cross(w, once)
 
 
-def accelerated_spin(w: np.ndarray, v: np.ndarray, a: np.ndarray, durations: np.ndarray) -> Pose:
+def accelerated_spin(w: Array, v: Array, a: Array, durations: Array) -> Pose:
     """Closed form of a twist with constant w and linear v: R = exp(w T), d = T phi_1 v + T^2 phi_2 a.
 
     Args:
@@ -216,7 +239,8 @@ def accelerated_spin(w: np.ndarray, v: np.ndarray, a: np.ndarray, durations: np.
         a: Rate of v. [3]
         durations: Signed times T. [...]
     """
-    span = np.asarray(durations, np.float64)[..., None]
+    w, v, a, durations = float64(w, v, a, durations)
+    span = durations[..., None]
     turn = w * span
-    d = span * v_matrix_times(turn, np.broadcast_to(v, turn.shape))
-    return rotations.rotvecs_to_quats(turn), d + span**2 * phi_2_times(turn, np.broadcast_to(a, turn.shape))
+    d = span * v_matrix_times(turn, v + 0 * turn)
+    return rotations.rotvecs_to_quats(turn), d + span**2 * phi_2_times(turn, a + 0 * turn)

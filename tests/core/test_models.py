@@ -19,7 +19,10 @@ WORLD_TWIST = MotionModel(
     angular_acceleration=[0.9, 1.1, -0.4],
     radius=0.3,
 )
-CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {"world twist": WORLD_TWIST}
+CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {
+    "world twist": WORLD_TWIST,
+    "tumbling": problems.TUMBLING,
+}
 
 
 def with_offsets(model):
@@ -181,7 +184,13 @@ def test_batches_of_any_shape_equal_single_times():
 def test_json_restores_a_model_to_the_bit(vector, number, kind):
     names = ("velocity.x", "velocity.y")
     model = MotionModel(
-        kind, velocity=vector, offset_rotvec=vector, fade_time=number, covariance=np.eye(2) / 3, covariance_names=names
+        kind,
+        velocity=vector,
+        offset_rotvec=vector,
+        fade_time=number,
+        inertia=np.diag([number, number / 3, 1e-3]) if kind == "free_top" else None,
+        covariance=np.eye(2) / 3,
+        covariance_names=names,
     )
     back = MotionModel.from_dict(json.loads(json.dumps(model.to_dict())))
     assert back == model
@@ -200,6 +209,10 @@ def test_json_restores_a_model_to_the_bit(vector, number, kind):
         ({"frequency": -1.0}, "frequency"),
         ({"frequency": math.nan}, "frequency"),
         ({"speed": 3}, "speed"),
+        ({"kind": "free_top"}, "inertia"),
+        ({"inertia": np.eye(3).tolist()}, "inertia"),
+        ({"kind": "free_top", "inertia": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "inertia"),
+        ({"kind": "free_top", "inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "inertia"),
         ({"covariance": [[1.0]]}, "covariance"),
     ],
 )

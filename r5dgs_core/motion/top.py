@@ -1,0 +1,210 @@
+"""A body that turns freely, without any torque: a thrown box that tumbles.
+
+Notation: J inertia in the world at tau = 0, only its ratios matter; I1, I2, I3 its principal moments, A the turn from
+the principal axes to the world; w_k spins in the principal axes, L = |J w|, 2E = w J w. Both are kept for ever. With
+the axes named so that the spin circles the third, and the clock u = p tau + u_0, Euler's equations give
+w_1 = w_1m cn u, w_2 = w_2m sn u, w_3 = w_3m dn u, Jacobi's elliptic functions of parameter m. Seen along the fixed
+vector J w, an axis k of the body turns at the rate L (2E - I_k w_k^2) / (L^2 - I_k^2 w_k^2), whose integral is a mean
+rate and a Fourier series: everything is in closed form, and any time costs the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import rotations
+
+DISTINCT = 0.1  # moments nearer to each other than this share make a body turn steadily, as far as poses can tell
+_GAP = 1e-9  # relative; moments are this far apart at least, as Euler's solution divides by their differences
+_SAMPLES = 256  # of a rate over a period; its series converges like exp(-n), near a separatrix more slowly
+_LEAST = 1e-300
+
+
+def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Inertia of a cloud of points about its centroid, scaled to trace 1; that of a ball where it has no extent.
+
+    Args:
+        points: In the world. [n, 3]
+        weights: Masses, >= 0, or None for equal ones. [n]
+
+    Returns:
+        Symmetric, positive semidefinite. [3, 3]
+    """
+    points = np.asarray(points, np.float64)
+    masses = np.ones(len(points)) if weights is None else np.asarray(weights, np.float64)
+    if len(points) == 0 or not masses.sum() > 0:
+        return np.eye(3) / 3
+    offsets = points - np.average(points, axis=0, weights=masses)
+    spread = np.einsum("n,ni,nj->ij", masses, offsets, offsets)
+    size = float(np.trace(spread))
+    return (np.eye(3) * size - spread) / (2 * size) if size > 0 else np.eye(3) / 3
+
+
+def tumbles(body: np.ndarray) -> bool:
+    """Whether an inertia is so far from that of a ball that poses can tell: [3, 3]."""
+    moments = np.linalg.eigvalsh(body)
+    return bool(moments[0] < (1 - DISTINCT) * moments[2])
+
+
+def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations of a free body, and its spins.
+
+    Args:
+        body: Inertia J in the world at tau = 0, symmetric with positive moments. [3, 3]
+        w: Angular velocity at tau = 0, world frame, rad per unit of time. [..., 3]
+        tau: Times of either sign. [S]
+
+    Returns:
+        Rotations since tau = 0, unit wxyz with w >= 0 [..., S, 4]; the identity to the bit at tau = 0. Angular
+        velocities in the world frame [..., S, 3].
+
+    Source: Euler's equations; Jacobi's solution by arithmetic-geometric means.
+    """
+    w, tau = np.asarray(w, np.float64), np.asarray(tau, np.float64)
+    path = _solve(body, w)
+    frames, spins = path.at(np.concatenate([np.zeros(1), tau]))
+    axes = path.axes[..., None, :, :]
+    to_world = axes @ np.swapaxes(frames[..., :1, :, :], -1, -2) @ frames[..., 1:, :, :]
+    quats = rotations.rotmats_to_quats(to_world @ np.swapaxes(axes, -1, -2))
+    still = (tau == 0)[..., None] | (w == 0).all(-1)[..., None, None]
+    return np.where(still, rotations.identity(), quats), (to_world @ spins[..., 1:, :, None])[..., 0]
+
+
+@dataclass(frozen=True)
+class _Path:
+    """The solution for B spins; principal axes in Jacobi's order.
+
+    Attributes:
+        axes: Columns are the principal axes in the world at tau = 0. [B, 3, 3]
+        moments: [B, 3]
+        peaks: w_1m, w_2m, w_3m with their signs. [B, 3]
+        rate: p. [B]
+        phase: u_0. [B]
+        m1: 1 - m. [B]
+        pole: Index of the axis k whose turn is followed, the one that stays farther from the fixed vector. [B]
+    """
+
+    axes: np.ndarray
+    moments: np.ndarray
+    peaks: np.ndarray
+    rate: np.ndarray
+    phase: np.ndarray
+    m1: np.ndarray
+    pole: np.ndarray
+
+    def spins(self, u: np.ndarray) -> np.ndarray:
+        """Spins in the principal axes at clocks u. [B, S] -> [B, S, 3]"""
+        sn, cn, dn = elliptic(u, self.m1[..., None])
+        return np.stack([cn, sn, dn], -1) * self.peaks[..., None, :]
+
+    def precession(self, spins: np.ndarray) -> np.ndarray:
+        """Rate of the turn of axis `pole` about the fixed vector. [B, S, 3] -> [B, S]"""
+        momenta = self.moments[..., None, :] * spins
+        squares, energies = momenta**2, momenta * spins
+        k = np.broadcast_to(self.pole[..., None, None], (*spins.shape[:-1], 1))
+        length = squares.sum(-1)
+        across = length - np.take_along_axis(squares, k, -1)[..., 0]
+        energy = energies.sum(-1) - np.take_along_axis(energies, k, -1)[..., 0]
+        return np.sqrt(length) * energy / np.maximum(across, _LEAST)
+
+    def at(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Turns from the principal axes to a frame that stands still in the world [B, S, 3, 3]; spins [B, S, 3]."""
+        u = self.rate[..., None] * tau + self.phase[..., None]
+        spins = self.spins(u)
+        momenta = self.moments[..., None, :] * spins
+        up = momenta / np.maximum(np.linalg.norm(momenta, axis=-1, keepdims=True), _LEAST)
+        poles = np.eye(3)[self.pole][..., None, :]
+        east = poles - (poles * up).sum(-1)[..., None] * up
+        east = east / np.maximum(np.linalg.norm(east, axis=-1, keepdims=True), _LEAST)
+        body = np.stack([east, rotations.cross(up, east), up], -2)
+        angle = self._angle(tau, u)
+        c, s, zero = np.cos(angle), np.sin(angle), 0 * angle
+        turn = np.stack([np.stack([c, -s, zero], -1), np.stack([s, c, zero], -1), np.stack([zero, zero, 1 + zero], -1)])
+        return np.moveaxis(turn, 0, -2) @ body, spins
+
+    def _angle(self, tau: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Integral of the precession from a time of its own to tau. [B, S]"""
+        quarter = complete(self.m1)
+        grid = 2 * quarter[..., None] * np.arange(_SAMPLES) / _SAMPLES  # a period of the squares
+        waves = np.fft.rfft(self.precession(self.spins(grid)), axis=-1) / _SAMPLES
+        numbers = np.arange(1, _SAMPLES // 2)
+        pace = np.where(self.rate > 0, self.rate * np.pi / quarter, 1.0)
+        # The rates are even in u, so that their series has cosines alone; sines integrate them.
+        sizes = 2 * waves[..., 1:-1].real / (numbers * pace[..., None])
+        sizes = np.where(self.rate[..., None] > 0, sizes, 0.0)
+        phases = u[..., None] * (np.pi / quarter)[..., None, None] * numbers
+        return waves[..., :1].real * tau + (np.sin(phases) @ sizes[..., None])[..., 0]
+
+
+def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
+    values, vectors = np.linalg.eigh(body)
+    if not values[0] > 0:
+        raise ValueError(f"body: expected positive moments of inertia, got {values}")
+    if np.linalg.det(vectors) < 0:
+        vectors = -vectors
+    values = values / values[2]
+    middle = max(values[1], values[0] + _GAP)
+    values = np.array([values[0], middle, max(values[2], middle + _GAP)])
+    spins = w @ vectors
+    # L^2 - 2E I2: where it is negative, the spin circles the axis of the smallest moment, which then is the third.
+    circling = (values * spins**2 * (values - values[1])).sum(-1)
+    flip = (circling < 0)[..., None]
+    spins = np.where(flip, spins[..., ::-1] * [1, -1, 1], spins)
+    moments = np.where(flip, values[::-1], values)
+    axes = np.where(flip[..., None], vectors[:, ::-1] * [1, -1, 1], vectors)
+
+    i1, i2, i3 = (moments[..., k] for k in range(3))
+    # |2E I3 - L^2| and |L^2 - 2E I1|, as sums without cancellation.
+    low = np.abs((moments * spins**2 * (moments - moments[..., 2:])).sum(-1))
+    high = np.abs((moments * spins**2 * (moments - moments[..., :1])).sum(-1))
+    gap12, gap13, gap23 = np.abs(i1 - i2), np.abs(i1 - i3), np.abs(i2 - i3)
+    side = np.where(spins[..., 2] < 0, -1.0, 1.0)
+    order = np.where(i1 < i3, 1.0, -1.0)
+    peaks = np.sqrt(np.stack([low / (i1 * gap13), low / (i2 * gap23), high / (i3 * gap13)], -1))
+    peaks = peaks * np.stack([np.ones_like(side), side * order, side], -1)
+    rate = np.sqrt(high * gap23 / (i1 * i2 * i3))
+    m = np.where(high > 0, low * gap12 / np.maximum(high * gap23, _LEAST), 0.0)
+    m1 = np.abs(circling) * gap13 / np.maximum(high * gap23, _LEAST)
+    m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), 1e-30, 1.0), 1.0)
+    amplitude = np.arctan2(side * order * spins[..., 1] * np.sqrt(i2 * gap23), spins[..., 0] * np.sqrt(i1 * gap13))
+    squares = (moments * peaks) ** 2
+    pole = np.where(squares[..., 2] > np.minimum(squares[..., 0], squares[..., 1]), 0, 2)
+    return _Path(axes, moments, peaks, rate, incomplete(amplitude, m1), m1, pole)
+
+
+def _means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Arithmetic and geometric means a, b, and half differences c, from 1 and sqrt(1 - m)."""
+    a, b = [np.ones_like(m1)], [np.sqrt(m1)]
+    c = [np.sqrt(np.maximum(1 - m1, 0.0))]
+    while len(a) < 12 and (c[-1] > 1e-17 * a[-1]).any():
+        c.append(0.5 * (a[-1] - b[-1]))
+        a.append(0.5 * (a[-1] + b[-1]))
+        b.append(np.sqrt(a[-2] * b[-1]))
+    return a, b, c
+
+
+def complete(m1: np.ndarray) -> np.ndarray:
+    """K, a quarter of the period of sn, for parameters m = 1 - m1. [...]"""
+    return 0.5 * np.pi / _means(np.asarray(m1, np.float64))[0][-1]
+
+
+def incomplete(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
+    """F: the clock u at which sn u = sin(amplitude), cn u = cos(amplitude). Angles of any size. [...]"""
+    a, b, _ = _means(np.asarray(m1, np.float64))
+    phi = np.asarray(amplitude, np.float64)
+    for x, y in zip(a[:-1], b[:-1], strict=True):
+        turned = np.round(phi / np.pi)
+        phi = phi + np.arctan((y / x) * np.tan(phi - np.pi * turned)) + np.pi * turned
+    return phi / (2.0 ** (len(a) - 1) * a[-1])
+
+
+def elliptic(u: np.ndarray, m1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobi's sn, cn, dn at clocks u, for parameters m = 1 - m1, broadcast. [...] each"""
+    a, _, c = _means(np.asarray(m1, np.float64))
+    phi = 2.0 ** (len(a) - 1) * a[-1] * u
+    for x, z in zip(a[:0:-1], c[:0:-1], strict=True):
+        phi = 0.5 * (phi + np.arcsin(np.clip(z / x * np.sin(phi), -1, 1)))
+    sn, cn = np.sin(phi), np.cos(phi)
+    return sn, cn, np.sqrt(cn**2 + m1 * sn**2)
