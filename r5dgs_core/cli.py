@@ -1,4 +1,4 @@
-"""The ``r5dgs`` command: demo, train, bake, import, evaluate, bench, info, warm-up.
+"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, warm-up.
 
 Each sub-command is a function ``run_<name>`` that does the work and can be called without the command line.
 """
@@ -164,6 +164,84 @@ def run_evaluate(
     return result
 
 
+def run_report(
+    target: Path,
+    data: Path | None,
+    out: Path,
+    *,
+    tasks: Sequence[str] | None = None,
+    splits: Sequence[str] | None = None,
+    rounds: int | None = None,
+    progress_kind: str = "none",
+) -> dict[str, Any]:
+    """Measure error against run time of a run or scene file (see `report.error_time`) and write it to a folder.
+
+    Args:
+        target: A run folder, or a `.r5dgs` file.
+        data: The data set; by default the one a run was trained on, none for a file.
+        out: Folder of ``report.json``, ``.csv``, ``.md`` and ``.png``.
+        tasks: What to measure, all where None.
+        splits: Splits whose images are compared, "test" where None.
+        rounds: Rounds of timing, the report's own number where None.
+        progress_kind: How progress is shown (`progress.make`).
+
+    Returns:
+        The report, in the shape of ``report.json``.
+    """
+    from .data import dataset as datasets
+    from .progress import make
+    from .report import error_time, report_rows, report_table
+    from .scene import scene_file
+    from .train import bake, checkpoint
+
+    for kind, given, known in (("tasks", tasks, report_rows.TASKS), ("splits", splits, datasets.SPLITS)):
+        for name in given or ():
+            if name not in known:
+                raise errors.ConfigError(f"--{kind} {name}: expected some of {', '.join(known)}")
+    if rounds is not None and rounds < 1:
+        raise errors.ConfigError(f"--repeats {rounds}: expected 1 or more")
+    if out.exists() and not out.is_dir():
+        raise errors.ConfigError(f"--out {out}: expected a folder, or nothing yet; found a file")
+    if target.is_dir():
+        run = checkpoint.open_run(target)
+        dataset = datasets.read(run.data(data))
+        scene, trained_on = bake.bake(run, dataset), run.digest
+    else:
+        scene = scene_file.read(target)
+        dataset = None if data is None else datasets.read(data)
+        trained_on = scene.provenance.get("dataset_digest")
+    if dataset is not None and trained_on is not None and trained_on != dataset.digest:
+        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+    with make(progress_kind) as progress:
+        result = error_time.measure(
+            scene,
+            dataset,
+            tasks=tasks or report_rows.TASKS,
+            splits=splits or ("test",),
+            rounds=rounds or error_time.ROUNDS,
+            progress=progress,
+        )
+    paths = error_time.write(result, out)
+    if progress_kind != "json":
+        report_table.show(result)
+        print("\n".join(f"written: {path}" for path in paths))
+    return result
+
+
+def run_stability(json_path: Path | None = None) -> bool:
+    """Run the stiff and extreme cases (see `report.stability`) and print them; returns whether all passed."""
+    from rich.console import Console
+
+    from .report import stability
+
+    rows = stability.run()
+    Console().print(stability.make(rows))
+    print(stability.summary(rows))
+    if json_path is not None:
+        print(f"written: {stability.write(rows, json_path)}")
+    return all(row.passed for row in rows)
+
+
 def run_info(path: Path, *, as_json: bool) -> None:
     """Say what is in a scene file."""
     from .scene import scene_file
@@ -281,6 +359,17 @@ def parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
     add_progress(evaluate)
 
+    report = commands.add_parser("report", help="error against run time of a run or scene; or --stability")
+    report.add_argument("target", type=Path, nargs="?", metavar="RUN|SCENE", help="run folder or .r5dgs file")
+    report.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set (default: the run's own)")
+    report.add_argument("--out", type=Path, metavar="DIR", help="folder of report.json, .csv, .md and .png")
+    report.add_argument("--tasks", nargs="+", metavar="TASK", help="of dynamics, poses, images, raster (default: all)")
+    report.add_argument("--splits", nargs="+", metavar="SPLIT", help="of val, test: images to compare (default: test)")
+    report.add_argument("--repeats", type=int, metavar="N", help="rounds of timing (default: 7)")
+    report.add_argument("--stability", action="store_true", help="stiff and extreme cases instead; needs no scene")
+    report.add_argument("--json", type=Path, metavar="FILE", help="where --stability writes its rows")
+    add_progress(report)
+
     some, usual = ", ".join(variants.VARIANTS), " ".join(variants.DEFAULT_VARIANTS)
     bench = commands.add_parser("bench", help="train variants on scenes and lay out the paper's tables")
     bench.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="data set folders")
@@ -301,10 +390,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status (0, 1 for an error that the user can act on, 130 when stopped)."""
+    """Run the command line; returns the exit status (0; 1 for an error that the user can act on, or a case that fails; 130 when stopped)."""
     args = parser().parse_args(arguments)
     try:
-        _dispatch(args)
+        return _dispatch(args)
     except errors.Interrupted as stop:
         print(f"r5dgs: {stop}", file=sys.stderr)
         return 130
@@ -317,10 +406,10 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has gone; what is left of it goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    return 0
 
 
-def _dispatch(args: argparse.Namespace) -> None:
+def _dispatch(args: argparse.Namespace) -> int:
+    """Do what the command line says; returns the exit status."""
     cap = getattr(args, "max_gaussians", None)
     overrides = [*getattr(args, "set", []), *([] if cap is None else [f"densify.max_gaussians={cap}"])]
     if args.command in ("demo", "train"):
@@ -348,6 +437,13 @@ def _dispatch(args: argparse.Namespace) -> None:
         run_evaluate(
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress
         )
+    elif args.command == "report":
+        if args.stability:
+            return 0 if run_stability(args.json) else 1
+        if args.target is None or args.out is None:
+            raise errors.ConfigError("report: expected RUN|SCENE and --out DIR, or --stability")
+        options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "progress_kind": args.progress}
+        run_report(args.target, args.data, args.out, **options)
     elif args.command == "bench":
         from .bench import benchmark, cases
         from .scene import playback
@@ -367,6 +463,7 @@ def _dispatch(args: argparse.Namespace) -> None:
         run_warm_up(progress_kind=args.progress)
     else:
         run_info(args.file, as_json=args.json)
+    return 0
 
 
 if __name__ == "__main__":
