@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from . import rotations, se3, top
+from . import propagation, rotations, se3, top
 
 log = logging.getLogger(__name__)
 
@@ -193,34 +193,73 @@ def evaluate(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, n
 
 
 def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray, np.ndarray]:
-    """`evaluate` of G models at one time, in a few calls whatever their number. Returns [G, 4] and [G, 3]."""
-    if tau < 0:
-        raise ValueError(f"tau: expected a time since t_max >= 0, got {tau}")
-    quats, displacements = rotations.identity(len(models)), np.zeros((len(models), 3))
-    if not models:
-        return quats, displacements
-    stacked = {name: np.array([getattr(model, name) for model in models]) for name in _VECTORS}
-    span = np.array([[float(tau)]])
-    frequencies = np.array([[model.frequency] for model in models])
-    with np.errstate(over="ignore", invalid="ignore"):
-        for kind in {model.kind for model in models} - {"static"}:
+    """`evaluate` of G models at one time, in a few calls whatever their number; for many times keep a `Stack`.
+
+    Returns:
+        Unit quaternions wxyz [G, 4] and displacements [G, 3].
+    """
+    return Stack(models).poses(tau)
+
+
+class Stack:
+    """Several motions, ready to be evaluated together at any time; what does not depend on the time is done once."""
+
+    def __init__(self, models: Sequence[MotionModel]):
+        self._count = len(models)
+        self._kinds = []
+        for kind in sorted({model.kind for model in models} - {"static"}):
             rows = np.array([g for g, model in enumerate(models) if model.kind == kind])
-            v, a, w, eps, u = (stacked[name][rows] for name in _VECTORS[:5])
-            if kind == "translation":
-                once, twice = clocks(frequencies[rows], span)
-                displacements[rows] = v * once + a * twice
-            elif kind == "ballistic_spin":
-                quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, frequencies[rows], span)
-            elif kind == "constant_twist":
-                quats[rows], displacements[rows] = twist_poses(v, w, span)
-            else:
-                for g in rows:
-                    quats[g], displacements[g], _, _ = curve(models[g], tau)
-        s = -np.expm1(-tau / np.array([[model.fade_time] for model in models]))
-        quats = rotations.multiply(quats, rotations.rotvecs_to_quats(s * stacked["offset_rotvec"]))
-        displacements = displacements + s * stacked["offset_displacement"]
-    held = _held(quats, displacements)
-    return held[0], held[1]
+            chosen = [models[g] for g in rows]
+            rates = tuple(np.array([getattr(model, name) for model in chosen]) for name in _VECTORS[:5])
+            self._kinds.append((kind, rows, rates, _prepared(kind, chosen, rates)))
+        self._faded = np.array(
+            [g for g, m in enumerate(models) if m.offset_rotvec.any() or m.offset_displacement.any()]
+        )
+        fading = [models[g] for g in self._faded]
+        self._fade_times = np.array([[model.fade_time] for model in fading])
+        self._rotvecs = np.array([model.offset_rotvec for model in fading])
+        self._displacements = np.array([model.offset_displacement for model in fading])
+
+    def poses(self, tau: float) -> tuple[np.ndarray, np.ndarray]:
+        """Unit quaternions wxyz [G, 4] and displacements [G, 3] at a time since t_max, as `evaluate`."""
+        if tau < 0:
+            raise ValueError(f"tau: expected a time since t_max >= 0, got {tau}")
+        quats, displacements = rotations.identity(self._count), np.zeros((self._count, 3))
+        if tau == 0:
+            return quats, displacements
+        span = np.array([[float(tau)]])
+        with np.errstate(over="ignore", invalid="ignore"):
+            for kind, rows, (v, a, w, eps, u), prepared in self._kinds:
+                if kind == "translation":
+                    once, twice = clocks(prepared, span)
+                    displacements[rows] = v * once + a * twice
+                elif kind == "ballistic_spin":
+                    quats[rows], displacements[rows] = spin_poses(v, a, w, eps, u, prepared, span)
+                elif kind == "constant_twist":
+                    quats[rows], displacements[rows] = twist_poses(v, w, span)
+                elif kind == "world_twist":
+                    quats[rows], displacements[rows] = prepared.rows_of(float(tau))
+                else:
+                    for g, model in zip(rows, prepared, strict=True):
+                        quats[g], displacements[g], _, _ = curve(model, tau)
+            if len(self._faded):
+                s = -np.expm1(-tau / self._fade_times)
+                faded = rotations.rotvecs_to_quats(s * self._rotvecs)
+                quats[self._faded] = rotations.multiply(quats[self._faded], faded)
+                displacements[self._faded] += s * self._displacements
+        held = _held(quats, displacements)
+        return held[0], held[1]
+
+
+def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray, ...]) -> Any:
+    """What motions of one kind are evaluated with, beside their rates."""
+    if kind == "world_twist":
+        v, a, w, eps, _ = rates
+        radii = np.array([model.radius for model in models])
+        return propagation.Propagator(np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii)
+    if kind == "free_top":
+        return models
+    return np.array([[model.frequency] for model in models])
 
 
 def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:

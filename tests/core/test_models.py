@@ -11,6 +11,7 @@ from r5dgs_core.motion.models import MotionModel
 from tests import problems
 
 OFFSETS = {"offset_rotvec": [0.05, -0.02, 0.1], "offset_displacement": [0.02, 0.01, -0.03]}
+RNG = np.random.default_rng(5)
 WORLD_TWIST = MotionModel(
     "world_twist",
     velocity=[0.5, 0.3, -0.9],
@@ -58,8 +59,9 @@ def test_many_models_at_once_are_each_by_itself(tau):
     quats, displacements = models.evaluate_all(group, tau)
     for model, quat, displacement in zip(group, quats, displacements, strict=True):
         expected = models.evaluate(model, tau)
-        np.testing.assert_allclose(quat, expected[0], atol=1e-12)
-        np.testing.assert_allclose(displacement, expected[1], atol=1e-12)
+        allowed = 2e-9 if model.kind == "world_twist" else 1e-12  # its steps may be others
+        np.testing.assert_allclose(quat, expected[0], atol=allowed)
+        np.testing.assert_allclose(displacement, expected[1], atol=allowed)
     assert [len(x) for x in models.evaluate_all([], tau)] == [0, 0]
     with pytest.raises(ValueError, match="tau"):
         models.evaluate_all(group, -0.1)
@@ -82,6 +84,46 @@ def test_distances_are_kept(name):
     moved = rotations.rotate(quats, points) + displacements
     before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
     np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_jumps_at_t_max_and_speeds_are_finite(name):
+    model = with_offsets(CASES[name])
+    quats, displacements, spins, velocities = models.evaluate_with_rates(model, np.array([0.0, 1e-9, 1e-8]))
+    assert rotations.angle_between(quats, quats[0]).max() < 1e-6
+    assert np.abs(displacements).max() < 1e-6
+    assert np.isfinite(spins).all() and np.isfinite(velocities).all()
+    assert np.abs(velocities).max() < 100
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_single_precision_keeps_distances_relative_to_the_pivot(name):
+    points = RNG.normal(size=(30, 3))
+    quats, _ = models.evaluate(with_offsets(CASES[name]), 2.3)
+    moved = rotations.rotate(quats, points).astype(np.float32)
+    before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
+    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in models.KINDS if kind != "static"])
+@pytest.mark.parametrize("rate", ["velocity", "acceleration", "angular_velocity", "angular_acceleration"])
+@pytest.mark.parametrize("size", [1e30, 1e200, 1e308])
+def test_overflow_is_finite_or_told(kind, rate, size, caplog):
+    models._warn_of_wild_motion.cache_clear()
+    inertia = np.diag([1.0, 2.0, 2.5]) if kind == "free_top" else None
+    vector = [0.3 * size, 0.0, 0.8 * size]
+    wild = MotionModel(
+        kind, inertia=inertia, **{"velocity": [0.1, 0, 0], "angular_velocity": [0, 0.1, 0], rate: vector}
+    )
+    sane = CASES["hinge"]
+    quats, displacements = models.evaluate_all([sane, wild], 0.8)
+    expected = models.evaluate_all([sane, models.STATIC], 0.8)
+    np.testing.assert_array_equal(quats[0], expected[0][0])
+    np.testing.assert_array_equal(displacements[0], expected[1][0])
+    for part in (quats, displacements, *models.evaluate_with_rates(wild, np.array([0.0, 0.8]))):
+        assert np.isfinite(part).all()
+    if quats[1].tolist() == [1, 0, 0, 0] and not displacements[1].any():
+        assert "leaves the range of numbers" in caplog.text or wild.is_static or not wild.turns
 
 
 def test_velocity_and_spin_at_t_max_are_those_of_the_model():
