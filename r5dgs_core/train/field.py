@@ -257,6 +257,7 @@ class FieldRepresentation:
             tensors["field.casters"].tolist(),
             tensors["field.plane_normal"].numpy().astype(np.float64),
             tensors["light"].numpy().astype(np.float64),
+            config.needs.regrouping,
         )
 
 

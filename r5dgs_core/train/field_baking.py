@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..model import spherical_harmonics
-from ..motion import poses, rotations, se3
-from . import shading
+from ..motion import fitting, poses, rotations, se3
+from . import hygiene, shading
 from .field_motion import Motion
 from .groups import GroupTrack, ObservedMotion, PointMotion
 
@@ -39,6 +39,7 @@ def observed_motion(
     shadows: Sequence[int],
     normal: np.ndarray,
     light: np.ndarray,
+    regrouping: str = "auto",
 ) -> ObservedMotion:
     """Sample a field at the knots and fit its groups.
 
@@ -53,6 +54,7 @@ def observed_motion(
         shadows: Caster, a class, of each group from B on.
         normal: Normal of the plane that carries shadows. [3]
         light: Light of the shading. [3]
+        regrouping: ``off`` leaves Gaussians in the groups that they were made for.
     """
     at = knots(times, motion.horizon)
     rows, means = movers, gaussians["means"][movers]
@@ -87,23 +89,62 @@ def observed_motion(
     motion_ids[resting] = labels[resting]
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
-    still = rotations.identity(len(at)), np.zeros((len(at), 3))
-    groups = [GroupTrack(0, "pinned", np.zeros(3), *still, np.ones(len(at), bool))]
+    observed = np.concatenate([np.ones((1, len(times)), bool), seen])[:, nearest]
+    observed[:, -1] = True
+
+    def fit(ids: np.ndarray) -> list[GroupTrack]:
+        return _groups(path, ids, opacities, object_ids, observed, shadows, normal)
+
+    groups, moves = fit(own), None
+    if regrouping != "off":
+        made_for = own
+        own, groups, moves = hygiene.tidy(path, own, opacities, fit)
+        if len(shadows) == 0:  # none was made in training, yet the floor may imitate some
+            casters = hygiene.imitators(path, own, opacities, groups, normal)
+            shadows = np.unique(casters[casters > 0]).tolist()
+            own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
+            own, groups, moves = hygiene.tidy(path, own, opacities, fit, made_for)
+        motion_ids[rows.numpy()] = own
+    points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
+    return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points, moves=moves)
+
+
+def _groups(
+    path: np.ndarray,
+    ids: np.ndarray,
+    opacities: np.ndarray,
+    object_ids: np.ndarray,
+    observed: np.ndarray,
+    shadows: Sequence[int],
+    normal: np.ndarray,
+) -> list[GroupTrack]:
+    """The groups fitted to their members: the pinned one, a body per object, the shadows.
+
+    Args:
+        path: Centres of what moves, at the knots. [R, S, 3]
+        ids: Its groups. [R]
+        opacities: [R]
+        object_ids: Object id of each class. [B]
+        observed: Knots at which each class was placed by its masks. [B, S] bool
+        shadows: Caster, a class, of each group from B on.
+        normal: Normal of the plane that carries shadows. [3]
+    """
+    still = rotations.identity(path.shape[1]), np.zeros((path.shape[1], 3))
+    groups = [GroupTrack(0, "pinned", np.zeros(3), *still, observed[0])]
     for row in range(1, len(object_ids)):
-        observed = seen[row - 1][nearest].copy()
-        observed[-1] = True
-        members = own == row
-        center, quat, shift = _track(path[members], opacities[members])
-        groups.append(GroupTrack(int(object_ids[row]), "body", center, quat, shift, observed))
+        members = ids == row
+        center, quat, shift = _track(path[members], hygiene.voters(path[members, -1], opacities[members]))
+        groups.append(GroupTrack(int(object_ids[row]), "body", center, quat, shift, observed[row]))
     for k, caster in enumerate(shadows):
-        members = own == len(object_ids) + k
-        leader = groups[caster]
-        matrix = _follow(path[members], opacities[members], leader.displacements, normal)
-        center = np.average(path[members, -1], axis=0, weights=opacities[members]) if members.any() else leader.center
+        members = ids == len(object_ids) + k
+        leader, weights = groups[caster], hygiene.voters(path[members, -1], opacities[members])
+        matrix = _follow(path[members], weights, leader.displacements, normal)
+        if not follows(path[members], weights, leader.displacements, normal):
+            matrix = np.zeros((3, 3))
+        center = np.average(path[members, -1], axis=0, weights=weights) if members.any() else leader.center
         shift = leader.displacements @ matrix.T
         groups.append(GroupTrack(leader.object_id, "shadow", center, still[0], shift, leader.observed, caster, matrix))
-    points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
-    return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points)
+    return groups
 
 
 def _track(path: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,6 +169,25 @@ def _follow(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: n
     gram = leader.T @ leader
     ridge = SHADOW_RIDGE * np.trace(gram) / 3 + 1e-9
     return np.linalg.solve(gram + ridge * np.eye(3), leader.T @ moved + ridge * flat.T).T
+
+
+def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether a shadow went on with its caster, better than if it had stayed: learned early, judged at the last knots.
+
+    Args:
+        path: Centres of its Gaussians at the knots. [n, S, 3]
+        weights: Of these. [n]
+        leader: Displacements of the caster. [S, 3]
+        normal: Of the plane. [3]
+    """
+    last = len(leader) - 1 - max(2, round(fitting.HELD_OUT * len(leader)))
+    if last < 2 or len(path) == 0:
+        return True
+    matrix = _follow(path[:, : last + 1], weights, leader[: last + 1] - leader[last], normal)
+    moved = path[:, last + 1 :] - path[:, last : last + 1]
+    missed = moved - (leader[last + 1 :] - leader[last]) @ matrix.T
+    went, stayed = (np.average(np.linalg.norm(x, axis=-1).mean(1), weights=weights) for x in (missed, moved))
+    return bool(went <= stayed)
 
 
 def _about_own_centre(points: np.ndarray, state, scale: float) -> np.ndarray:

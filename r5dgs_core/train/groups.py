@@ -63,6 +63,30 @@ class PointMotion:
 
 
 @dataclass(frozen=True)
+class Moves:
+    """What became of the Gaussians that move.
+
+    Attributes:
+        to_bodies: How many went to another body.
+        to_shadows: How many went to a shadow.
+        to_rest: How many were found to rest.
+        resting_shadows: Shadows that stayed where they were in the last observed times though their casters moved.
+        moving: Of how many.
+    """
+
+    to_bodies: int = 0
+    to_shadows: int = 0
+    to_rest: int = 0
+    resting_shadows: int = 0
+    moving: int = 0
+
+    @property
+    def moved(self) -> int:
+        """How many changed their group."""
+        return self.to_bodies + self.to_shadows + self.to_rest
+
+
+@dataclass(frozen=True)
 class ObservedMotion:
     """What a trained representation hands to baking.
 
@@ -73,6 +97,7 @@ class ObservedMotion:
         gaussians: Parameters by name that the groups' tracks start from, where they are not the canonical ones.
         motion_ids: Group of each Gaussian, where it is not that of the training. [N]
         points: Motion of single Gaussians, or None where all move with their groups.
+        moves: How many Gaussians went to groups that explain them better; None where none was asked.
         smooth: Whether the tracks go on smoothly before their objects are seen; else they hold the first observed pose.
     """
 
@@ -83,3 +108,4 @@ class ObservedMotion:
     motion_ids: np.ndarray | None = None
     points: PointMotion | None = None
     smooth: bool = False
+    moves: Moves | None = None

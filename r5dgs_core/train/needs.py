@@ -14,6 +14,7 @@ import numpy as np
 from ..motion import rotations
 from ..scene.scene import MotionGroup
 from .config import Config
+from .groups import Moves
 from .sections import NeedsSection
 
 STILL_QUAT = rotations.identity()
@@ -130,6 +131,28 @@ def decide(
         _row(name, value, threshold, on, there, reason, getattr(wanted, name))
         for name, value, threshold, on, there, reason in rows
     )
+
+
+def regrouping(moves: Moves | None, unexplained: int, wanted: NeedsSection) -> list[dict[str, Any]]:
+    """The row of the needs table on Gaussians that go with another group than that of their object; none where no
+    Gaussian moves on its own and the user does not ask.
+
+    Args:
+        moves: What was moved; None where nothing was asked.
+        unexplained: Gaussians that no group explains; mode "hybrid" moves them one by one.
+        wanted: The user's word.
+    """
+    if moves is None:
+        if wanted.regrouping == "auto":
+            return []
+        return [_row("regrouping", 0, 1, False, False, "each goes with the group it was made for", wanted.regrouping)]
+    reason = (
+        f"of {moves.moving} Gaussians that move, {moves.to_bodies} went to another body, {moves.to_shadows} to a "
+        f"shadow, {moves.to_rest} to rest; no group explains {unexplained}"
+    )
+    if moves.resting_shadows:
+        reason += f"; {moves.resting_shadows} shadows rest"
+    return [_row("regrouping", moves.moved, 1, moves.moved > 0, moves.moved > 0, reason, wanted.regrouping)]
 
 
 def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:

@@ -390,6 +390,7 @@ class NeedsSection:
         sky_gradient: Harmonics of the sky; without them it has one colour.
         classifier: Identity encodings and their classifier.
         residuals: Motion of objects that bend or breathe.
+        regrouping: Gaussians of a field that go with the group that explains their motion, not that of their object.
     """
 
     tracks: str = "auto"
@@ -400,3 +401,4 @@ class NeedsSection:
     sky_gradient: str = "auto"
     classifier: str = "auto"
     residuals: str = "auto"
+    regrouping: str = "auto"
