@@ -99,6 +99,7 @@ class Server:
         self._scene: Scene | None = None
         self._stamp: tuple[str, int, int] | None = None
         self._stage = None  # of the scene, from the first picture on
+        self._player: playback.Player | None = None  # of the scene, from the first time that is asked for
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
@@ -140,7 +141,7 @@ class Server:
             ) from error
         stamp = (str(path), status.st_mtime_ns, status.st_size)
         if self._scene is None or stamp != self._stamp:
-            self._scene, self._stamp, self._stage = None, None, None
+            self._scene, self._stamp, self._stage, self._player = None, None, None, None
             self._scene, self._stamp = scene_file.read(path), stamp
         return {"name": self._scene.name, "gaussians": len(self._scene.means)}, {}
 
@@ -168,7 +169,10 @@ class Server:
             output = self._stage.render(instances, camera, sky=bool(sky))
             ms_motion, count = self._stage.ms_motion, sum(instance.count for instance in instances)
         else:
-            pose = scene_render.pose_frame(scene, playback.frame(scene, float(_need(request, "t", (int, float)))))
+            t = float(_need(request, "t", (int, float)))
+            if self._player is None:
+                self._player = playback.Player(scene)
+            pose = scene_render.pose_frame(scene, self._player.frame(t, camera.center))
             ms_motion, count = 1e3 * (time.perf_counter() - started), len(pose.means)
             output = scene_render.render_frame(scene, pose, camera, background="scene" if sky else None)
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion

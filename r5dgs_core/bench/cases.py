@@ -34,7 +34,7 @@ class Plan:
         out: Folder of the benchmark.
         variants: Of `variants.VARIANTS`.
         seeds: Of training.
-        modes: Of `playback.MODES`; a scene is played in those that it has data for.
+        modes: Of `playback.every`; a scene is played in those that it has data for.
         preset: Named settings of training.
         config_path: TOML configuration, wins over the preset.
         overrides: ``section.key=value``, win over both.
@@ -96,7 +96,8 @@ def make(plan: Plan) -> list[Case]:
         DatasetError: A data set cannot be read, or two have one name.
         CheckpointError: A run folder is damaged, or its run was trained on other data.
     """
-    for name, given, known in (("--variants", plan.variants, kinds.VARIANTS), ("--modes", plan.modes, playback.MODES)):
+    every_mode = playback.every()
+    for name, given, known in (("--variants", plan.variants, kinds.VARIANTS), ("--modes", plan.modes, every_mode)):
         if not given:
             raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")
         for item in given:

@@ -42,16 +42,17 @@ def measure(
     times: dict[str, list[tuple[float, float, float]]] = {mode: [] for mode in modes}
     if not ordered:
         return {mode: _summary(found) for mode, found in times.items()}
-    for mode in modes:
+    players = {mode: playback.Player(scene, mode) for mode in modes}
+    for player in players.values():
         for view in ordered:
-            _draw(scene, view, mode, backend)
+            _draw(player, view, backend)
     began = time.monotonic()
     for taken in itertools.count():
         patient = time.monotonic() - began < PATIENCE_S * len(modes)
         if taken * len(ordered) >= LEAST_FRAMES or (taken and not patient):
             break
         for mode, found in times.items():
-            found += [_draw(scene, view, mode, backend) for view in ordered]
+            found += [_draw(players[mode], view, backend) for view in ordered]
     return {mode: _summary(found) for mode, found in times.items()}
 
 
@@ -67,11 +68,11 @@ def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
     return {**dict(zip(names, map(float, values), strict=True)), "frames": len(times)}
 
 
-def _draw(scene: Scene, view: View, mode: str, backend: str) -> tuple[float, float, float]:
+def _draw(player: playback.Player, view: View, backend: str) -> tuple[float, float, float]:
     """Milliseconds of motion, of rasterization, and of processor time of one frame."""
     cpu, start = time.process_time(), time.perf_counter()
-    frame = playback.frame(scene, view.t, mode)
+    frame = player.frame(view.t, view.camera.center)
     moved = time.perf_counter()
-    output = scene_render.render_frame(scene, frame, view.camera, backend=backend)
+    output = scene_render.render_frame(player.scene, frame, view.camera, backend=backend)
     scene_render.to_numpy(output.color, np.float32)  # waits for a GPU, too
     return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)

@@ -132,24 +132,41 @@ def _omitted(x: np.ndarray, b: np.ndarray, bracket: np.ndarray, reach: np.ndarra
 
 
 def _magnus(x: np.ndarray, b: np.ndarray, c: np.ndarray, duration: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poses after equal steps. [6, n] each -> [4, n], [3, n]"""
-    h = duration / steps
-    fixed = h * x - (h**3 / 12) * c
-    quats, displacements = _exp(fixed + (0.5 * h * h) * b)
-    for i in range(1, steps):
-        q, d = _exp(fixed + ((i + 0.5) * h * h) * b)
-        displacements = _rotate(q, displacements) + d
-        quats = multiply(q, quats)
+    """Poses after equal steps: as many at once as fit the cache. [6, n] each -> [4, n], [3, n]"""
+    count, h = x.shape[1], duration / steps
+    fixed = (h * x - (h**3 / 12) * c)[:, None]
+    quats, displacements = np.empty((4, 0)), np.empty((3, 0))
+    at_once = max(1, CHUNK // max(count, 1))
+    for start in range(0, steps, at_once):
+        middles = (np.arange(start, min(start + at_once, steps)) + 0.5) * h * h
+        taken = len(middles)
+        q, d = _exp((fixed + middles[:, None] * b[:, None]).reshape(6, taken * count))
+        q, d = _product(q.reshape(4, taken, count), d.reshape(3, taken, count))
+        if start:
+            displacements = _rotate(q, displacements) + d
+            quats = multiply(q, quats)
+        else:
+            quats, displacements = q, d
     if steps > 1:
         quats /= np.sqrt((quats * quats).sum(0))
     return quats, displacements
 
 
+def _product(quats: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The poses along axis 1 one after the other, by halving. [4, s, n], [3, s, n] -> [4, n], [3, n]"""
+    while quats.shape[1] > 1:
+        even = quats.shape[1] // 2 * 2
+        first, second = slice(0, even, 2), slice(1, even, 2)
+        d = _rotate(quats[:, second], displacements[:, first]) + displacements[:, second]
+        q = multiply(quats[:, second], quats[:, first])
+        quats = np.concatenate([q, quats[:, even:]], axis=1)
+        displacements = np.concatenate([d, displacements[:, even:]], axis=1)
+    return quats[:, 0], displacements[:, 0]
+
+
 def _exp(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pose of one unit of time under a constant twist. [6, n] -> [4, n], [3, n]"""
-    w, v = u[:3], u[3:]
-    quats, displacements, _, _ = _turn(w, v)
-    return quats, displacements
+    return _turn(u[:3], u[3:])[:2]
 
 
 def _turn(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -180,7 +197,7 @@ def _accelerated_spin(x: np.ndarray, a: np.ndarray, duration: float) -> tuple[np
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b by column. [3, n] each"""
+    """a x b by column. [3, ...] each"""
     result = np.empty_like(b)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=result[i])
@@ -189,7 +206,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternion products p q by column. [4, n] each"""
+    """Quaternion products p q by column. [4, ...] each"""
     return np.stack([
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from . import dynamics, rotations
+
+State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotations, v, w
 
 
 class SteppedPath:
@@ -30,13 +30,14 @@ class SteppedPath:
         if duration < 0:
             raise ValueError(f"duration: expected a time >= 0, got {duration}")
         if duration == 0:
-            return self._states[0][:2]
-        count = max(1, math.ceil(duration / self._step - 1e-9))
-        while len(self._states) < count:
+            return self._states[0][0], self._states[0][1]
+        steps = dynamics.step_sizes(duration, self._step)
+        while len(self._states) < len(steps):
             self._states.append(self._next(self._states[-1], self._step))
-        return self._next(self._states[count - 1], duration - self._step * (count - 1))[:2]
+        points, quats, _, _ = self._next(self._states[len(steps) - 1], steps[-1])
+        return points, quats
 
-    def _next(self, state: tuple[np.ndarray, ...], h: float) -> tuple[np.ndarray, ...]:
+    def _next(self, state: State, h: float) -> State:
         """Points, rotations and twist a step later."""
         (points, quats, v, w), (a, e) = state, self._rates
         points, turn = dynamics.rk2(points, v, w, a, e, h, h)

@@ -75,7 +75,7 @@ def evaluate(
     Args:
         scene: The scene.
         dataset: The data set.
-        modes: Ways to move past t_max, of `playback.MODES`.
+        modes: Ways to move past t_max, of `playback.modes`.
         splits: Splits to measure.
         background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
         backend: Rasterizer.
@@ -104,7 +104,7 @@ def evaluate(
             result["splits"][split][mode] = measure(
                 scene,
                 views,
-                functools.partial(playback.frame, scene, mode=mode),
+                playback.Player(scene, mode).frame,
                 background=background,
                 backend=backend,
                 measured=count,
@@ -142,8 +142,8 @@ def measure(
     """
     background = truth_background(scene) if background is None else background
     tally = _Tally([item.id for item in scene.objects if item.id > 0])
-    if views:
-        draw(scene, views[0].camera, views[0].t, move, backend=backend)  # compiles; not timed
+    for view in (views[0], views[-1]) if views else ():
+        draw(scene, view.camera, view.t, move, backend=backend)  # compiles, fills what is kept; not timed
     for view in views:
         rendering = draw(scene, view.camera, view.t, move, backend=backend)
         tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view))

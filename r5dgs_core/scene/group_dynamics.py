@@ -61,11 +61,9 @@ class GroupMotion:
 
     def __init__(self, scene: Scene, source: str = "fitted"):
         self._times, self._t_max = scene.track_times, scene.t_max
-        self._count = len(scene.groups)
         self._scene, self._source = scene, source
         self._quats, self._displacements = knots(scene)
         self._slopes = keyframes.slopes(self._times, self._quats), keyframes.slopes(self._times, self._displacements)
-        self._leaders = [g for g, group in enumerate(scene.groups) if group.follows is None]
         self._followers = [
             (g, group.follows, group.follow_matrix)
             for g, group in enumerate(scene.groups)
@@ -77,15 +75,19 @@ class GroupMotion:
         """Motion of each group past t_max."""
         return models_of(self._scene, self._source)
 
+    @functools.cached_property
+    def _future(self) -> models.Stack:
+        return models.Stack(
+            [STATIC if g.follows is not None else m for g, m in zip(self._scene.groups, self.models, strict=True)]
+        )
+
     def poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Pose of every group relative to the bind state, as `playback.group_poses`."""
         if not np.isfinite(t):
             raise ValueError(f"t: expected a finite scene time, got {t}")
         if t < self._t_max:
             return self._observed(t)
-        quats, displacements = rotations.identity(self._count), np.zeros((self._count, 3))
-        found = models.evaluate_all([self.models[g] for g in self._leaders], t - self._t_max)
-        quats[self._leaders], displacements[self._leaders] = found
+        quats, displacements = self._future.poses(t - self._t_max)
         for g, leader, matrix in self._followers:
             displacements[g] = matrix @ displacements[leader]
         return quats, displacements
@@ -198,7 +200,7 @@ def _screw(
         guess: What w is about an axis that the points leave open. [3]
         doubt: Standard deviation of w from which an axis counts as open.
     """
-    current = weights / weights.sum()
+    current, center, mean, w = weights / weights.sum(), arms[0], speeds[0], guess
     for remaining in range(_ROUNDS, -1, -1):
         center, mean = current @ arms, current @ speeds
         x, u = arms - center, speeds - mean

@@ -32,8 +32,8 @@ from .residuals import Literal, OwnMotion, Residuals, unexplained
 from .scene import Scene
 
 __all__ = (
-    "MODES", "VARIANTS", "Frame", "Player", "available", "frame", "group_poses", "knot_slopes", "knots", "modes",
-    "move_points", "pose", "rest_factors", "runs", "sh_rotations", "slopes", "split", "turn_quats",
+    "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
+    "modes", "move_points", "pose", "rest_factors", "runs", "sh_rotations", "slopes", "split", "turn_quats",
 )  # fmt: skip
 
 MODES = ("rigid", "hybrid", "standard", "rigid_paper")
@@ -101,9 +101,14 @@ def split(mode: str) -> tuple[str, str]:
     return base, variant or next(iter(variants), "")
 
 
+def every() -> tuple[str, ...]:
+    """All modes, each once, the first variant of a base by the base's name."""
+    return tuple(mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:])))
+
+
 def modes(scene: Scene) -> tuple[str, ...]:
-    """All modes that a scene holds data for, each once: `rigid` always, the others where it carries dynamics."""
-    return tuple(mode for mode in _ALL if available(scene, mode))
+    """Those of `every` that a scene holds data for: `rigid` always, the others where it carries dynamics."""
+    return tuple(mode for mode in every() if available(scene, mode))
 
 
 def available(scene: Scene, mode: str) -> bool:
@@ -112,11 +117,6 @@ def available(scene: Scene, mode: str) -> bool:
     if base == "rigid_paper":
         return scene.dynamics is not None and scene.canonical_means is not None
     return scene.dynamics is not None or (base == "rigid" and variant == "fitted")
-
-
-_ALL = tuple(
-    mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:]))
-)  # the first variant is the base itself
 
 
 class Player:

@@ -16,6 +16,7 @@ from .scene import Scene
 
 TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
 ANGLE_TOLERANCE = 1e-3  # error of its rotations, rad
+Cubic = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # values and slopes at both ends
 UNEXPLAINED = 0.1  # of the group's radius: residuals from there on belong to no motion of a group
 
 
@@ -35,7 +36,7 @@ class Residuals:
         self._parts = tuple(part for part in parts if part is not None) if there else ()
         self.runs = runs(scene.motion_ids[self.rows])
         self._times, self._t_max = scene.track_times, scene.t_max
-        self._interval: tuple[int, list[tuple[np.ndarray, ...]]] | None = None
+        self._interval: tuple[int, list[Cubic]] | None = None
 
     def at(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Offsets [R, 3], unit quaternions wxyz [R, 4] and changes of log scales [R, 3] at a time, float64.
@@ -53,11 +54,14 @@ class Residuals:
         if self._interval is None or self._interval[0] != k:
             self._interval = k, [_cubic(times, part, k) for part in self._parts]
         h = times[k + 1] - times[k]
-        offsets, turns, growths = (keyframes.hermite(*ends, h, (t - times[k]) / h) for ends in self._interval[1])
+        u = (t - times[k]) / h
+        offsets, turns, growths = (
+            keyframes.hermite(a, b, left, right, h, u) for a, b, left, right in self._interval[1]
+        )
         return offsets, rotations.normalize(turns), growths
 
 
-def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
     """Values and slopes at the ends of interval k of curves through knots. [R, S, C] -> four times [R, C] float64"""
     window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope asks for the neighbours of its knot alone
     near = values[:, window].astype(np.float64)
@@ -65,7 +69,9 @@ def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> tuple[np.ndarray, .
         flip = np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(-1) < 0, -1.0, 1.0), axis=1)
         near[:, 1:] *= flip[..., None]
     rates, i = keyframes.slopes(times[window], near), k - window.start
-    return tuple(np.ascontiguousarray(part) for part in (near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1]))
+    ends = (near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1])
+    a, b, left, right = (np.ascontiguousarray(part) for part in ends)
+    return a, b, left, right
 
 
 def unexplained(scene: Scene) -> np.ndarray:

@@ -64,7 +64,7 @@ def test_hello_says_what_is_missing_and_which_protocol():
 
 def test_a_rendered_time_is_the_cores_picture(path):
     scene = scene_file.read(path)
-    expected = scene_render.render_frame(scene, playback.frame(scene, 0.9), CAMERA)
+    expected = scene_render.render_frame(scene, playback.frame(scene, 0.9, origin=CAMERA.center), CAMERA)
     request = {"command": "render", "camera": CAMERA_JSON, "t": 0.9, "want": ["depth", "alpha", "ids"]}
     _, (header, arrays) = talk(load(path), request)
     assert header["ok"] and header["result"]["gaussians"] == len(scene.means)
