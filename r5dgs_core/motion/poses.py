@@ -13,6 +13,7 @@ from . import rotations
 
 _MAD_TO_SIGMA = 1.4826
 UNDETERMINED_RAD = 0.1
+ALIASED_RAD = np.radians(120.0)
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,26 @@ def fit_rigid(
             quat = rotations.multiply(shortest_turn(start, end), known)
         residuals = np.linalg.norm(target - moved - rotations.rotate(quat, source - center), axis=-1)
     return RigidFit(quat, moved - center, center, residuals, current, axes, covariance)
+
+
+def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, float] | None:
+    """The largest turn between neighbouring poses, where it is over 120 degrees, else None.
+
+    A turn of more than 180 degrees looks like the rest of a whole turn backwards, so that a body whose steps come near
+    that may spin the other way in truth: poses at more times tell.
+
+    Args:
+        times: Of the poses, increasing. [S]
+        quats: Unit wxyz. [S, 4]
+
+    Returns:
+        The angle in rad, and the two times.
+    """
+    if len(times) < 2:
+        return None
+    angles = rotations.angle_between(quats[:-1], quats[1:])
+    k = int(np.argmax(angles))
+    return (float(angles[k]), float(times[k]), float(times[k + 1])) if angles[k] > ALIASED_RAD else None
 
 
 def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:

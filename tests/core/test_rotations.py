@@ -50,7 +50,7 @@ def test_matrices_and_quaternions_convert_back(q):
 
 
 @pytest.mark.parametrize("gap", [0.0, 1e-6, 1e-4, 0.1])
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 2e-15), (np.float32, 6e-7)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-15), (np.float32, 3e-7)])
 def test_half_turns_keep_their_digits_as_matrices(gap, dtype, tolerance):
     axes = np.random.default_rng(1).normal(size=(500, 3))
     axes = np.concatenate([axes / np.linalg.norm(axes, axis=-1, keepdims=True), np.eye(3)])
@@ -89,6 +89,24 @@ def test_series_keep_their_digits(angle):
             # Near a zero of the function only the absolute error can be small: the argument itself is rounded.
             scale = abs(float(truth)) if angle <= 1.01 else 1 / max(1.0, angle2 ** (function is not rot.cosine))
             assert error <= 2e-15 * scale * max(1.0, angle)
+
+
+@pytest.mark.parametrize("make", [np.array, torch.tensor])
+@pytest.mark.parametrize("angle", [1e-12, 1e-8, 1e-4, 0.01, 0.3, 0.99, 1.01, 2.0, 3.0])
+def test_series_keep_the_digits_of_single_precision(angle, make):
+    mpmath.mp.dps = 50
+    single = np.float32 if make is np.array else torch.float32
+    angle2 = make(np.float32(angle) ** 2, dtype=single)
+    x = mpmath.sqrt(mpmath.mpf(float(angle2)))
+    exact = {
+        rot.sine_ratio: (mpmath.sin(x) / x, 2e-7),
+        rot.versine_ratio: ((1 - mpmath.cos(x)) / x**2, 2e-7),
+        rot.remainder_ratio: ((x - mpmath.sin(x)) / x**3, 3e-7),
+    }
+    for function, (truth, tolerance) in exact.items():
+        value = function(angle2)
+        assert value.dtype == single
+        assert abs(float(value) - truth) <= tolerance * abs(truth)
 
 
 def test_zero_vector_gives_the_identity_to_the_bit():
