@@ -1,0 +1,187 @@
+"""`r5dgs report --stability`: stiff, extreme and degenerate cases on the code as it is shipped, one row each.
+
+Nothing is read but the code itself, and nothing is random: the rows are the same on every run but for their seconds
+and, on another processor, their last digits.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from .. import errors
+from ..scene import files
+from . import (
+    stability_cases_extremes,
+    stability_cases_groups,
+    stability_cases_keys,
+    stability_cases_orders,
+    stability_cases_playback,
+    stability_cases_rotations,
+    stability_cases_steps,
+)
+from .stability_cases import Case, logged
+
+CASES: tuple[Case, ...] = (
+    *stability_cases_orders.CASES,
+    *stability_cases_steps.CASES,
+    *stability_cases_extremes.CASES,
+    *stability_cases_rotations.CASES,
+    *stability_cases_groups.CASES,
+    *stability_cases_playback.CASES,
+    *stability_cases_keys.CASES,
+)
+_CAPTION = (
+    "less is better; trace_rk2: the same value for TRACE's integrator on each point, where it has a part in the case. "
+    "No motion model has drag, so none is stiff by it. Where tolerances come from: --json FILE"
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case with what came of it.
+
+    Attributes:
+        topic: Rows of one topic stand together.
+        name: What was tried.
+        method: Our function.
+        quantity: What was measured; less is better.
+        measured: The value, NaN where the case could not be measured.
+        tolerance: Largest value that passes.
+        source: Where the tolerance comes from.
+        trace_rk2: The same value for TRACE's integrator, or None where it has no part in the case.
+        passed: Whether the value is within the tolerance.
+        seconds: CPU time of our side.
+        message: The error of a case that raised one, else "".
+    """
+
+    topic: str
+    name: str
+    method: str
+    quantity: str
+    measured: float
+    tolerance: float
+    source: str
+    trace_rk2: float | None
+    passed: bool
+    seconds: float
+    message: str = ""
+
+
+def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | None = None) -> list[Row]:
+    """Measure cases. One that raises fails with its message, and the others still run.
+
+    Args:
+        cases: Which ones; None for all.
+        progress: Called with the number of cases that are done.
+    """
+    rows: list[Row] = []
+    for case in CASES if cases is None else cases:
+        rows.append(_measured(case))
+        if progress is not None:
+            progress(len(rows))
+    return rows
+
+
+def _measured(case: Case) -> Row:
+    message, start = "", time.process_time()
+    # What the core warns of belongs to the case; that the value is right is what counts.
+    with logged(), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)
+        try:
+            value = float(case.measure())
+        except Exception as error:  # the table is there to show what breaks, whatever it is
+            value, message = math.nan, f"{type(error).__name__}: {error}"
+        seconds = time.process_time() - start
+        other = None
+        if case.trace_rk2 is not None:
+            try:
+                other = float(case.trace_rk2())
+            except Exception as error:
+                other, message = math.nan, message or f"trace_rk2: {type(error).__name__}: {error}"
+    passed = bool(value <= case.tolerance)  # NaN does not pass
+    return Row(
+        case.topic,
+        case.name,
+        case.method,
+        case.quantity,
+        value,
+        case.tolerance,
+        case.source,
+        other,
+        passed,
+        seconds,
+        message,
+    )
+
+
+def make(rows: Sequence[Row]) -> Table:
+    """Lay out the rows, to print with rich."""
+    table = Table(title="stability", title_justify="left", caption=_CAPTION, caption_justify="left")
+    table.add_column("case", overflow="fold")
+    table.add_column("method", overflow="fold")
+    table.add_column("measured is", overflow="fold")
+    for name in ("measured", "tolerance", "trace_rk2", "CPU s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    topic = None
+    for row in rows:
+        if row.topic != topic:
+            topic = row.topic
+            table.add_section()
+            table.add_row(f"[bold]{topic}[/bold]")
+        other = "" if row.trace_rk2 is None else f"{row.trace_rk2:.3g}"
+        figures = (f"{row.measured:.3g}", f"{row.tolerance:.3g}", other, f"{row.seconds:.2f}")
+        result = "pass" if row.passed else "[bold red]FAIL[/bold red]"
+        name = f"{row.name}: {row.message}" if row.message else row.name
+        table.add_row(_plain(name), _plain(row.method), _plain(row.quantity), *figures, result)
+    return table
+
+
+def _plain(text: str) -> str:
+    """Text whose brackets rich leaves alone."""
+    return text.replace("[", r"\[")
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """One line: how many passed, which failed, in what time."""
+    failed = [row for row in rows if not row.passed]
+    seconds = sum(row.seconds for row in rows)
+    text = f"{len(rows) - len(failed)} of {len(rows)} cases pass, in {seconds:.1f} s of CPU time"
+    return text + "".join(f"\nfailed: {row.topic}: {row.name}" for row in failed)
+
+
+def to_json(rows: Sequence[Row]) -> dict[str, Any]:
+    """The rows as JSON types; numbers that JSON has none for become "nan", "inf" and "-inf"."""
+    return {
+        "passed": sum(row.passed for row in rows),
+        "failed": sum(not row.passed for row in rows),
+        "seconds": sum(row.seconds for row in rows),
+        "rows": [{key: _number(value) for key, value in asdict(row).items()} for row in rows],
+    }
+
+
+def _number(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write(rows: Sequence[Row], path: Path) -> Path:
+    """Write the rows as JSON; returns ``path``.
+
+    Raises:
+        ConfigError: It cannot be written there.
+    """
+    try:
+        files.write(path, json.dumps(to_json(rows), indent=2).encode())
+    except OSError as error:
+        raise errors.ConfigError(f"{path}: the stability table cannot be written: {error}") from error
+    return path
