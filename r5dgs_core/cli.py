@@ -121,11 +121,11 @@ def run_evaluate(
     from .train import bake, checkpoint
 
     for mode in modes:
-        if mode not in playback.MODES:
-            raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.MODES)}")
-    if json_path is not None and (json_path.is_dir() or not json_path.parent.is_dir()):
-        expected = "a file" if json_path.is_dir() else f"the folder {json_path.parent} to exist; make it first"
-        raise errors.ConfigError(f"--json {json_path}: expected {expected}")
+        try:
+            playback.split(mode)
+        except ValueError:
+            raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
+    _check_json(json_path)
     trained_on = None
     if target.is_dir():
         run = checkpoint.open_run(target)
@@ -145,7 +145,7 @@ def run_evaluate(
     if trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
     for mode in modes:
-        if mode not in playback.modes(scene):
+        if not playback.available(scene, mode):
             raise errors.ConfigError(f"--mode {mode}: {target} has data for {', '.join(playback.modes(scene))} only")
     with make(progress_kind) as progress:
         result = evaluate.evaluate(
@@ -162,6 +162,43 @@ def run_evaluate(
     if progress_kind != "json":
         print(f"written: {path}")
     return result
+
+
+def run_stability(json_path: Path | None = None, *, progress_kind: str = "none") -> bool:
+    """Run the stiff, extreme and degenerate cases on this installation and print what came of them.
+
+    Args:
+        json_path: Where the rows go as JSON, or None.
+        progress_kind: How progress is shown (`progress.make`); "json" prints no table.
+
+    Returns:
+        Whether all cases passed.
+    """
+    from rich.console import Console
+
+    from .progress import make
+    from .report import stability
+
+    _check_json(json_path)
+    with make(progress_kind) as progress:
+        total = len(stability.CASES)
+        rows = stability.run(
+            progress=lambda done: progress({"event": "stability", "done": done, "total": total, "unit": "cases"})
+        )
+    if progress_kind != "json":
+        Console().print(stability.make(rows))
+        print(stability.summary(rows))
+    if json_path is not None:
+        stability.write(rows, json_path)
+        if progress_kind != "json":
+            print(f"written: {json_path}")
+    return all(row.passed for row in rows)
+
+
+def _check_json(path: Path | None) -> None:
+    if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
+        raise errors.ConfigError(f"--json {path}: expected {expected}")
 
 
 def run_report(
@@ -226,20 +263,6 @@ def run_report(
         report_table.show(result)
         print("\n".join(f"written: {path}" for path in paths))
     return result
-
-
-def run_stability(json_path: Path | None = None) -> bool:
-    """Run the stiff and extreme cases (see `report.stability`) and print them; returns whether all passed."""
-    from rich.console import Console
-
-    from .report import stability
-
-    rows = stability.run()
-    Console().print(stability.make(rows))
-    print(stability.summary(rows))
-    if json_path is not None:
-        print(f"written: {stability.write(rows, json_path)}")
-    return all(row.passed for row in rows)
 
 
 def run_info(path: Path, *, as_json: bool) -> None:
@@ -355,7 +378,8 @@ def parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="measure a run or scene on held-out views")
     evaluate.add_argument("target", type=Path, help="run folder or .r5dgs file")
     evaluate.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
-    evaluate.add_argument("--mode", action="append", metavar="MODE", help="playback mode; may be repeated")
+    kinds = "playback mode, BASE or BASE/VARIANT (default: rigid); may be repeated"
+    evaluate.add_argument("--mode", action="append", metavar="MODE", help=kinds)
     evaluate.add_argument("--json", type=Path, metavar="FILE", help="where evaluation.json goes instead")
     add_progress(evaluate)
 
@@ -376,7 +400,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs and the tables")
     bench.add_argument("--variants", nargs="+", metavar="NAME", help=f"of {some} (default: {usual})")
     bench.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="seeds of training (default: 0)")
-    bench.add_argument("--modes", nargs="+", metavar="MODE", help="playback modes (default: all that a scene has)")
+    bench.add_argument("--modes", nargs="+", metavar="MODE", help="playback modes (default: one of each base)")
     bench.add_argument("--remeasure", action="store_true", help="bake and measure finished runs again")
     add_settings(bench)
 
@@ -390,7 +414,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status (0; 1 for an error that the user can act on, or a case that fails; 130 when stopped)."""
+    """Run the command line; returns the exit status: 0, 1 for an error that the user can act on or a case that fails,
+    130 when stopped."""
     args = parser().parse_args(arguments)
     try:
         return _dispatch(args)
@@ -439,7 +464,7 @@ def _dispatch(args: argparse.Namespace) -> int:
         )
     elif args.command == "report":
         if args.stability:
-            return 0 if run_stability(args.json) else 1
+            return 0 if run_stability(args.json, progress_kind=args.progress) else 1
         if args.target is None or args.out is None:
             raise errors.ConfigError("report: expected RUN|SCENE and --out DIR, or --stability")
         options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "progress_kind": args.progress}
