@@ -13,15 +13,13 @@ import math
 
 import numpy as np
 
-from . import rotations, se3
+from . import propagation, rotations
 
 log = logging.getLogger(__name__)
 
 Array = rotations.Array
 MAX_TURN = 0.1  # radians per midpoint step: beyond, distances grow visibly, by sqrt(1 + x^4 / 4) a step
-MAX_STEPS = 512
 TRACE_STEP = 1 / 60  # TRACE's step at playback, in units of time
-CHUNK = 16384
 
 
 def time_unit(first: float, last: float) -> float:
@@ -80,6 +78,8 @@ def rk2(
 def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and displacements of points under dynamics about their own centres, by fourth-order Magnus steps.
 
+    For more than one time keep a `propagation.Propagator`.
+
     Args:
         dynamics: Velocity, angular velocity and the rates of both about the centre of each point, side by side. [N, 12]
         duration: Signed time to reach.
@@ -90,25 +90,7 @@ def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[
         points at rest, and, with a warning, for points whose dynamics are not finite or go beyond all numbers. What
         is wrong with one point changes no bit of the others.
     """
-    state = np.asarray(dynamics, np.float64)
-    quats, displacements = rotations.identity(len(state)), np.zeros((len(state), 3))
-    sound = np.asarray(np.isfinite(state).all(-1))
-    moving = np.flatnonzero((state != 0).any(-1) & sound)
-    for rows in np.array_split(moving, max(1, math.ceil(len(moving) / CHUNK))):
-        if duration == 0 or len(rows) == 0:
-            continue
-        v, w, a, e = np.split(state[rows], 4, axis=-1)
-        spans = np.full(len(rows), float(duration))
-        with np.errstate(over="ignore", invalid="ignore"):
-            needed = se3.steps_needed(w, v, e, a, spans, 0.0, tolerance)
-            steps = int(min(needed[needed < se3.MOST_STEPS].max(initial=1), MAX_STEPS))
-            turns, moves = se3.integrate(w, v, e, a, spans, steps)
-            finite = np.isfinite(turns).all(-1) & np.isfinite(moves).all(-1)
-        quats[rows[finite]], displacements[rows[finite]] = turns[finite], moves[finite]
-        sound[rows] = finite
-    if not sound.all():
-        _warn_of_wild_dynamics(int((~sound).sum()), len(state))
-    return quats, displacements
+    return propagation.Propagator(dynamics, tolerance).rows_of(duration)
 
 
 @functools.cache
@@ -119,11 +101,6 @@ def _warn_of_coarse_steps(step: float) -> None:
         step,
         MAX_TURN,
     )
-
-
-@functools.cache
-def _warn_of_wild_dynamics(bad: int, count: int) -> None:
-    log.warning("%d of %d points have dynamics beyond all numbers and stay where they are at t_max", bad, count)
 
 
 def step_sizes(duration: float, step: float) -> list[float]:

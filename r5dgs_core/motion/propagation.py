@@ -53,7 +53,7 @@ class Propagator:
             omitted = _omitted(x, b, bracket, reach) / limit
             turning = np.stack([_norms(w), _norms(e)])
             difficulty = omitted.sum(0) + turning.sum(0)
-        speed = (reach * turning[0] + _norms(v)) / limit
+            speed = (reach * turning[0] + _norms(v)) / limit
         commuting = (omitted <= 1e-15 * speed).all(0)
         omitted[:, commuting], turning[:, commuting], difficulty[commuting] = 0.0, 0.0, 0.0
         wild = ~(difficulty < WILD)
@@ -70,7 +70,7 @@ class Propagator:
         self._omitted = [omitted[:, order[part]].max(-1) for part, _ in self._parts]
         self._turning = [turning[:, order[part]].max(-1) for part, _ in self._parts]
         if not sound.all():
-            _warn(int((~sound).sum()), self.count)
+            warn_of_wild_dynamics(int((~sound).sum()), self.count)
 
     def columns(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
         """Motion of the points that move, in the order of `rows`.
@@ -93,7 +93,7 @@ class Propagator:
                 lost = ~(np.isfinite(q).all(0) & np.isfinite(d).all(0))
                 q[:, lost], d[:, lost] = np.array([[1.0], [0], [0], [0]]), 0.0
                 if lost.any():
-                    _warn(int(lost.sum()), self.count)
+                    warn_of_wild_dynamics(int(lost.sum()), self.count)
             quats[:, part], displacements[:, part] = q, d
         return quats, displacements
 
@@ -116,7 +116,7 @@ class Propagator:
 
 
 @functools.cache
-def _warn(bad: int, count: int) -> None:
+def warn_of_wild_dynamics(bad: int, count: int) -> None:
     log.warning("%d of %d points have dynamics beyond all numbers and stay where they are at t_max", bad, count)
 
 
