@@ -84,6 +84,7 @@ def make_dataset(
     alpha: bool = False,
     ball_from: float = 0.0,
     breath: float = 0.0,
+    still: bool = False,
     scale: float = 1.0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> TinyData:
@@ -98,6 +99,7 @@ def make_dataset(
         alpha: Write RGBA images without sky and floor.
         ball_from: Time before which the ball is not there.
         breath: Share of its radius by which the ball swells and shrinks in the observed time.
+        still: Nothing moves; there is no ground truth of poses then.
         scale: World units of the data set per unit of the truth.
         shift: Where the truth's origin lies in the data set's world.
 
@@ -119,7 +121,10 @@ def make_dataset(
             camera = orbit_camera(2 * np.pi * k / views if k < views else 0.5, width, height)
             shown = truth if t >= ball_from else without(truth, BALL)
             output = scene_render.render_frame(
-                shown, playback.frame(shown, float(t)), camera, background=None if alpha else "scene"
+                shown,
+                playback.frame(shown, T_MAX if still else float(t)),
+                camera,
+                background=None if alpha else "scene",
             )
             color = output.color.numpy()
             if alpha:
@@ -137,7 +142,8 @@ def make_dataset(
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     data = TinyData(folder, truth, scale, offset)
     (folder / "objects.json").write_text(json.dumps({i: {"name": n, "aliases": a} for i, (n, a) in NAMES.items()}))
-    (folder / "ground_truth.json").write_text(json.dumps(_poses(data)))
+    if not still:
+        (folder / "ground_truth.json").write_text(json.dumps(_poses(data)))
     return data
 
 

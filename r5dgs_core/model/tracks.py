@@ -10,23 +10,13 @@ to time (`rebase`), so that an object may turn by any angle and the exponential 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..motion import keyframes, rotations
 from ..scene import playback
-
-
-@dataclass(frozen=True)
-class GroupPoses:
-    """Poses of all groups at one time: unit quats [G, 4], their matrices [G, 3, 3], displacements [G, 3]."""
-
-    quats: Tensor
-    rotmats: Tensor
-    displacements: Tensor
+from .group_poses import GroupPoses
 
 
 class Tracks:

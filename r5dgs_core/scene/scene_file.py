@@ -53,7 +53,9 @@ _MEMORY_DTYPES: dict[str, type] = {
     "embeddings": np.float32,
     "vocabulary_embeddings": np.float32,
 }
+_TRACKS = ("track_times", "track_poses")  # left out where nothing moves
 _OPTIONAL = (
+    *_TRACKS,
     "identities",
     "classifier_weight",
     "classifier_bias",
@@ -159,13 +161,12 @@ def info(scene: Scene) -> dict[str, Any]:
 
 def _write_zip(scene: Scene, stream: Any, exact: bool) -> None:
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None]
+        still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
+        arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None and name not in still]
         head = {"format": FORMAT, "format_version": FORMAT_VERSION, "arrays": arrays}
         _add(archive, JSON_MEMBER, scene_json.dump(scene, head))
-        for name, dtype in _MEMORY_DTYPES.items():
-            array = getattr(scene, name)
-            if array is None:
-                continue
+        for name in arrays:
+            array, dtype = getattr(scene, name), _MEMORY_DTYPES[name]
             buffer = io.BytesIO()
             stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
             np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
@@ -212,7 +213,14 @@ def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
         raise errors.SceneFileError(
             f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
         )
-    return Scene(**arrays, **scene_json.fields(data, json_place))  # type: ignore[arg-type]
+    fields = scene_json.fields(data, json_place)
+    if not set(listed) & set(_TRACKS):
+        arrays["track_times"] = np.array([fields["t_max"]])
+        arrays["track_poses"] = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
+    for name in _TRACKS:
+        if arrays[name] is None:
+            raise errors.SceneFileError(f"{json_place}: arrays: expected both of {' and '.join(_TRACKS)}, or none")
+    return Scene(**arrays, **fields)  # type: ignore[arg-type]
 
 
 def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:

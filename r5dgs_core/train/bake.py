@@ -23,8 +23,9 @@ from ..model import spherical_harmonics
 from ..model.gaussians import SEEN_OPACITY
 from ..motion import fitting, rotations
 from ..motion.models import MotionModel
+from ..scene import residuals
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, mask_stack, needs, plain_motion, point_baking, representation, residual
+from . import checkpoint, groups, mask_stack, needs, plain_motion, point_baking, representation
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -63,7 +64,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         extent = float(np.ptp(np.quantile(cloud.means, [0.01, 0.99], axis=0), axis=0).max())
         # Relative to what the groups really did: what the user switches off must not come back as residuals.
         single = point_baking.members(motion.points, norm, cloud.motion_ids, bound.trained, bound.pivots, order, extent)
-    bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
+    bent = (0.0, 0.0, False, "nothing moves")
+    if state.representation != representation.STILL:
+        from . import residual
+
+        bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
     bases, classified = cloud.sh.shape[1], cloud.identities is not None
     decisions = needs.decide(
         rows,
@@ -89,7 +94,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
         for row in rows
     ]
-    return Scene(
+    scene = Scene(
         name=dataset.name,
         means=cloud.means[order].astype(np.float32),
         quats=rotations.normalize(cloud.quats[order]).astype(np.float32),
@@ -125,10 +130,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
                 "finished": state.finished,
             },
         },
-        needs=(*decisions, *bound.of_objects),
         near_plane=NEAR_PLANE * norm.scale,
         **single,
     )
+    regrouped = needs.regrouping(motion.moves, len(residuals.unexplained(scene)), wanted)
+    return dataclasses.replace(scene, needs=(*decisions, *regrouped, *bound.of_objects))
 
 
 @dataclass

@@ -33,6 +33,7 @@ from .config import Config
 FORMAT_VERSION = 1
 RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = "run.json", "checkpoint.pt", "log.jsonl", "evaluation.json"
 CURVES_FILE = "learning_curves.png"
+RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: what a body gains cannot always be said
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
-from . import gating, motion_clusters
+from . import gating, motion_clusters, representation
 from .config import Config
 from .field import FieldRepresentation
 from .posing import Splats
@@ -65,6 +65,8 @@ def find(
     progress = progress or (lambda event: None)
     progress({"event": "prepare", "text": "no masks: looking for what moves"})
     trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
+    if trainer.motion.name == representation.STILL:
+        return None
     while not trainer.done:
         trainer.step()
     labels = parts(trainer, config)

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from ..model.gaussians import Gaussians
-from ..model.tracks import Tracks
 from . import evidence, hull, placing, scatter, shadows, sweep, triangulation
 from .config import Config
 from .views import TrainView, nearest_knot, spread
@@ -27,12 +25,33 @@ SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowher
 
 
 @dataclass(frozen=True)
+class FirstTracks:
+    """Where bodies are before training, without rotation.
+
+    Attributes:
+        times: Knots, increasing. [S]
+        centers: Centres of the bodies, row 0 for the pinned group. [B, 3]
+        translations: Triangulated displacements at the knots. [B, S, 3]
+        casters: Body that each shadow group follows. [W]
+        plane_normal: Unit normal of the support plane, or None. [3]
+        slope: Slope of the shadows along it. [3]
+    """
+
+    times: np.ndarray
+    centers: np.ndarray
+    translations: np.ndarray
+    casters: np.ndarray
+    plane_normal: np.ndarray | None
+    slope: np.ndarray
+
+
+@dataclass(frozen=True)
 class Start:
     """What training starts from.
 
     Attributes:
         gaussians: Canonical Gaussians; each body in its state at its reference time.
-        tracks: Tracks with triangulated translations and no rotation.
+        tracks: Where the bodies are at the observed times.
         object_ids: Object id of each body; row 0 is the background. [B]
         places: Where the masks put the objects.
         first_time: Index of the time at which training begins.
@@ -42,7 +61,7 @@ class Start:
     """
 
     gaussians: Gaussians
-    tracks: Tracks
+    tracks: FirstTracks
     object_ids: np.ndarray
     places: triangulation.Places
     first_time: int
@@ -81,6 +100,7 @@ def start(
     find_sky: bool,
     rng: np.random.Generator,
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
+    still: bool = False,
 ) -> Start:
     """Place Gaussians and tracks.
 
@@ -90,23 +110,27 @@ def start(
         find_sky: Whether there may be sky behind the scene; not where the background's colour is given.
         rng: Source of the draws.
         cloud: Points and colours in [0, 1] of a reconstruction, normalised coordinates. [P, 3] each
+        still: Whether nothing moves, so that all images show one time.
 
     Returns:
         The start of the training.
     """
     init = config.init
     times = observed_times(views)
+    if still and len(times) > 1:
+        log.info("nothing moves in any view: trained as a static scene")
+        times = times[-1:]
     places = triangulation.locate(views, times, init.min_mask_pixels)
     unmasked = all(v.mask is None for v in views)
-    by_field = config.train.representation == "field"
-    if unmasked:
+    by_field = config.train.representation == "field" and not still
+    if unmasked and not still:
         if by_field:
             log.warning("no masks: the field moves every Gaussian, and there are no objects. %s", MASKS)
         else:
             log.warning(
                 "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS
             )
-    elif len(times) == 1:
+    elif len({view.t for view in views}) == 1:
         log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
     if unmasked and by_field and config.curriculum.start != "first":
@@ -148,7 +172,7 @@ def start(
     parts = [placing.solid([*clouds, (where, shade, 0)], init.opacity)]
     casters = np.zeros(0, np.int64)
     shadow_slope = np.zeros(3)
-    if plane is not None and config.train.shadows and init.shadow_points > 0:
+    if plane is not None and config.train.shadows and init.shadow_points > 0 and not still:
         casters = np.arange(1, bodies)
         light = shadows.find_light(views, scenes, places, times, plane, rng)
         shadow_slope = shadows.slope(light.direction, plane[0])
@@ -157,18 +181,7 @@ def start(
             radius, group = float(places.radii[body - 1]), bodies + int(body) - 1
             parts.append(placing.shadow(centers[body], radius, light.direction, plane, group, init.shadow_points, rng))
     gaussians = placing.gaussians_of(parts, config.train.sh_degree)
-    base = torch.zeros(bodies, len(times), 4)
-    base[..., 0] = 1.0
-    tracks = Tracks(
-        times,
-        torch.from_numpy(centers.astype(np.float32)),
-        torch.from_numpy(translations.astype(np.float32)),
-        base,
-        torch.from_numpy(casters),
-        None if plane is None else torch.from_numpy(plane[0].astype(np.float32)),
-    )
-    with torch.no_grad():
-        tracks.params["slope"].copy_(torch.from_numpy(shadow_slope))
+    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], shadow_slope)
     known = evidence.gather(views, places, times)
     ids = np.concatenate([[0], places.object_ids])
     return Start(gaussians, tracks, ids, places, first, plane, placed.sky, known)

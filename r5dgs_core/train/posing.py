@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..model.tracks import GroupPoses
+from ..model.group_poses import GroupPoses
 from ..raster import compile as kernels
 
 CHUNKS = 16

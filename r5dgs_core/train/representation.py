@@ -1,12 +1,13 @@
 """How Gaussians move in the observed time: the border that every representation keeps.
 
 The trainer knows only `Representation`: splats at a time, what to optimise, a penalty, upkeep, and named tensors for
-the checkpoint. `tracks` moves Gaussians by one SE(3) track per object; a deformation field is another class with the
-same face.
+the checkpoint. `tracks` moves Gaussians by one SE(3) track per object, `field` by a deformation field, `still` not at
+all. A module is imported when a run or a checkpoint asks for it.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Protocol
 
@@ -19,9 +20,14 @@ from ..model.gaussians import Gaussians
 from ..scene.cameras import Camera
 from . import initialization, posing
 from .config import Config
-from .field import FieldRepresentation, bring_together
 from .groups import ObservedMotion
-from .tracks_representation import TracksRepresentation
+
+TRACKS, FIELD, STILL = "tracks", "field", "still"
+_CLASSES = {
+    TRACKS: ("tracks_representation", "TracksRepresentation"),
+    FIELD: ("field", "FieldRepresentation"),
+    STILL: ("stillness", "StillRepresentation"),
+}
 
 
 class Representation(Protocol):
@@ -102,18 +108,28 @@ class Representation(Protocol):
         ...
 
 
-REPRESENTATIONS: dict[str, type[TracksRepresentation] | type[FieldRepresentation]] = {
-    TracksRepresentation.name: TracksRepresentation,
-    FieldRepresentation.name: FieldRepresentation,
-}
+def make(start: initialization.Start, config: Config, still: bool = False) -> Representation:
+    """The representation that training starts with: the one asked for, or the tracks that a field starts from.
 
+    Args:
+        start: What training starts from.
+        config: The run's configuration.
+        still: Whether nothing moves.
+    """
+    if still:
+        from .stillness import StillRepresentation
 
-def make(start: initialization.Start, config: Config) -> Representation:
-    """The representation that training starts with: the one asked for, or the tracks that a field starts from."""
-    if config.train.representation == TracksRepresentation.name or config.field.tracks_share > 0:
+        return StillRepresentation(start)
+    if config.train.representation == TRACKS or config.field.tracks_share > 0:
+        from .tracks_representation import TracksRepresentation
+
         return TracksRepresentation(start, config)
-    bring_together(start.gaussians, start.tracks, start.first_time)
-    return FieldRepresentation(start.tracks, start.first_time, config)
+    from . import field
+    from .tracks_representation import first_tracks
+
+    tracks = first_tracks(start.tracks)
+    field.bring_together(start.gaussians, tracks, start.first_time)
+    return field.FieldRepresentation(tracks, start.first_time, config)
 
 
 def observed_motion(
@@ -141,8 +157,9 @@ def group_classes(name: str, tensors: dict[str, Tensor]) -> np.ndarray:
     return _known(name).group_classes(tensors)
 
 
-def _known(name: str) -> type[TracksRepresentation] | type[FieldRepresentation]:
-    if name not in REPRESENTATIONS:
-        known = ", ".join(REPRESENTATIONS)
+def _known(name: str) -> type[Representation]:
+    if name not in _CLASSES:
+        known = ", ".join(_CLASSES)
         raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
-    return REPRESENTATIONS[name]
+    module, made = _CLASSES[name]
+    return getattr(importlib.import_module(f".{module}", __package__), made)

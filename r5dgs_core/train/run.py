@@ -18,7 +18,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, discovery, identity, mask_stack, probing, residual, stopping
+from . import checkpoint, curves, identity, mask_stack, probing, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -131,6 +131,10 @@ def _found_masks(
 ) -> list[np.ndarray] | None:
     """Masks of what moves where the data set has none: those that the run began with, or found now."""
     if state is None:
+        if len({view.t for view in dataset.train}) < 2 or any(view.mask_path is not None for view in dataset.train):
+            return None
+        from . import discovery
+
         return discovery.find(dataset, config, progress)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
     return mask_stack.unpack(state.tensors[mask_stack.NAME], sizes) if mask_stack.NAME in state.tensors else None
@@ -281,7 +285,7 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
-    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name != residual.GAINS}
+    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name != checkpoint.RESIDUAL_GAINS}
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(

@@ -37,7 +37,7 @@ class TracksRepresentation:
     name = "tracks"
 
     def __init__(self, start: initialization.Start, config: Config):
-        self.tracks = tracks = start.tracks
+        self.tracks = first_tracks(start.tracks)
         self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
         self._places = start.places
         self._absent = start.evidence.absent
@@ -48,10 +48,6 @@ class TracksRepresentation:
         self.residuals: ResidualField | None = None
         self._gains: Tensor | None = None  # of the residuals by body, once they were tried
         self._config = config
-        self._moves = config.needs.tracks != "off"
-        if not self._moves:
-            with torch.no_grad():
-                tracks.params["translations"].zero_()
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -130,8 +126,6 @@ class TracksRepresentation:
         """
         self.tracks.rebase()
         self._entered = (min(entered[0], knot), max(entered[1], knot))
-        if not self._moves:
-            return
         near, next_near = knot + towards, knot + 2 * towards
         quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
         steady = entered[0] <= next_near <= entered[1]
@@ -227,6 +221,23 @@ class TracksRepresentation:
             return ObservedMotion(tracks.times, tuple(groups), light, smooth=True)
         points, bind = residual.point_motion(field, tracks, tensors)
         return ObservedMotion(tracks.times, tuple(groups), light, bind, points=points, smooth=True)
+
+
+def first_tracks(first: initialization.FirstTracks) -> Tracks:
+    """Tracks that start where the masks put the bodies, without rotation."""
+    base = torch.zeros(*first.translations.shape[:2], 4)
+    base[..., 0] = 1.0
+    tracks = Tracks(
+        first.times,
+        torch.from_numpy(first.centers.astype(np.float32)),
+        torch.from_numpy(first.translations.astype(np.float32)),
+        base,
+        torch.from_numpy(first.casters),
+        None if first.plane_normal is None else torch.from_numpy(first.plane_normal.astype(np.float32)),
+    )
+    with torch.no_grad():
+        tracks.params["slope"].copy_(torch.from_numpy(first.slope))
+    return tracks
 
 
 def tracks_of(tensors: dict[str, Tensor]) -> Tracks:

@@ -25,7 +25,6 @@ from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import (
     densification,
-    field,
     identity,
     initialization,
     losses,
@@ -34,8 +33,8 @@ from . import (
     normalization,
     posing,
     representation,
-    residual,
     sky,
+    stillness,
     strategies,
     sweep,
     thinning,
@@ -43,7 +42,6 @@ from . import (
 )
 from .checkpoint import Checkpoint
 from .config import Config
-from .tracks_representation import TracksRepresentation
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +74,10 @@ class Trainer:
         rng = np.random.default_rng(config.train.seed)
         self.found = None if found is None else mask_stack.pack(found)
         shown = self.views if found is None else views.with_masks(self.views, found)
-        start = initialization.start(shown, config, behind is None, rng, self._cloud())
+        still = stillness.applies(self.views, config)
+        if still:
+            self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
+        start = initialization.start(shown, config, behind is None, rng, self._cloud(), still)
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
@@ -91,7 +92,7 @@ class Trainer:
         if most:
             start = dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng))
         self.gaussians: Gaussians = start.gaussians
-        self.motion = representation.make(start, config)
+        self.motion = representation.make(start, config, still)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
@@ -255,10 +256,13 @@ class Trainer:
 
     def _leave_tracks(self) -> None:
         """Go on with a field where the configuration asks for one and its share of tracks is over."""
-        asked = self.config.train.representation == field.FieldRepresentation.name
-        if not (asked and isinstance(self.motion, TracksRepresentation)):
+        if self.config.train.representation != representation.FIELD or self.motion.name != representation.TRACKS:
             return
         if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
+            from . import field
+            from .tracks_representation import TracksRepresentation
+
+            assert isinstance(self.motion, TracksRepresentation)
             self.motion = field.from_tracks(self.motion, self.gaussians, self.first_time, self.config, self.generator)
             self.optimizer = self._make_optimizer()
 
@@ -347,8 +351,11 @@ class Trainer:
                 f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
                 "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
             )
-        if self.iteration == residual.decision_step(self.config, self._curriculum()[1]):
-            residual.decide(self)
+        if self.motion.name == representation.TRACKS:
+            from . import residual
+
+            if self.iteration == residual.decision_step(self.config, self._curriculum()[1]):
+                residual.decide(self)
 
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
@@ -398,8 +405,11 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        asked = self.config.train.representation == field.FieldRepresentation.name
-        if asked and state.representation == self.config.train.representation != self.motion.name:
+        asked = self.config.train.representation == representation.FIELD
+        if asked and state.representation == representation.FIELD and self.motion.name == representation.TRACKS:
+            from . import field
+            from .tracks_representation import TracksRepresentation
+
             assert isinstance(self.motion, TracksRepresentation)
             self.motion = field.FieldRepresentation(self.motion.tracks, self.first_time, self.config)
         if state.representation != self.motion.name:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from ..model.tracks import GroupPoses
+from ..model.group_poses import GroupPoses
 from ..raster import warming
 from . import losses, posing
 

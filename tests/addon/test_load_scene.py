@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
+from r5dgs_core.motion import models
 from r5dgs_core.scene import cameras, playback, scene_file
-from tests import scenes
+from tests import datasets, scenes
 
 POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
@@ -162,6 +163,23 @@ def test_only_what_moves_has_curves(blender, scene_path):
     assert {path for path, _ in curves_of(anchor_of(collection, "red apple"))} == {"location"}  # it slides
     assert {path for path, _ in curves_of(anchor_of(collection, "mug shadow"))} == {"location"}
     assert {path for path, _ in curves_of(anchor_of(collection, "mug"))} == {"location", "rotation_quaternion"}
+
+
+def test_what_only_slides_has_two_keys(blender, tmp_path):
+    truth = datasets.make_truth()
+    slide = models.MotionModel("translation", velocity=[0.9, 0.35, 0.0], radius=0.5)
+    poses = truth.track_poses.copy()
+    poses[:, :, :] = [1.0, 0, 0, 0, 0, 0, 0]
+    poses[1, :, 4:] = slide.velocity * (truth.track_times - truth.t_max)[:, None]
+    still = dataclasses.replace(truth.groups[2], model=models.STATIC)
+    groups = (truth.groups[0], dataclasses.replace(truth.groups[1], model=slide), still)
+    sliding = dataclasses.replace(truth, track_poses=poses, groups=groups)
+    collection = load(blender, scene_file.write(sliding, tmp_path / "sliding.r5dgs"))
+    curves = curves_of(anchor_of(collection, "brick"))
+    assert {path for path, _ in curves} == {"location"}
+    assert [len(curves["location", axis].keyframe_points) for axis in range(3)] == [2, 2, 1]  # it does not rise
+    assert not curves_of(anchor_of(collection, "ball"))
+    assert_plays_like_the_core(blender, collection, sliding, np.linspace(0.0, 1.0, 9))
 
 
 def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scene_path):

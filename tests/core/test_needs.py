@@ -10,7 +10,7 @@ from r5dgs_core.errors import ConfigError
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup
-from r5dgs_core.train import bake, checkpoint, config, needs, run
+from r5dgs_core.train import bake, checkpoint, config, groups, needs, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -166,9 +166,9 @@ def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
     settings = tiny_datasets.settings("train.iterations=60", *off)
     done = run.train(tiny.root, tmp_path / "run", settings)
     tensors = checkpoint.load(done.folder).tensors
-    for name in ("tracks.translations", "tracks.rotvecs", "gaussians.shading"):
-        assert not tensors[name].any(), name
-    assert len(tensors["tracks.casters"]) == 0 and "identities" not in tensors and len(tensors["background"]) == 1
+    assert not tensors["gaussians.shading"].any()
+    assert not [name for name in tensors if name.startswith("tracks.")]
+    assert "identities" not in tensors and len(tensors["background"]) == 1
     assert done.config == settings  # the folder says what was asked for
     scene = bake.bake(done, datasets.read(tiny.root))
     assert {row["decision"] for row in scene.needs} == {"off"}
@@ -198,3 +198,16 @@ def test_a_run_can_be_baked_without_what_it_has_learned(trained, baked, tiny, tm
 def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
     with pytest.raises(ConfigError, match="--set train.seed=1: .*bake takes needs.NAME"):
         bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
+
+
+def test_the_table_says_what_was_regrouped_and_nothing_where_nothing_could_be():
+    auto, off = config.NeedsSection(), config.NeedsSection(regrouping="off")
+    assert needs.regrouping(None, 0, auto) == []
+    (row,) = needs.regrouping(groups.Moves(3, 2, 1, 1, 60), 7, auto)
+    assert (row["value"], row["decision"]) == (6, "on")
+    for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "explains 7", "1 shadows rest"):
+        assert part in row["reason"]
+    (row,) = needs.regrouping(groups.Moves(moving=60), 0, auto)
+    assert row["decision"] == "off" and "rest" in row["reason"]
+    (row,) = needs.regrouping(None, 0, off)
+    assert row["decision"] == "off" and "set off by you" in row["reason"]

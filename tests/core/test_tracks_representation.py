@@ -9,9 +9,8 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.model.tracks import Tracks
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import config, evidence, tracks_representation, triangulation
+from r5dgs_core.train import config, evidence, initialization, tracks_representation, triangulation
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 from tests import scenes
@@ -28,9 +27,9 @@ def truth(t):
 def make(measured, absent=None, first=3, path=None):
     """One body that starts at knot ``first``; its path is known from masks where ``measured``, straight elsewhere."""
     count = len(TIMES)
-    base = torch.zeros(2, count, 4)
-    base[..., 0] = 1.0
-    tracks = Tracks(TIMES, torch.zeros(2, 3), torch.zeros(2, count, 3), base, torch.tensor([1]))
+    tracks = initialization.FirstTracks(
+        TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3)
+    )
     centers = np.asarray(path if path is not None else [truth(t)[0] for t in TIMES])[None]
     places = triangulation.Places(
         np.array([1]), centers, np.array([measured], bool), np.ones((1, count)), np.ones(1), np.ones((1, count))
