@@ -209,6 +209,7 @@ def run_report(
     tasks: Sequence[str] | None = None,
     splits: Sequence[str] | None = None,
     rounds: int | None = None,
+    clock: str = "wall",
     progress_kind: str = "none",
 ) -> dict[str, Any]:
     """Measure error against run time of a run or scene file (see `report.error_time`) and write it to a folder.
@@ -220,6 +221,7 @@ def run_report(
         tasks: What to measure, all where None.
         splits: Splits whose images are compared, "test" where None.
         rounds: Rounds of timing, the report's own number where None.
+        clock: "wall", or "cpu" for processor time.
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
@@ -256,6 +258,7 @@ def run_report(
             tasks=tasks or report_rows.TASKS,
             splits=splits or ("test",),
             rounds=rounds or error_time.ROUNDS,
+            clock=clock,
             progress=progress,
         )
     paths = error_time.write(result, out)
@@ -390,6 +393,7 @@ def parser() -> argparse.ArgumentParser:
     report.add_argument("--tasks", nargs="+", metavar="TASK", help="of dynamics, poses, images, raster (default: all)")
     report.add_argument("--splits", nargs="+", metavar="SPLIT", help="of val, test: images to compare (default: test)")
     report.add_argument("--repeats", type=int, metavar="N", help="rounds of timing (default: 7)")
+    report.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="what ms is: wall or processor time")
     report.add_argument("--stability", action="store_true", help="stiff and extreme cases instead; needs no scene")
     report.add_argument("--json", type=Path, metavar="FILE", help="where --stability writes its rows")
     add_progress(report)
@@ -467,8 +471,8 @@ def _dispatch(args: argparse.Namespace) -> int:
             return 0 if run_stability(args.json, progress_kind=args.progress) else 1
         if args.target is None or args.out is None:
             raise errors.ConfigError("report: expected RUN|SCENE and --out DIR, or --stability")
-        options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "progress_kind": args.progress}
-        run_report(args.target, args.data, args.out, **options)
+        options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "clock": args.clock}
+        run_report(args.target, args.data, args.out, **options, progress_kind=args.progress)
     elif args.command == "bench":
         from .bench import benchmark, cases
         from .scene import playback

@@ -9,8 +9,10 @@ the largest over the pivot and six points at the group's radius, as a share of i
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,13 +53,14 @@ class _State:
     radii: np.ndarray
 
 
-def measure(scene: Scene, tau: float, rounds: int) -> tuple[list[Row], list[str]]:
+def measure(scene: Scene, tau: float, rounds: int, clock: str = "wall") -> tuple[list[Row], list[str]]:
     """Rows of the task "dynamics".
 
     Args:
         scene: The scene.
         tau: Time past t_max at which errors are measured.
         rounds: Rounds of timing.
+        clock: Of `turns.CLOCKS`: what the rows' ``ms`` is.
 
     Returns:
         The rows, and what is absent and why.
@@ -66,13 +69,13 @@ def measure(scene: Scene, tau: float, rounds: int) -> tuple[list[Row], list[str]
     absent = []
     if not groups:
         absent.append("dynamics: no group of the scene moves past t_max, so there is nothing to integrate")
-    rows = _of_groups(scene, groups, tau, rounds) if groups else []
+    rows = _of_groups(scene, groups, tau, rounds, clock) if groups else []
     if scene.dynamics is None:
         absent.append("dynamics of single Gaussians (mode standard): the scene holds none; a `field` run has them")
     elif not (scene.dynamics != 0).any():
         absent.append("dynamics of single Gaussians (mode standard): all Gaussians of the scene rest")
     else:
-        rows += _of_points(scene, tau, rounds)
+        rows += _of_points(scene, tau, rounds, clock)
     return rows, absent
 
 
@@ -90,6 +93,17 @@ def state_of(model: models.MotionModel) -> np.ndarray:
     return np.stack([v, w, a, eps])
 
 
+@contextmanager
+def _unwarned() -> Iterator[None]:
+    """Steps that are too long are what is shown here."""
+    log = logging.getLogger(dynamics.__name__)
+    before, log.disabled = log.disabled, True
+    try:
+        yield
+    finally:
+        log.disabled = before
+
+
 def _moves(group: MotionGroup) -> bool:
     return not _without_offset(group.model).is_static
 
@@ -98,7 +112,7 @@ def _without_offset(model: models.MotionModel) -> models.MotionModel:
     return dataclasses.replace(model, offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
 
 
-def _of_groups(scene: Scene, groups: list[MotionGroup], tau: float, rounds: int) -> list[Row]:
+def _of_groups(scene: Scene, groups: list[MotionGroup], tau: float, rounds: int, clock: str) -> list[Row]:
     plain = [_without_offset(group.model) for group in groups]
     v, w, a, eps = np.stack([state_of(model) for model in plain], axis=1)
     state = _State(v, w, a, eps, np.array([model.radius for model in plain]))
@@ -124,20 +138,23 @@ def _of_groups(scene: Scene, groups: list[MotionGroup], tau: float, rounds: int)
         )[::-1]
     calls[TWIST, "Magnus-4", "step rule"] = lambda: models.evaluate_all(twists, tau)
     calls["rigid/fitted", "closed form", "exact"] = lambda: models.evaluate_all(plain, tau)
-    times = turns.take(calls, rounds)
+    with _unwarned():
+        times = turns.take(calls, rounds)
+        found = {key: call() for key, call in calls.items()}
 
     rows, notes = [], {TWIST: f"{len(groups)} groups", "rigid/fitted": f"{len(groups)} groups, against its own motion"}
-    for (mode, method, setting), call in calls.items():
+    for (mode, method, setting), poses in found.items():
         truth = fine_models if mode == "rigid/fitted" else reference
         if method == "trace_rk2, per Gaussian":
             steps = int(setting.split()[0])
-            positions, angles = _point_errors(state, reference, tau, steps)
+            with _unwarned():
+                positions, angles = _point_errors(state, reference, tau, steps)
             note = f"{len(arms)} Gaussians"
         else:
-            positions, angles = _pose_errors(state.radii, call(), truth)
+            positions, angles = _pose_errors(state.radii, poses, truth)
             note = notes[mode]
         label = {"task": "dynamics", "mode": mode, "method": method, "setting": setting, "note": note}
-        shared = {**label, **times[mode, method, setting].columns(), "count": len(groups)}
+        shared = {**label, **times[mode, method, setting].columns(clock), "count": len(groups)}
         rows += [
             Row(error_kind="position", **spread(positions), **shared),
             Row(error_kind="rotation", **spread(angles), **shared),
@@ -196,7 +213,7 @@ def _point_errors(state: _State, truth: Poses, tau: float, steps: int) -> tuple[
     return distances / (2 * state.radii), np.degrees(rotations.angle_between(quats[:, 0], truth[0]))
 
 
-def _of_points(scene: Scene, tau: float, rounds: int) -> list[Row]:
+def _of_points(scene: Scene, tau: float, rounds: int, clock: str) -> list[Row]:
     """Single Gaussians by their own dynamics: TRACE's integrator and ours."""
     assert scene.dynamics is not None
     moving = scene.dynamics[(scene.dynamics != 0).any(-1)].astype(np.float64)
@@ -214,12 +231,13 @@ def _of_points(scene: Scene, tau: float, rounds: int) -> list[Row]:
         for n in POINT_STEPS
     }
     calls["Magnus-4, own dynamics", "step rule"] = lambda: propagator.rows_of(tau)
-    times = turns.take(calls, rounds)
+    with _unwarned():
+        times = turns.take(calls, rounds)
+        found = {key: call() for key, call in calls.items()}
     bodies = [2 * group.model.radius for group in scene.groups if group.role == "body"]
     size = float(np.median(bodies)) if bodies else scene.extent
     rows = []
-    for (method, setting), call in calls.items():
-        quats, displacements = call()
+    for (method, setting), (quats, displacements) in found.items():
         shared = {
             "task": "dynamics",
             "mode": "standard",
@@ -227,7 +245,7 @@ def _of_points(scene: Scene, tau: float, rounds: int) -> list[Row]:
             "setting": setting,
             "count": len(moving),
             "note": f"{len(moving)} Gaussians; size is the median of the groups'",
-            **times[method, setting].columns(),
+            **times[method, setting].columns(clock),
         }
         distances = np.linalg.norm(displacements - fine, axis=-1) / size
         angles = np.degrees(rotations.angle_between(quats, fine_quats))

@@ -10,12 +10,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..data.dataset import Dataset
 from ..errors import ConfigError
 from ..scene import files
 from ..scene.scene import Scene
 from ..train import checkpoint
-from . import dynamics_rows, image_rows, pareto_plot, pose_rows, raster_rows, report_rows, report_table
+from . import dynamics_rows, image_rows, pareto_plot, pose_rows, raster_rows, report_rows, report_table, turns
 from .report_rows import Row
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"
@@ -30,6 +32,7 @@ def measure(
     tasks: Sequence[str] = report_rows.TASKS,
     splits: Sequence[str] = ("test",),
     rounds: int = ROUNDS,
+    clock: str = "wall",
     backend: str = "auto",
     progress: Callable[[dict[str, Any]], None] = lambda event: None,
 ) -> dict[str, Any]:
@@ -41,13 +44,14 @@ def measure(
         tasks: Of `report_rows.TASKS`.
         splits: Splits whose images are compared; the first one decides the front.
         rounds: Rounds of timing; medians and quartiles are over them.
+        clock: "wall", or "cpu" for processor time, which other work on the machine hardly disturbs.
         backend: Rasterizer.
         progress: Called with events.
 
     Returns:
-        In JSON types ``scene gaussians groups t_max horizon rounds machine kinds absent rows``: ``horizon`` is the time
-        past t_max at which errors of integration are measured, ``absent`` says what could not be measured and why, and
-        ``rows`` are those of `report_rows.Row`.
+        In JSON types ``scene gaussians groups t_max horizon rounds clock machine kinds absent rows``: ``horizon`` is
+        the time past t_max at which errors of integration are measured, ``absent`` says what could not be measured and
+        why, and ``rows`` are those of `report_rows.Row`.
     """
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
@@ -64,12 +68,12 @@ def measure(
         if task != "images":
             progress({"event": "report", "text": task})
         if task == "dynamics":
-            add(dynamics_rows.measure(scene, tau, rounds))
+            add(dynamics_rows.measure(scene, tau, rounds, clock))
         elif task == "poses":
             if dataset is None:
                 absent.append("poses: no data set was given, so no true poses are known")
             else:
-                add(pose_rows.measure(scene, dataset.ground_truth, rounds))
+                add(pose_rows.measure(scene, dataset.ground_truth, rounds, clock))
         elif task == "images":
             if dataset is None:
                 absent.append("images: no data set was given, so there is nothing to compare with")
@@ -80,13 +84,20 @@ def measure(
                         dataset,
                         splits,
                         rounds,
+                        clock=clock,
                         backend=backend,
                         progress=lambda done, total: progress({"event": "images", "done": done, "total": total}),
                     )
                 )
         else:
             views = () if dataset is None else dataset.views(splits[0])
-            add(raster_rows.measure(scene, views, rounds, backend=backend))
+            add(raster_rows.measure(scene, views, rounds, clock=clock, backend=backend))
+    busy = _busy(rows)
+    if busy > turns.BUSY and clock == "wall":
+        absent.append(
+            f"wall times of a machine at rest: here they are {busy:.1f} times the processor times (median); "
+            "measure again when nothing else runs, or with --clock cpu"
+        )
     rows = report_rows.mark_front(rows)
     return {
         "scene": scene.name,
@@ -95,11 +106,18 @@ def measure(
         "t_max": scene.t_max,
         "horizon": {"tau": tau, "why": why},
         "rounds": rounds,
+        "clock": clock,
         "machine": {**checkpoint.machine(), "versions": checkpoint.versions()},
         "kinds": {k: {"label": v.label, "more_is_better": v.more_is_better} for k, v in report_rows.KINDS.items()},
         "absent": absent,
         "rows": [row.to_dict() for row in rows],
     }
+
+
+def _busy(rows: Sequence[Row]) -> float:
+    """Median of wall time over processor time, 1 without rows."""
+    ratios = [row.ms_wall / row.ms_cpu for row in rows if row.ms_cpu > 0]
+    return float(np.median(ratios)) if ratios else 1.0
 
 
 def horizon(scene: Scene, dataset: Dataset | None) -> tuple[float, str]:

@@ -26,6 +26,7 @@ def measure(
     splits: Sequence[str],
     rounds: int,
     *,
+    clock: str = "wall",
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[Row], list[str]]:
@@ -36,6 +37,7 @@ def measure(
         dataset: Its data set.
         splits: Splits to measure; kinds of error of all but the first one carry "@" and their name.
         rounds: Rounds of timing.
+        clock: Of `turns.CLOCKS`: what the rows' ``ms`` is.
         backend: Rasterizer.
         progress: Called with images measured and their number.
 
@@ -89,11 +91,11 @@ def measure(
                     setting=split,
                     error_kind=kind if number == 0 else f"{kind}@{split}",
                     error=float(found[kind]),
-                    ms_motion=motion[mode].ms,
-                    ms_raster=raster[mode].ms,
+                    ms_motion=motion[mode].ms(clock),
+                    ms_raster=raster[mode].ms(clock),
                     count=found["images"],
                     note="motion is given" if mode == ORACLE else "",
-                    **both.columns(),
+                    **both.columns(clock),
                 )
                 rows.append(row)
     if missing:

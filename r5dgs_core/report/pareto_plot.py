@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import labels, report_rows
+from . import labels, report_rows, report_table
 from .report_rows import Row
 
 # A panel's kind of error, its label, and the factor on the numbers.
@@ -110,7 +110,7 @@ def _name_of(row: Row) -> str:
 
 def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]) -> None:
     kind, label, _ = _SHOWN[task]
-    axes.set(xscale="log", yscale="log", xlabel="time per frame, ms", ylabel=label)
+    axes.set(xscale="log", yscale="log", xlabel=f"{report_table.CLOCKS[report['clock']]} per frame, ms", ylabel=label)
     first = points[0].row
     tau = report["horizon"]["tau"]
     titles = {
@@ -123,10 +123,17 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]
     axes.set_title(titles[task], fontsize=11, loc="left")
     if task == "dynamics":
         for series in dict.fromkeys(_series(p.row) for p in points):
-            some = [p for p in points if _series(p.row) == series]
-            axes.plot([p.x for p in some], [p.y for p in some], "-", color=some[0].color, alpha=0.5, linewidth=1)
+            some = [p for p in points if _series(p.row) == series and p.row.setting.endswith(("step", "steps"))]
+            axes.plot(
+                [p.x for p in some],
+                [p.y for p in some],
+                "-",
+                color=next(iter(some), points[0]).color,
+                alpha=0.5,
+                linewidth=1,
+            )
     for p in points:
-        axes.plot([p.row.ms_low, p.row.ms_high], [p.y, p.y], "-", color=p.color, alpha=0.35, linewidth=2)
+        axes.plot([p.row.ms_low, p.row.ms_high], [p.y, p.y], "-", color=p.color, alpha=0.3, linewidth=2)
         marker = {"markeredgecolor": _FRONT, "markeredgewidth": 1.6} if p.row.pareto else {"markeredgewidth": 0}
         axes.plot(p.x, p.y, "o", color=p.color, markersize=6.5, **marker)
     front = sorted((p for p in points if p.row.pareto), key=lambda p: p.x)
@@ -200,9 +207,9 @@ def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point]) -> None
             ends = axes.transData.inverted().transform([place, nearest])
             axes.plot(ends[:, 0], ends[:, 1], "-", color=color, alpha=0.4, linewidth=0.7, zorder=1)
         at = axes.transData.inverted().transform(middle)
-        axes.text(
-            *at, text, color=color, fontsize=size, fontweight="bold" if bold else "normal", ha="center", va="center"
-        )
+        style = {"fontsize": size, "fontweight": "bold" if bold else "normal", "ha": "center", "va": "center"}
+        veil = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.3}
+        axes.text(*at, text, color=color, bbox=veil, **style)
     if unnamed:
         axes.text(
             0.01, 0.01, f"{unnamed} points without room for a name: see the table", transform=axes.transAxes, fontsize=8

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..data.dataset import GroundTruth
-from ..motion import candidates, fitting, models, poses
+from ..motion import candidates, fitting, models, poses, top
 from ..scene import group_dynamics, playback
 from ..scene.scene import Scene
 from . import metrics, true_poses, turns
 from .report_rows import Row, spread
 
+MODELS = tuple(candidates.BY_NAME)  # tried one by one
 STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # what a swing is where nothing swings
 _SAME = 1e-9
 
@@ -25,20 +26,23 @@ class _Fitted:
 
     Attributes:
         fits: By body; None for an object at rest that has no track of its own.
-        ms: What fitting them took.
+        ms: Processor time of fitting them.
     """
 
     fits: tuple[fitting.Fit | None, ...]
     ms: float
 
 
-def measure(scene: Scene, ground_truth: GroundTruth | None, rounds: int) -> tuple[list[Row], list[str]]:
+def measure(
+    scene: Scene, ground_truth: GroundTruth | None, rounds: int, clock: str = "wall"
+) -> tuple[list[Row], list[str]]:
     """Rows of the task "poses": at the last time of the truth, and along the horizon.
 
     Args:
         scene: The scene.
         ground_truth: True poses, where the data set has them.
         rounds: Rounds of timing.
+        clock: Of `turns.CLOCKS`: what the rows' ``ms`` is.
 
     Returns:
         The rows, and what is absent and why.
@@ -50,13 +54,13 @@ def measure(scene: Scene, ground_truth: GroundTruth | None, rounds: int) -> tupl
     if not bodies or not later.any():
         why = "none of them lies past t_max" if bodies else "none of them was observed, or of no object of the scene"
         return [], [f"poses: the data set has true poses, but {why}"]
-    rows, absent = _of_modes(scene, bodies, later, rounds)
-    some, missing = _of_models(scene, bodies, later, rounds)
+    rows, absent = _of_modes(scene, bodies, later, rounds, clock)
+    some, missing = _of_models(scene, bodies, later, rounds, clock)
     return rows + some, absent + missing
 
 
 def _of_modes(
-    scene: Scene, bodies: tuple[true_poses.Body, ...], later: np.ndarray, rounds: int
+    scene: Scene, bodies: tuple[true_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
     """Each playback mode. Bodies of hybrid are those of rigid; where Gaussians part, their best rigid motion counts."""
     times = bodies[0].times[later]
@@ -75,7 +79,7 @@ def _of_modes(
             predicted, method = _member_motion(scene, player, bodies, times), "rigid fit to moved Gaussians"
             note = "time is that of all Gaussians"
         label = {"task": "poses", "mode": mode, "method": method, "setting": "as baked", "note": note}
-        rows += _errors(bodies, later, predicted, {**label, **timed[mode].columns()})
+        rows += _errors(bodies, later, predicted, {**label, **timed[mode].columns(clock)})
     absent = []
     if len(players) == 1:
         absent.append("poses of rigid/representative, median, least_squares, kabsch, standard, rigid_paper: the scene "
@@ -86,15 +90,14 @@ def _of_modes(
 
 
 def _of_models(
-    scene: Scene, bodies: tuple[true_poses.Body, ...], later: np.ndarray, rounds: int
+    scene: Scene, bodies: tuple[true_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
     """Each motion model alone, the one that is chosen of all, and its confidence band."""
     times = bodies[0].times[later]
     taus = times - scene.t_max
-    names = list(candidates.BY_NAME)
-    fitted = {name: _fit(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in names}
+    fitted = {name: _fit(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
     chosen = _fit(scene, bodies, None)
-    counts = {name: sum(fit is not None and fit.chosen == name for fit in chosen.fits) for name in names}
+    counts = {name: sum(fit is not None and fit.chosen == name for fit in chosen.fits) for name in MODELS}
     found = {**fitted, "chosen of the family": chosen}
     sets = {
         name: [_model(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
@@ -109,20 +112,23 @@ def _of_models(
         notes = [f"{rested} found at rest"] if rested else []
         notes += [f"{STEADY[name]} where nothing swings"] if name in STEADY else []
         label = {"task": "poses", "mode": "rigid/fitted", "method": name, "setting": setting, "note": "; ".join(notes)}
-        rows += _errors(bodies, later, predicted, {**label, **timed[name].columns(), "ms_once": some.ms})
+        rows += _errors(bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once": some.ms})
     band, absent = _band(bodies, chosen, times, taus)
     return rows + band, absent
 
 
 def _fit(scene: Scene, bodies: tuple[true_poses.Body, ...], names: tuple[str, ...] | None) -> _Fitted:
     """Fit the tracks of the bodies as baking does, with one family of motions or several."""
-    started, fits = time.perf_counter(), []
+    started, fits = time.process_time(), []
     for body in bodies:
         group, track = body.group, scene.track_poses[body.group.id]
         if group.role != "body":
             fits.append(None)
             continue
         first, last = group.seen or (-np.inf, np.inf)
+        rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
+        # A free top is told by its shape; baking tries it no otherwise.
+        shape = top.inertia(scene.means[rows] - group.pivot, weights) if names == (candidates.FREE_TOP.name,) else None
         seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
         fits.append(
             fitting.fit(
@@ -132,9 +138,10 @@ def _fit(scene: Scene, bodies: tuple[true_poses.Body, ...], names: tuple[str, ..
                 radius=group.model.radius,
                 weights=seen.astype(np.float64),
                 candidates=names,
+                inertia=shape,
             )
         )
-    return _Fitted(tuple(fits), 1e3 * (time.perf_counter() - started))
+    return _Fitted(tuple(fits), 1e3 * (time.process_time() - started))
 
 
 def _model(body: true_poses.Body, fit: fitting.Fit | None) -> models.MotionModel:

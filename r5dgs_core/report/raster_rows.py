@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..data import dataset as datasets
-from ..raster import RasterSettings, scene_render
+from ..raster import RasterSettings, scene_render, splatting
 from ..scene import playback
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
@@ -33,7 +33,7 @@ VIEWS = 4
 
 
 def measure(
-    scene: Scene, views: Sequence[datasets.View], rounds: int, *, backend: str = "auto"
+    scene: Scene, views: Sequence[datasets.View], rounds: int, *, clock: str = "wall", backend: str = "auto"
 ) -> tuple[list[Row], list[str]]:
     """Rows of the task "raster", in mode "rigid".
 
@@ -41,6 +41,7 @@ def measure(
         scene: The scene.
         views: Views with true images; none for the cameras of the scene at t_max.
         rounds: Rounds of timing.
+        clock: Of `turns.CLOCKS`: what the rows' ``ms`` is.
         backend: Rasterizer.
 
     Returns:
@@ -60,6 +61,7 @@ def measure(
     else:
         truths = []
         absent.append("raster: PSNR against true images needs a data set")
+    used = splatting.choose_backend(backend, scene_render.tensor(scene.means))
     base = RasterSettings(near_plane=scene.near_plane)
 
     def draw(changes: dict[str, float]) -> list[np.ndarray]:
@@ -79,11 +81,11 @@ def measure(
         shared = {
             "task": "raster",
             "mode": "rigid",
-            "method": backend,
+            "method": used,
             "setting": name,
             "count": len(shots),
-            "ms_raster": times[name].ms,
-            **times[name].columns(),
+            "ms_raster": times[name].ms(clock),
+            **times[name].columns(clock),
         }
         if changes is not FINEST:
             distances = [255 * metrics.mse(p, e) ** 0.5 for p, e in zip(pictures, exact, strict=True)]

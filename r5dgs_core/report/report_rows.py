@@ -58,16 +58,17 @@ class Row:
         setting: Steps, thresholds, what the method was given.
         error_kind: A key of `KINDS`, with "@t" appended for errors at a time before the last one.
         error: The error; the median where it is of several objects.
-        ms: Time of one frame, milliseconds; median over rounds. NaN where nothing was timed.
+        ms: Time of one frame by the report's clock, milliseconds; median over rounds. NaN where nothing was timed.
         error_low: Lower quartile over objects, or of one object the error.
         error_high: Upper quartile.
         error_worst: The worst.
         ms_low: Lower quartile over rounds.
         ms_high: Upper quartile.
+        ms_wall: Wall time, median over rounds.
         ms_cpu: Processor time over all threads, median over rounds.
         ms_motion: Share of ``ms`` for motion, where it has several.
         ms_raster: Share of ``ms`` for rasterization.
-        ms_once: What was computed before, once per scene, such as a fit.
+        ms_once: Processor time of what was computed before, once per scene, such as a fit.
         count: Objects, Gaussians or images that the error is over.
         note: What else a reader must know.
         pareto: Whether it is on the front of its task and kind of error.
@@ -85,6 +86,7 @@ class Row:
     error_worst: float = math.nan
     ms_low: float = math.nan
     ms_high: float = math.nan
+    ms_wall: float = math.nan
     ms_cpu: float = math.nan
     ms_motion: float = math.nan
     ms_raster: float = math.nan

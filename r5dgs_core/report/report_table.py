@@ -12,6 +12,7 @@ from .report_rows import Row
 
 ABSENT = "-"
 FRONT = "*"
+CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
 _TITLES = {
     "dynamics": "Dynamics: where the integrators leave the groups, against a fine reference",
     "poses": "Poses: where the objects are at the last time, against the truth",
@@ -76,7 +77,8 @@ def markdown(report: dict[str, Any]) -> str:
         parts.append("## Not measured\n\n" + "\n".join(f"- {text}" for text in report["absent"]) + "\n")
     machine = report["machine"]
     parts.append(
-        f"## How\n\nMedians of {report['rounds']} rounds in which all methods took turns, on {machine['processor']}, "
+        f"## How\n\n`ms` is {CLOCKS[report['clock']]}. Medians of {report['rounds']} rounds in which all methods took "
+        f"turns, on {machine['processor']}, "
         f"{machine['cores']} usable cores, {machine['raster_threads']} threads of the rasterizer, "
         f"GPU: {machine['gpu'] or 'none'}. Docs: docs/report.md.\n"
     )
@@ -87,7 +89,7 @@ def _sheet(task: str, rows: Sequence[Row], report: dict[str, Any]) -> Sheet:
     kinds = report_rows.kinds_of(rows)
     split = any(math.isfinite(row.ms_motion) for row in rows)
     once = any(math.isfinite(row.ms_once) for row in rows)
-    head = ["mode", "method", "setting", *(_head(kind) for kind in kinds), "ms", "quartiles", "CPU ms"]
+    head = ["mode", "method", "setting", *(_head(kind) for kind in kinds), "ms", "quartiles", "wall ms", "CPU ms"]
     head += ["motion ms", "raster ms"] if split else []
     head += ["once, ms"] if once else []
     lines: dict[tuple[str, str, str], list[Row]] = {}
@@ -99,7 +101,12 @@ def _sheet(task: str, rows: Sequence[Row], report: dict[str, Any]) -> Sheet:
         by_kind = {row.error_kind: row for row in some}
         first = some[0]
         line = [*key, *(_error(by_kind.get(kind)) for kind in kinds)]
-        line += [_short(first.ms), f"{_short(first.ms_low)} - {_short(first.ms_high)}", _short(first.ms_cpu)]
+        line += [
+            _short(first.ms),
+            f"{_short(first.ms_low)} - {_short(first.ms_high)}",
+            _short(first.ms_wall),
+            _short(first.ms_cpu),
+        ]
         line += [_short(first.ms_motion), _short(first.ms_raster)] if split else []
         line += [_short(first.ms_once)] if once else []
         if math.isnan(first.ms):

@@ -9,45 +9,49 @@ from typing import TypeVar
 
 import numpy as np
 
+CLOCKS = ("wall", "cpu")
 SAMPLE_MS = 4.0  # a turn repeats its call until it lasts this long
 MOST_CALLS = 1000
+BUSY = 1.25  # wall time over processor time of one thread from which the machine did other things, too
 Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
 class Times:
-    """Times of one call in milliseconds, over rounds.
+    """Times of one call in milliseconds: lower quartile, median and upper quartile over rounds.
 
     Attributes:
-        ms: Median.
-        low: Lower quartile.
-        high: Upper quartile.
-        cpu: Median of the processor time, over all threads.
+        wall: Of the fastest call of each turn. [3]
+        cpu: Processor time over all threads, mean of each turn. [3]
     """
 
-    ms: float
-    low: float
-    high: float
-    cpu: float
+    wall: np.ndarray
+    cpu: np.ndarray
 
     def __add__(self, other: Times) -> Times:
         """Of one call after the other."""
-        return Times(self.ms + other.ms, self.low + other.low, self.high + other.high, self.cpu + other.cpu)
+        return Times(self.wall + other.wall, self.cpu + other.cpu)
 
     def scaled(self, factor: float) -> Times:
         """Times by a factor, such as one over the frames of a call."""
-        return Times(factor * self.ms, factor * self.low, factor * self.high, factor * self.cpu)
+        return Times(factor * self.wall, factor * self.cpu)
 
-    def columns(self) -> dict[str, float]:
-        """By the names of `report_rows.Row`."""
-        return {"ms": self.ms, "ms_low": self.low, "ms_high": self.high, "ms_cpu": self.cpu}
+    def columns(self, clock: str = "wall") -> dict[str, float]:
+        """By the names of `report_rows.Row`: ``ms`` and its quartiles by a clock of `CLOCKS`, and both medians."""
+        low, middle, high = (self.wall if clock == "wall" else self.cpu).tolist()
+        both = {"ms_wall": float(self.wall[1]), "ms_cpu": float(self.cpu[1])}
+        return {"ms": middle, "ms_low": low, "ms_high": high, **both}
+
+    def ms(self, clock: str = "wall") -> float:
+        """The median by a clock."""
+        return float((self.wall if clock == "wall" else self.cpu)[1])
 
 
 def take(calls: Mapping[Key, Callable[[], object]], rounds: int) -> dict[Key, Times]:
     """Time calls in rounds over all of them.
 
     Args:
-        calls: What to time. A first call of each does not count: it compiles, and tells how often to repeat.
+        calls: What to time. A first call of each does not count: it compiles. A second one tells how often to repeat.
         rounds: Turns of each, >= 1; every other round goes backwards, so that none is always after the same one.
 
     Returns:
@@ -58,23 +62,28 @@ def take(calls: Mapping[Key, Callable[[], object]], rounds: int) -> dict[Key, Ti
     repeats = {}
     for key, call in calls.items():
         call()
-        start = time.perf_counter()
+        start = time.process_time()
         call()
-        once = 1e3 * (time.perf_counter() - start)
+        once = 1e3 * (time.process_time() - start)
         repeats[key] = int(np.clip(np.ceil(SAMPLE_MS / max(once, 1e-6)), 1, MOST_CALLS))
     found: dict[Key, list[tuple[float, float]]] = {key: [] for key in calls}
     for number in range(rounds):
         order = list(calls) if number % 2 == 0 else list(calls)[::-1]
         for key in order:
-            call, count = calls[key], repeats[key]
-            cpu, start = time.process_time(), time.perf_counter()
-            for _ in range(count):
-                call()
-            wall = time.perf_counter() - start
-            found[key].append((1e3 * wall / count, 1e3 * (time.process_time() - cpu) / count))
+            found[key].append(_turn(calls[key], repeats[key]))
     return {key: _times(np.array(values)) for key, values in found.items()}
 
 
+def _turn(call: Callable[[], object], count: int) -> tuple[float, float]:
+    """Wall time of the fastest call, which nothing interrupted, and processor time of the mean one, ms."""
+    fastest, began = float("inf"), time.process_time()
+    for _ in range(count):
+        start = time.perf_counter()
+        call()
+        fastest = min(fastest, time.perf_counter() - start)
+    return 1e3 * fastest, 1e3 * (time.process_time() - began) / count
+
+
 def _times(values: np.ndarray) -> Times:
-    low, middle, high = np.quantile(values[:, 0], [0.25, 0.5, 0.75])
-    return Times(float(middle), float(low), float(high), float(np.median(values[:, 1])))
+    wall, cpu = np.quantile(values, [0.25, 0.5, 0.75], axis=0).T
+    return Times(wall, cpu)

@@ -1,0 +1,118 @@
+"""Rows of the report: the front, round trips, fair turns, and names that do not overlap."""
+
+import csv
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r5dgs_core.report import labels, report_rows, turns
+from r5dgs_core.report.report_rows import Row
+
+SHAPE = ("task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto")
+
+
+def row(error=1.0, ms=1.0, kind="position", task="dynamics", spread=0.0, **more):
+    return Row(task, "rigid", "m", "s", kind, error, ms, ms_low=ms - spread, ms_high=ms + spread, **more)
+
+
+@st.composite
+def rows(draw):
+    numbers = st.integers(1, 12).map(float)
+    kinds = st.sampled_from(["position", "psnr"])
+    make = st.builds(row, error=numbers, ms=numbers, kind=kinds, spread=st.sampled_from([0.0, 0.4, 1.5]))
+    return draw(st.lists(make, max_size=12))
+
+
+@given(rows())
+def test_the_front_is_what_nothing_better_beats(some):
+    marked = report_rows.mark_front(some)
+    assert [(r.error, r.ms) for r in marked] == [(r.error, r.ms) for r in some]
+    for kind in ("position", "psnr"):
+        sign = -1 if kind == "psnr" else 1
+        front = [r for r in marked if r.pareto and r.error_kind == kind]
+        mine = [r for r in marked if r.error_kind == kind]
+        assert bool(front) == bool(mine)
+        for one in mine:
+            beaten = any(
+                sign * other.error <= sign * one.error and other.ms_low <= one.ms_high
+                for other in front
+                if other is not one
+            )
+            assert beaten != one.pareto
+
+
+def test_of_methods_that_take_the_same_time_only_the_best_is_on_the_front():
+    marked = report_rows.mark_front([row(2.0, 1.0, spread=0.2), row(1.0, 1.1, spread=0.2), row(0.5, 9.0)])
+    assert [r.pareto for r in marked] == [False, True, True]
+
+
+def test_more_decibels_are_better_and_tasks_have_fronts_of_their_own():
+    marked = report_rows.mark_front(
+        [row(30.0, 1.0, "psnr"), row(20.0, 2.0, "psnr"), row(20.0, 2.0, "psnr", "raster"), row(9.0, 1.0, "flip")]
+    )
+    assert [r.pareto for r in marked] == [True, False, True, True]
+
+
+def test_a_row_without_time_is_on_no_front():
+    assert not any(r.pareto for r in report_rows.mark_front([row(0.0, math.nan), row(math.nan, 1.0)]))
+
+
+def test_rows_survive_json_and_csv():
+    some = [row(0.25, 0.125, "position@t=0.8", note='a "note", with a comma', count=3), row(1.0, math.nan)]
+    back = report_rows.from_dicts(json.loads(json.dumps([r.to_dict() for r in some], allow_nan=False)))
+    np.testing.assert_equal([r.to_dict() for r in back], [r.to_dict() for r in some])
+    table = list(csv.DictReader(io.StringIO(report_rows.to_csv(some))))
+    assert tuple(table[0])[: len(SHAPE)] == SHAPE
+    assert float(table[0]["error"]) == 0.25 and table[0]["note"] == some[0].note and table[1]["ms"] == ""
+
+
+def test_spread_is_median_quartiles_and_worst():
+    found = report_rows.spread(np.array([1.0, 2.0, 3.0, 4.0, 100.0]))
+    assert found == {"error": 3.0, "error_low": 2.0, "error_high": 4.0, "error_worst": 100.0}
+    assert report_rows.spread(np.array([1.0, 2.0]), more_is_better=True)["error_worst"] == 1.0
+    assert all(math.isnan(v) for v in report_rows.spread(np.array([])).values())
+
+
+def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
+    monkeypatch.setattr(turns, "SAMPLE_MS", 0.0)
+    seen = []
+    times = turns.take({name: lambda name=name: seen.append(name) for name in "abc"}, 3)
+    assert "".join(seen) == "aabbcc" + "abc" + "cba" + "abc"  # two calls each to compile and to see how long one is
+    assert set(times) == set("abc") and all(
+        (np.diff(t.wall) >= 0).all() and (t.wall >= 0).all() for t in times.values()
+    )
+    with pytest.raises(ValueError, match="rounds"):
+        turns.take({}, 0)
+
+
+def test_times_add_up_and_scale_and_one_clock_is_that_of_the_rows():
+    one, two = (turns.Times(k * np.array([1.0, 2, 3]), k * np.array([4.0, 5, 6])) for k in (1, 2))
+    columns = (one + two).scaled(0.5).columns("cpu")
+    assert columns == {"ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
+    assert one.columns()["ms"] == one.ms() == 2.0 and one.ms("cpu") == 5.0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 25))
+def test_names_never_overlap_nor_hide_a_point_nor_leave_the_frame(seed, count):
+    rng = np.random.default_rng(seed)
+    points, sizes = rng.uniform(20, 380, (count, 2)), rng.uniform([10, 8], [90, 14], (count, 2))
+    markers = np.concatenate([points - 3, points + 3], axis=1)
+    frame = np.array([0, 0, 400, 400.0])
+    boxes = labels.place(points, sizes, frame, markers)
+    kept = np.array([box for box in boxes if box is not None]).reshape(-1, 4)
+    for i, box in enumerate(kept):
+        assert not labels.overlaps(box, np.delete(kept, i, axis=0)).any() and not labels.overlaps(box, markers).any()
+        assert (box[:2] >= frame[:2]).all() and (box[2:] <= frame[2:]).all()
+    for box, size in zip(boxes, sizes, strict=True):
+        if box is not None:
+            np.testing.assert_allclose(box[2:] - box[:2], size)
+
+
+def test_a_name_that_no_place_is_left_for_is_none():
+    point, size = np.array([[10.0, 10.0]]), np.array([[50.0, 10.0]])
+    assert labels.place(point, size, np.array([0, 0, 20, 20.0]), np.zeros((0, 4))) == [None]
