@@ -20,6 +20,7 @@ DISTINCT = 0.1  # moments nearer to each other than this share make a body turn 
 _GAP = 1e-9  # relative; moments are this far apart at least, as Euler's solution divides by their differences
 _SAMPLES = 256  # of a rate over a period; its series converges like exp(-n), near a separatrix more slowly
 _LEAST = 1e-300
+_LEAST_M1 = 1e-20  # a spin is never exactly on the separatrix, where the period is infinite
 
 
 def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -167,7 +168,7 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     rate = np.sqrt(high * gap23 / (i1 * i2 * i3))
     m = np.where(high > 0, low * gap12 / np.maximum(high * gap23, _LEAST), 0.0)
     m1 = np.abs(circling) * gap13 / np.maximum(high * gap23, _LEAST)
-    m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), 1e-30, 1.0), 1.0)
+    m1 = np.where(high > 0, np.clip(np.where(m < 0.5, 1 - m, m1), _LEAST_M1, 1.0), 1.0)
     amplitude = np.arctan2(side * order * spins[..., 1] * np.sqrt(i2 * gap23), spins[..., 0] * np.sqrt(i1 * gap13))
     squares = (moments * peaks) ** 2
     pole = np.where(squares[..., 2] > np.minimum(squares[..., 0], squares[..., 1]), 0, 2)

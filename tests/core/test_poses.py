@@ -75,6 +75,64 @@ def test_a_thin_rod_in_noise_counts_as_a_line():
     assert len(fit.undetermined_axes) == 0
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 60])
+@pytest.mark.parametrize("flatten", [(1, 1, 1), (1, 1, 0), (1, 0.1, 0.1), (1, 0.01, 0.01), (1, 0, 0), (0, 0, 0)])
+def test_no_cloud_is_mirrored_or_gives_nonsense(count, flatten):
+    rng = np.random.default_rng(count)
+    for _ in range(10):
+        source = cloud(count, int(rng.integers(1 << 30)), flatten)
+        fit = poses.fit_rigid(source, moved(source) + 0.005 * rng.normal(size=source.shape), hint=QUAT)
+        assert np.linalg.det(rotations.quats_to_rotmats(fit.quat)) == pytest.approx(1, abs=1e-12)
+        assert np.isfinite(fit.rotation_covariance).all() and np.isfinite(fit.residuals).all()
+        np.testing.assert_allclose(fit.displacement_at(fit.center), fit.displacement, atol=1e-12)
+        if count == 1 or not any(flatten):
+            assert len(fit.undetermined_axes) == 3
+            assert rotations.angle_between(fit.quat, QUAT) < 1e-12
+
+
+def test_two_points_leave_the_turn_about_their_line_open():
+    source = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    fit = poses.fit_rigid(source, moved(source))
+    assert len(fit.undetermined_axes) == 1
+    assert abs(fit.undetermined_axes[0] @ [1, 0, 0]) == pytest.approx(1)
+    ends = rotations.rotate(fit.quat, source - fit.center) + fit.center + fit.displacement
+    np.testing.assert_allclose(ends, moved(source), atol=1e-12)
+
+
+def test_three_points_of_a_triangle_fix_the_rotation():
+    source = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.3, 0.8, 0]])
+    fit = poses.fit_rigid(source, moved(source))
+    assert len(fit.undetermined_axes) == 0
+    assert rotations.angle_between(fit.quat, QUAT) < 1e-12
+
+
+@pytest.mark.parametrize("thickness", [0.0, 0.1])
+def test_covariance_of_planes_and_rods_predicts_the_spread(thickness):
+    rng = np.random.default_rng(6)
+    source = cloud(100, flatten=(1, 1, 0) if thickness == 0 else (1, thickness, thickness))
+    source = 0.3 * (source - source.mean(0))
+    errors, predicted = [], []
+    for _ in range(300):
+        fit = poses.fit_rigid(source, moved(source) + 0.005 * rng.normal(size=source.shape), rounds=0)
+        assert len(fit.undetermined_axes) == 0
+        errors.append(rotations.quats_to_rotvecs(rotations.multiply(rotations.conjugate(QUAT), fit.quat)))
+        predicted.append(fit.rotation_covariance)
+    measured = np.sqrt(np.diag(np.cov(np.array(errors).T)))
+    np.testing.assert_allclose(np.sqrt(np.diag(np.mean(predicted, axis=0))), measured, rtol=0.2)
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(20, False), (119, False), (121, True), (160, True), (200, True)])
+def test_steps_that_may_be_turns_the_other_way_are_told(degrees, told):
+    times = np.array([0.0, 0.1, 0.3, 0.4])
+    angles = np.radians([0.0, 5.0, 5.0 + degrees, 9.0 + degrees])
+    quats = rotations.rotvecs_to_quats(angles[:, None] * [0.0, 0.6, 0.8]) * [[1], [-1], [1], [1]]
+    found = poses.aliased_step(times, quats)
+    assert (found is not None) == told
+    if found is not None:
+        assert found == pytest.approx((np.radians(min(degrees, 360 - degrees)), 0.1, 0.3))
+    assert poses.aliased_step(times[:1], quats[:1]) is None
+
+
 def test_opposite_points_turn_half_about_a_normal():
     quat = poses.shortest_turn(np.array([0, 0, 1.0]), np.array([0, 0, -1.0]))
     np.testing.assert_allclose(rotations.rotate(quat, np.array([0, 0, 1.0])), [0, 0, -1], atol=1e-12)
