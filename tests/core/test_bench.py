@@ -123,7 +123,8 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
     assert [record["mode"] for record in result] == list(playback.MODES)
     assert result[0] == before[0], "what was measured before stays"
     # Motion past t_max stops in the modes that read the dynamics, which are none; up to t_max all modes are the same.
-    rigid, standard, literal = (record["splits"] for record in result)
+    rigid, hybrid, standard, literal = (record["splits"] for record in result)
+    assert hybrid["test"]["psnr"] == rigid["test"]["psnr"], "there is nothing that no group's motion explains"
     assert standard["val"]["psnr"] == literal["val"]["psnr"] == pytest.approx(rigid["val"]["psnr"])
     assert standard["test"]["psnr"] == literal["test"]["psnr"] != pytest.approx(rigid["test"]["psnr"])
 

@@ -145,8 +145,63 @@ def test_scenes_without_gaussians_objects_or_motion_play():
     np.testing.assert_array_equal(playback.frame(single, 0.0).means, base.means)
 
 
+@pytest.mark.parametrize("shift", [0.0, 1e4])
+@pytest.mark.parametrize("t", [T_MAX / 2, 2.0, 100 * T_MAX])
+def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
+    """Where the origin is the body's own place, to single precision of the body's size."""
+    away = np.array([1.0, -1.0, 0.5]) * shift
+    groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
+    moved = dataclasses.replace(scene, means=(scene.means + away).astype(np.float32), groups=groups)
+    player = playback.Player(moved)
+    _, displacements = player.group_poses(t)
+    for start, stop, g in playback.runs(moved.motion_ids):
+        if moved.groups[g].role == "body":
+            frame = player.frame(t, moved.groups[g].pivot + displacements[g])
+            before, after = moved.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+            pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+            apart = pairs[0] > 0.1
+            assert np.abs(pairs[1] / np.where(apart, pairs[0], 1) - 1)[apart].max() < 1e-6
+
+
+@pytest.mark.parametrize("t", [0.3, T_MAX, 1.2])
+def test_an_origin_only_shifts_the_centres(scene, t):
+    player, origin = playback.Player(scene), np.array([3.0, -40.0, 7.5])
+    plain, shifted = player.frame(t), player.frame(t, origin)
+    np.testing.assert_allclose(shifted.means + origin, plain.means, atol=5e-6)
+    np.testing.assert_array_equal(shifted.quats, plain.quats)
+    np.testing.assert_array_equal(shifted.shading_factor, plain.shading_factor)
+    assert (plain.origin == 0).all() and (shifted.origin == origin).all()
+    again = player.frame(t)
+    np.testing.assert_array_equal(again.means, plain.means)
+
+
+def test_frames_are_their_own_whatever_a_player_showed_before(scene):
+    player = playback.Player(scene)
+    first = player.frame(1.1)
+    kept = first.means.copy()
+    for t in (0.2, T_MAX, 1.7, 1.1):
+        frame = player.frame(t)
+        for one, other in zip(dataclasses.astuple(frame), dataclasses.astuple(playback.frame(scene, t)), strict=True):
+            np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(first.means, kept)
+
+
+def test_modes_have_one_spelling_and_a_default_variant(scene):
+    assert playback.split("rigid") == ("rigid", "fitted") == playback.split("rigid/fitted")
+    assert playback.split("rigid_paper") == ("rigid_paper", "pinned")
+    assert playback.split("hybrid/kabsch") == ("hybrid", "kabsch")
+    assert playback.split("standard") == ("standard", "")
+    assert playback.modes(scene) == ("rigid",)
+    assert len(set(playback.every())) == len(playback.every()) == 5 + 5 + 1 + 2
+    for mode in ("wobbly", "rigid/mean", "rigid/", "standard/fitted", "", None):
+        with pytest.raises(ValueError, match="mode: expected one of"):
+            playback.split(mode)
+
+
 def test_unknown_modes_and_times_are_refused(scene):
     with pytest.raises(ValueError, match="mode"):
         playback.frame(scene, 1.0, mode="wobbly")
+    with pytest.raises(ValueError, match="origin"):
+        playback.frame(scene, 1.0, origin=np.array([0.0, np.nan, 0.0]))
     with pytest.raises(ValueError, match="finite"):
         playback.frame(scene, float("nan"))

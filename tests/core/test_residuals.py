@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations, se3
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.scene import group_dynamics, playback, residuals, scene_file
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, TIMES, make_scene
 
@@ -101,13 +101,104 @@ def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
     assert np.abs(pairs[1] - pairs[0]).max() > 0.05
 
 
-def test_all_modes_meet_at_t_max_and_agree_before_it():
-    scene = twisting(make_scene())
-    assert {playback.split(mode)[0] for mode in playback.modes(scene)} == set(playback.MODES)
-    for mode in playback.modes(scene):
-        np.testing.assert_array_equal(playback.frame(scene, T_MAX, mode).means, scene.means)
-        np.testing.assert_array_equal(playback.frame(scene, 0.2, mode).means, playback.frame(scene, 0.2).means)
-        np.testing.assert_allclose(playback.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-5)
+@pytest.fixture(scope="module")
+def twisted() -> Scene:
+    return twisting(make_scene(300, shadows=False))
+
+
+@pytest.mark.parametrize("mode", playback.every())
+def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
+    scene = twisted
+    assert mode in playback.modes(scene)
+    frame, rigid = playback.frame(scene, T_MAX, mode), playback.frame(scene, 0.2)
+    for name in ("means", "quats"):
+        np.testing.assert_array_equal(getattr(frame, name), getattr(scene, name))
+        np.testing.assert_array_equal(getattr(playback.frame(scene, 0.2, mode), name), getattr(rigid, name))
+    np.testing.assert_allclose(playback.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
+
+
+@pytest.mark.parametrize("source", group_dynamics.SOURCES[1:])
+def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
+    scene = twisted
+    for t in (0.8, 1.1):
+        rigid, own = playback.frame(scene, t, f"rigid/{source}"), playback.frame(scene, t, "standard")
+        np.testing.assert_allclose(rigid.means, own.means, atol=3 * residuals.TOLERANCE * scene.extent)
+        assert rotations.angle_between(rigid.quats.astype(float), own.quats.astype(float)).max() < 2e-3
+        np.testing.assert_allclose(rigid.shading_factor, own.shading_factor, atol=2e-3)
+        since = rigid.group_quats[scene.motion_ids[own.turned_rows]]
+        assert rotations.angle_between(since, own.turned_quats).max() < 2e-3
+
+
+@pytest.mark.parametrize("mode", [mode for mode in playback.every() if mode.startswith("rigid/")])
+def test_sources_move_every_group_rigidly_for_long(twisted, mode):
+    scene = twisted
+    player, t = playback.Player(scene, mode), T_MAX + 4.0
+    _, displacements = player.group_poses(t)
+    for start, stop, g in playback.runs(scene.motion_ids):
+        frame = player.frame(t, scene.groups[g].pivot + displacements[g])
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=5e-7 if scene.groups[g].role == "body" else 2e-6)
+
+
+def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
+    """The scene with residuals of a size in the observed time for some rows."""
+    offsets = np.zeros((len(rows), len(TIMES), 3), np.float32)
+    offsets[:, :-1, 0] = size
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), len(TIMES), 1))
+    return dataclasses.replace(
+        scene, residual_rows=rows, residual_offsets=offsets, residual_quats=quats, residual_log_scales=0 * offsets
+    )
+
+
+@pytest.mark.parametrize("variant", ["", "/least_squares"])
+def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
+    scene = dataclasses.replace(twisted, dynamics=twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2))
+    rigid, own = playback.frame(scene, 1.1, f"rigid{variant}"), playback.frame(scene, 1.1, "standard")
+    everyone = np.arange(len(scene.means), dtype=np.int32)
+    some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
+    for rows, size in ((None, 0.0), (everyone, 1e-3), (some, 0.5), (everyone, 0.5)):
+        changed = scene if rows is None else loose(scene, rows, size)
+        frame = playback.frame(changed, 1.1, f"hybrid{variant}")
+        free = np.zeros(len(scene.means), bool)
+        if rows is not None and size > 0.1:
+            free[rows] = True
+        elif rows is not None:
+            free[scene.motion_ids == 0] = True  # what is pinned by rule has no motion that explains anything
+        free &= (scene.dynamics != 0).any(-1)
+        for name in ("means", "quats", "shading_factor"):
+            np.testing.assert_array_equal(getattr(frame, name)[free], getattr(own, name)[free])
+            np.testing.assert_array_equal(getattr(frame, name)[~free], getattr(rigid, name)[~free])
+
+
+def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
+    """Where f_def is a translation, offsets in the canonical state are those at t_max."""
+    dynamics = twisted.dynamics.copy()
+    dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
+    dynamics[:, 9:] *= 0.1
+    moved = twisted.means + np.float32(0.3) * (twisted.motion_ids[:, None] == 1)
+    scene = dataclasses.replace(twisted, dynamics=dynamics, canonical_means=moved.astype(np.float32))
+    literal, rigid = (playback.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
+    np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
+    np.testing.assert_allclose(literal.quats, rigid.quats, atol=1e-4)
+
+
+def test_an_anchored_background_goes_with_its_representative(twisted):
+    still = twisted.motion_ids == 0
+    dynamics = twisted.dynamics.copy()
+    dynamics[still, :3] = [0.3, 0.0, -0.1]
+    scene = dataclasses.replace(twisted, dynamics=dynamics)
+    pinned, anchored = (playback.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
+    np.testing.assert_array_equal(pinned.means[still], scene.means[still])
+    moved = 0.25 * np.array([0.3, 0.0, -0.1])
+    np.testing.assert_allclose(anchored.means[still], scene.means[still] + moved, atol=1e-6)
+    body = scene.motion_ids == 1
+    np.testing.assert_array_equal(anchored.means[body], pinned.means[body])
+
+
+def test_modes_without_canonical_places_lack_the_literal_form():
+    scene = dataclasses.replace(twisting(make_scene(60)), canonical_means=None)
+    assert {playback.split(mode)[0] for mode in playback.modes(scene)} == {"rigid", "hybrid", "standard"}
 
 
 def test_a_mode_without_data_is_refused():
