@@ -2,8 +2,8 @@
 
 Notation: x = (w, v) the twist of a point about its own centre at time 0, b = (e, a) its rate, T the time to reach. For
 a twist that is linear in time the bracket C = [x, b] is that of every moment, so that a Magnus step of length h with
-its middle at m is exp(h x + h m b - h^3/12 C): three products. Everything lies in columns, [6, n], as numpy is slow
-at rows of three. With s = sin(|u|/2) the ratios B = 2 s^2/|u|^2, C and D of `se3` lose digits towards u = 0 only as
+its middle at m is exp(h x + h m b - h^3/12 C): three products. Everything lies in columns, [6, n]
+(`columns`). With s = sin(|u|/2) the ratios B = 2 s^2/|u|^2, C and D of `se3` lose digits towards u = 0 only as
 fast as what they are multiplied with vanishes, so no series is needed.
 """
 
@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from . import rotations
+from . import columns, rotations
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,7 @@ class Propagator:
         self.count = len(state)
         sound = np.isfinite(state).all(-1)
         moving = np.flatnonzero((state != 0).any(-1) & sound)
-        columns = np.ascontiguousarray(state[moving].T, np.float64)
-        v, w, a, e = columns[:3], columns[3:6], columns[6:9], columns[9:]
+        v, w, a, e = np.split(np.ascontiguousarray(state[moving].T, np.float64), 4)
         x, b = np.concatenate([w, v]), np.concatenate([e, a])
         reach = np.broadcast_to(np.asarray(radius, np.float64), (self.count,))[moving]
         limit = np.broadcast_to(np.asarray(tolerance, np.float64), (self.count,))[moving]
@@ -143,8 +142,8 @@ def _magnus(x: np.ndarray, b: np.ndarray, c: np.ndarray, duration: float, steps:
         q, d = _exp((fixed + middles[:, None] * b[:, None]).reshape(6, taken * count))
         q, d = _product(q.reshape(4, taken, count), d.reshape(3, taken, count))
         if start:
-            displacements = _rotate(q, displacements) + d
-            quats = multiply(q, quats)
+            displacements = columns.rotate(q, displacements) + d
+            quats = columns.multiply(q, quats)
         else:
             quats, displacements = q, d
     if steps > 1:
@@ -157,8 +156,8 @@ def _product(quats: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, 
     while quats.shape[1] > 1:
         even = quats.shape[1] // 2 * 2
         first, second = slice(0, even, 2), slice(1, even, 2)
-        d = _rotate(quats[:, second], displacements[:, first]) + displacements[:, second]
-        q = multiply(quats[:, second], quats[:, first])
+        d = columns.rotate(quats[:, second], displacements[:, first]) + displacements[:, second]
+        q = columns.multiply(quats[:, second], quats[:, first])
         quats = np.concatenate([q, quats[:, even:]], axis=1)
         displacements = np.concatenate([d, displacements[:, even:]], axis=1)
     return quats[:, 0], displacements[:, 0]
@@ -178,9 +177,9 @@ def _turn(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
     quats = np.empty((4, w.shape[1]))
     quats[0] = cosine
     np.multiply(ratio, w, out=quats[1:])
-    once = cross(w, v)
+    once = columns.cross(w, v)
     displacements = v + (2 * ratio * ratio) * once
-    displacements += ((angle - 2 * s * cosine) / (angle * angle * angle)) * cross(w, once)
+    displacements += ((angle - 2 * s * cosine) / (angle * angle * angle)) * columns.cross(w, once)
     return quats, displacements, angle, s
 
 
@@ -190,39 +189,15 @@ def _accelerated_spin(x: np.ndarray, a: np.ndarray, duration: float) -> tuple[np
     quats, displacements, angle, s = _turn(w, v)
     square = angle * angle
     twice = duration * duration * a
-    once = cross(w, twice)
+    once = columns.cross(w, twice)
     displacements += 0.5 * twice + ((angle - 2 * s * quats[0]) / (square * angle)) * once
-    displacements += ((0.5 * square - 2 * s * s) / (square * square)) * cross(w, once)
+    displacements += ((0.5 * square - 2 * s * s) / (square * square)) * columns.cross(w, once)
     return quats, displacements
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b by column. [3, ...] each"""
-    result = np.empty_like(b)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(a[j], b[k], out=result[i])
-        result[i] -= a[k] * b[j]
-    return result
-
-
-def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Quaternion products p q by column. [4, ...] each"""
-    return np.stack([
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    ])  # fmt: skip
-
-
-def _rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    twice = 2 * cross(quats[1:], vectors)
-    return vectors + quats[0] * twice + cross(quats[1:], twice)
 
 
 def _bracket(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[(w1, v1), (w2, v2)] = (w1 x w2, w1 x v2 - w2 x v1) by column. [6, n] each"""
-    return np.concatenate([cross(x[:3], y[:3]), cross(x[:3], y[3:]) - cross(y[:3], x[3:])])
+    return np.concatenate([columns.cross(x[:3], y[:3]), columns.cross(x[:3], y[3:]) - columns.cross(y[:3], x[3:])])
 
 
 def _norms(columns: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..motion import propagation, rotations
+from ..motion import columns, rotations
 from ..motion.keyframes import slopes
 from . import group_dynamics, posing
 from .group_dynamics import knots
@@ -66,7 +66,7 @@ class Frame:
         group_displacements: Displacement of each group's pivot, world. [G, 3] float64
         origin: Point of the world that ``means`` are relative to. [3] float64
         turned_rows: Gaussians that turned otherwise than their group, or None. [R] int64
-        turned_quats: Their rotations since the bind state, unit wxyz, or None. [R, 4] float64
+        turned_quats: Their rotations since the bind state, unit wxyz, or None. [R, 4] float32
     """
 
     t: float
@@ -218,14 +218,15 @@ class Player:
         offsets, turns, growths = found
         rows, scene = self._residuals.rows, self.scene
         arms = self._poser.arms[rows]
-        arms[:, :3] += offsets
+        arms[:, :3] += offsets.T
         maps = self._poser.maps(quats, displacements, origin)
         for start, stop, g in self._residuals.runs:
             moved.means[rows[start:stop]] = arms[start:stop] @ maps[g]
-        since = propagation.multiply(quats.T[:, scene.motion_ids[rows]], turns.T)
-        moved.turn(rows, since, propagation.multiply(since, scene.quats[rows].T), scene)
+        carried = np.take(quats.T.astype(np.float32), scene.motion_ids[rows], axis=1)
+        since = columns.multiply(carried, turns.astype(np.float32))
+        moved.turn(rows, since, columns.multiply(since, self._residuals.bind_quats), scene)
         moved.log_scales = scene.log_scales.copy()
-        moved.log_scales[rows] += growths
+        moved.log_scales[rows] += growths.T
         self._poser.relight(moved.shading, rows, since)
 
     def _part(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..motion import rotations
+from ..motion import columns, rotations
 from .scene import Scene
 
 
@@ -104,8 +104,7 @@ class Poser:
         vectors, light = self._scene.shading, self._scene.light_direction
         if factors is None or vectors is None or light is None:
             return
-        change = rotations.rotate(rotations.conjugate(turns.T), light) - light
-        lit = self._rest[rows] + np.einsum("rc,rc->r", vectors[rows], change.astype(np.float32))
+        lit = self._rest[rows] + (vectors[rows].T * columns.direction_changes(turns, light.astype(turns.dtype))).sum(0)
         factors[rows] = np.maximum(lit, 0)
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..motion import dynamics, keyframes, propagation, rotations, stepping
+from ..motion import columns, dynamics, keyframes, propagation, rotations, stepping
 from . import group_dynamics
 from .posing import Poser, runs
 from .scene import Scene
@@ -21,11 +21,12 @@ UNEXPLAINED = 0.1  # of the group's radius: residuals from there on belong to no
 
 
 class Residuals:
-    """What the residuals of a scene say at any time; the coefficients of the last interval are kept.
+    """What the residuals of a scene say at any time, by column; the ends of the last interval are kept.
 
     Attributes:
         rows: Gaussians that have some, increasing. [R]
         runs: Stretches of ``rows`` of one motion group: start, stop, group.
+        bind_quats: Their rotations in the bind state, unit wxyz, by column. [4, R]
     """
 
     def __init__(self, scene: Scene):
@@ -35,11 +36,12 @@ class Residuals:
         self.rows = np.asarray(rows, np.int64) if there and rows is not None else np.zeros(0, np.int64)
         self._parts = tuple(part for part in parts if part is not None) if there else ()
         self.runs = runs(scene.motion_ids[self.rows])
+        self.bind_quats = np.ascontiguousarray(scene.quats[self.rows].T)
         self._times, self._t_max = scene.track_times, scene.t_max
         self._interval: tuple[int, list[Cubic]] | None = None
 
     def at(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Offsets [R, 3], unit quaternions wxyz [R, 4] and changes of log scales [R, 3] at a time, float64.
+        """Offsets [3, R], unit quaternions wxyz [4, R] and changes of log scales [3, R] at a time, float64.
 
         Returns:
             The three, as before the first knot held, or None where there are none: from t_max on.
@@ -48,8 +50,8 @@ class Residuals:
             return None
         times = self._times
         if t <= times[0]:
-            offsets, turns, growths = (part[:, 0].astype(np.float64) for part in self._parts)
-            return offsets, rotations.normalize(turns), growths
+            offsets, turns, growths = (np.ascontiguousarray(part[:, 0].T, np.float64) for part in self._parts)
+            return offsets, _unit(turns), growths
         k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
         if self._interval is None or self._interval[0] != k:
             self._interval = k, [_cubic(times, part, k) for part in self._parts]
@@ -58,11 +60,16 @@ class Residuals:
         offsets, turns, growths = (
             keyframes.hermite(a, b, left, right, h, u) for a, b, left, right in self._interval[1]
         )
-        return offsets, rotations.normalize(turns), growths
+        return offsets, _unit(turns), growths
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    """Quaternions by column, normalised. [4, R]"""
+    return quats / np.sqrt(np.maximum((quats * quats).sum(0), 1e-300))
 
 
 def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
-    """Values and slopes at the ends of interval k of curves through knots. [R, S, C] -> four times [R, C] float64"""
+    """Values and slopes at the ends of interval k of curves through knots. [R, S, C] -> four times [C, R] float64"""
     window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope asks for the neighbours of its knot alone
     near = values[:, window].astype(np.float64)
     if values.shape[-1] == 4:
@@ -70,7 +77,7 @@ def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
         near[:, 1:] *= flip[..., None]
     rates, i = keyframes.slopes(times[window], near), k - window.start
     ends = (near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1])
-    a, b, left, right = (np.ascontiguousarray(part) for part in ends)
+    a, b, left, right = (np.ascontiguousarray(part.T) for part in ends)
     return a, b, left, right
 
 
@@ -101,16 +108,23 @@ class OwnMotion:
         chosen = np.arange(len(scene.means)) if rows is None else rows
         tolerance = TOLERANCE * scene.extent
         self._propagator = propagation.Propagator(scene.dynamics[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE)
-        self.rows = chosen[self._propagator.rows]
+        moving = self._propagator.rows
+        # Among all, those at rest are where no group brings them; of some, they are to stay though their group moves.
+        self._resting = np.zeros(0, np.int64) if rows is None else np.setdiff1d(np.arange(len(chosen)), moving)
+        self.rows = chosen[np.concatenate([moving, self._resting])]
         self._means = np.ascontiguousarray(scene.means[self.rows].T, np.float64)
-        self._quats = np.ascontiguousarray(scene.quats[self.rows].T, np.float64)
+        self._quats = np.ascontiguousarray(scene.quats[self.rows].T)
 
     def at(self, tau: float, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means relative to the origin [3, R], quats [4, R] and rotations since t_max [4, R] by column, float64."""
+        """Means relative to the origin [3, R], quats [4, R] and rotations since t_max [4, R], by column."""
         turns, moves = self._propagator.columns(tau)
+        if len(self._resting):
+            still = rotations.identity(len(self._resting)).T
+            turns, moves = np.hstack([turns, still]), np.hstack([moves, 0 * still[1:]])
         moves += self._means
         moves -= origin[:, None]
-        return moves, propagation.multiply(turns, self._quats), turns
+        turns = turns.astype(np.float32)
+        return moves, columns.multiply(turns, self._quats), turns
 
 
 class Literal:

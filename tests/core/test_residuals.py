@@ -153,7 +153,9 @@ def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
 
 @pytest.mark.parametrize("variant", ["", "/least_squares"])
 def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
-    scene = dataclasses.replace(twisted, dynamics=twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2))
+    dynamics = twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2)
+    dynamics[np.flatnonzero(twisted.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
+    scene = dataclasses.replace(twisted, dynamics=dynamics)
     rigid, own = playback.frame(scene, 1.1, f"rigid{variant}"), playback.frame(scene, 1.1, "standard")
     everyone = np.arange(len(scene.means), dtype=np.int32)
     some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
@@ -165,7 +167,6 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
             free[rows] = True
         elif rows is not None:
             free[scene.motion_ids == 0] = True  # what is pinned by rule has no motion that explains anything
-        free &= (scene.dynamics != 0).any(-1)
         for name in ("means", "quats", "shading_factor"):
             np.testing.assert_array_equal(getattr(frame, name)[free], getattr(own, name)[free])
             np.testing.assert_array_equal(getattr(frame, name)[~free], getattr(rigid, name)[~free])
