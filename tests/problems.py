@@ -83,12 +83,12 @@ MOTIONS: dict[str, tuple[MotionModel, tuple[str, ...]]] = {
 }
 
 
-# A thrown box that tumbles about its middle axis; it needs the inertia of the body to be told from others.
+# A thrown box that tumbles; it needs the inertia of the body to be told from others.
 TUMBLING = MotionModel(
     "free_top",
     velocity=[1, 0, -2],
     acceleration=[0, 0, -9],
-    angular_velocity=[0.8, 4.5, 1.2],
+    angular_velocity=[3.0, 3.5, -1.5],
     inertia=[[0.40, 0.02, 0.0], [0.02, 0.80, -0.03], [0.0, -0.03, 1.0]],
     radius=RADIUS,
 )

@@ -17,6 +17,7 @@ import numpy as np
 from . import rotations
 
 DISTINCT = 0.1  # moments nearer to each other than this share make a body turn steadily, as far as poses can tell
+LINE = 1e-3  # a smallest moment below this share of the largest is that of a line, which has no spin about itself
 _GAP = 1e-9  # relative; moments are this far apart at least, as Euler's solution divides by their differences
 _SAMPLES = 256  # of a rate over a period; its series converges like exp(-n), near a separatrix more slowly
 _LEAST = 1e-300
@@ -44,9 +45,9 @@ def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray
 
 
 def tumbles(body: np.ndarray) -> bool:
-    """Whether an inertia is so far from that of a ball that poses can tell: [3, 3]."""
+    """Whether an inertia is so far from that of a ball that poses can tell, and not that of a line. [3, 3]"""
     moments = np.linalg.eigvalsh(body)
-    return bool(moments[0] < (1 - DISTINCT) * moments[2])
+    return bool(LINE * moments[2] < moments[0] < (1 - DISTINCT) * moments[2])
 
 
 def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

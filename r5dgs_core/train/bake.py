@@ -21,11 +21,11 @@ from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
 from ..model.gaussians import SEEN_OPACITY
-from ..motion import fitting, rotations
+from ..motion import fitting, gravity, rotations, top
 from ..motion.models import MotionModel
 from ..scene import residuals
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, groups, mask_stack, needs, plain_motion, point_baking, representation
+from . import checkpoint, falling, groups, mask_stack, needs, plain_motion, point_baking, representation, track_checks
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -55,7 +55,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     light, strength = _unit(motion.light)
     cloud.shading *= strength
     names = {int(i): dataset.object_names.get(int(i), f"object {i}") for i in tensors["object_ids"]}
-    bound = _bind(cloud, motion, norm, light, wanted, names)
+    bound = _bind(cloud, motion, norm, light, wanted, names, dataset.world_convention)
     rows, track_poses = bound.rows, bound.played
     order = np.lexsort((cloud.motion_ids, cloud.object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
@@ -235,11 +235,14 @@ def _bind(
     light: np.ndarray,
     wanted: NeedsSection,
     names: dict[int, str],
+    convention: str,
 ) -> _Bound:
     """Bring the Gaussians to the bind state, in place, and fit the motion of their groups."""
     rows, trained, pivots, played, of_objects = [], [], [], [], []
+    fits: dict[int, tuple[gravity.Track, fitting.Fit]] = {}
     opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     for index, group in enumerate(motion.groups):
+        group = track_checks.sound(group, names.get(group.object_id, "background"))
         members = cloud.motion_ids == index
         center = norm.points_to_world(group.center)
         path = group.displacements * norm.scale
@@ -264,8 +267,13 @@ def _bind(
             poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
         model = MotionModel(radius=radius)
         if group.role == "body" and np.any(poses[:, 1:] != 0):
-            seen = group.observed.astype(np.float64)
-            fit = fitting.fit(motion.times, poses[:, :4], poses[:, 4:], radius=radius, weights=seen)
+            track_checks.warn_of_aliasing(names[group.object_id], motion.times, poses)
+            track = gravity.Track(motion.times, poses[:, :4], poses[:, 4:], group.observed.astype(np.float64))
+            body = top.inertia(cloud.means[members][_voters(opacities[members])])
+            fit = fitting.fit(
+                track.times, track.quats, track.displacements, radius=radius, weights=track.weights, inertia=body
+            )
+            fits[index] = track, fit
             plain = plain_motion.reduce(names[group.object_id], motion.times, poses, fit)
             poses, model, pivot = plain.poses, plain.model, pivot + plain.shift
             cloud.means[members] += plain.shift
@@ -273,6 +281,7 @@ def _bind(
         played.append(poses)
         anchor = _anchor(np.flatnonzero(members), cloud.means[members], opacities[members], pivot)
         rows.append(_motion_group(index, group, motion.times, pivot, model, anchor))
+    rows = falling.share_gravity(rows, fits, played, convention, names)
     return _Bound(rows, np.stack(trained), np.stack(pivots), np.stack(played), of_objects)
 
 

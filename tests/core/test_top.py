@@ -134,6 +134,7 @@ def test_inertia_is_that_of_the_cloud():
         np.testing.assert_allclose(top.inertia(none), np.eye(3) / 3)
     assert not top.tumbles(np.eye(3) / 3)
     assert not top.tumbles(np.diag([0.95, 1.0, 1.0]))
+    assert not top.tumbles(top.inertia(np.outer(np.arange(5.0), [1, 2, 3])))
 
 
 def test_a_body_without_extent_across_is_refused():
