@@ -258,7 +258,7 @@ CASES: tuple[Case, ...] = (
             f"places {label} from the origin, seen from the body",
             "playback.frame",
             "distance / radius",
-            3e-7,
+            5e-7,
             _FLOAT32,
             functools.partial(_places, d),
         )
