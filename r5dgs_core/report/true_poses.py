@@ -31,6 +31,10 @@ class Body:
         size: Diameter of the object, world units.
         times: Of the ground truth. [T]
         motion: True map from the bind state to the world. [T, 4, 4]
+        path: Where the group's pivot truly is if the body's own origin tells: right where `motion` is not, as how the
+            scene's body lies in the true one is not known. [T, 3]
+        turn_error_deg: How far the scene's rotations are from the true ones at the observed times, median, degrees. A
+            body that looks the same from all sides may be turned as it likes.
     """
 
     object_id: int
@@ -39,6 +43,8 @@ class Body:
     size: float
     times: np.ndarray
     motion: np.ndarray
+    path: np.ndarray
+    turn_error_deg: float
 
 
 def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> tuple[Body, ...]:
@@ -66,8 +72,13 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
             first, last = group.seen or (-np.inf, np.inf)
             seen = observed & (times >= first - 1e-9) & (times <= last + 1e-9)
             predicted = motion(scene, [group], times)[0]
-            true = metrics.true_motion(predicted, truth, seen if seen.any() else observed, group.pivot)
-            found.append(Body(object_id, name, group, _size(scene, group), times, true))
+            used = seen if seen.any() else observed
+            true = metrics.true_motion(predicted, truth, used, group.pivot)
+            here = (predicted @ np.append(group.pivot, 1.0))[:, :3]
+            path = truth[:, :3, 3] + (here - truth[:, :3, 3])[used].mean(axis=0)
+            _, angles = metrics.pose_errors(predicted[used], true[used], group.pivot)
+            size = _size(scene, group)
+            found.append(Body(object_id, name, group, size, times, true, path, float(np.median(angles))))
     return tuple(found)
 
 

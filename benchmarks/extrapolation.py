@@ -1,0 +1,149 @@
+"""Extrapolation, one table over many runs: every playback mode, every motion model, and true poses as the oracle.
+
+    python benchmarks/extrapolation.py RUN... [--split test] [--json FILE] [--markdown FILE]
+
+Each run is baked with its data set. A run with dynamics of single Gaussians (`field`) is played in every mode; one
+without (`tracks`) with each motion model alone. All are measured in dB on the test images, which lie past t_max, beside
+the same scene with true poses where the data set has them. Runs of one scene and training that differ in their seed are
+columns of their own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data.dataset import Dataset
+from r5dgs_core.motion import candidates, fitting
+from r5dgs_core.report import evaluate, image_rows, pose_rows
+from r5dgs_core.scene import playback
+from r5dgs_core.scene.scene import Scene
+from r5dgs_core.train import bake, checkpoint
+
+ORACLE = "true poses"
+
+
+def refitted(scene: Scene, name: str) -> Scene:
+    """The scene with one motion model for all bodies: a swing where there is one, else the steady motion beside it."""
+    names = (name, pose_rows.STEADY[name]) if name in pose_rows.STEADY else (name,)
+    groups = []
+    for group in scene.groups:
+        track = scene.track_poses[group.id]
+        if group.role == "body" and np.any(track[:, 1:] != 0):
+            first, last = group.seen or (-np.inf, np.inf)
+            seen = (scene.track_times >= first - 1e-9) & (scene.track_times <= last + 1e-9)
+            fit = fitting.fit(
+                scene.track_times,
+                track[:, :4],
+                track[:, 4:],
+                radius=group.model.radius,
+                weights=seen.astype(np.float64),
+                candidates=names,
+            )
+            group = dataclasses.replace(group, model=fit.model)
+        groups.append(group)
+    return dataclasses.replace(scene, groups=tuple(groups))
+
+
+def measure(folder: Path, split: str) -> dict[str, Any]:
+    """One run: PSNR by way of moving, errors of the poses, share of true errors inside the band."""
+    run = checkpoint.open_run(folder)
+    dataset = datasets.read(run.data())
+    scene = bake.bake(run, dataset)
+    ways: dict[str, Callable[[float], playback.Frame]]
+    if scene.dynamics is not None:
+        ways = {mode: playback.Player(scene, mode).frame for mode in playback.modes(scene)}
+    else:
+        ways = {
+            name: playback.Player(refitted(scene, name)).frame
+            for name in pose_rows.MODELS
+            if name != candidates.FREE_TOP.name
+        }
+        ways["chosen"] = playback.Player(scene).frame
+    views = dataset.views(split)
+    oracle, why = image_rows.true_move(scene, dataset, [view.t for view in views])
+    if oracle is None:
+        print(f"{folder}: no oracle: {why}")
+    else:
+        ways[ORACLE] = oracle
+    found = {name: evaluate.measure(scene, views, move) for name, move in ways.items()}
+    return {
+        "run": folder.name,
+        "scene": scene.name,
+        "seed": run.config.train.seed,
+        "training": _training(run),
+        "psnr": {name: metrics["psnr"] for name, metrics in found.items()},
+        "psnr_objects": {name: metrics["psnr_objects"] for name, metrics in found.items()},
+        "objects": _objects(scene, dataset),
+        "regrouping": [row["reason"] for row in scene.needs if row["name"] == "regrouping"],
+    }
+
+
+def _training(run: checkpoint.Run) -> str:
+    config = run.config
+    if config.train.representation == "tracks":
+        return "tracks"
+    return config.field.variant + (", from tracks" if config.field.tracks_share > 0 else "")
+
+
+def _objects(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
+    """Errors of poses at the last true time, in diameters and degrees, and whether the band of 2 sigma held."""
+    rows, _ = pose_rows.measure(scene, dataset.ground_truth, 1, "cpu")
+    kept = {"position", "rotation", "position_mean", "rotation_mean", "band"}
+    return [
+        {"mode": row.mode, "method": row.method, "kind": row.error_kind, "error": row.error}
+        for row in rows
+        if row.setting == "as baked" or row.method.startswith("chosen") or any(k in row.error_kind for k in kept)
+    ]
+
+
+def markdown(found: list[dict[str, Any]]) -> str:
+    """One table for each kind of run: a row for each way of moving, a column for each run, their mean last."""
+    parts = []
+    for single in (True, False):
+        runs = [r for r in found if (r["training"] == "tracks") != single]
+        if not runs:
+            continue
+        names = list(dict.fromkeys(name for r in runs for name in r["psnr"]))
+        heads = [f"{r['scene']} {r['training']}" + (f" seed {r['seed']}" if r["seed"] else "") for r in runs]
+        lines = [
+            f"| {'mode' if single else 'motion model'} | {' | '.join(heads)} | mean |",
+            f"|---|{'---:|' * (len(runs) + 1)}",
+        ]
+        for name in names:
+            values = [r["psnr"].get(name) for r in runs]
+            mean = f"{np.mean(values):.2f}" if all(v is not None for v in values) else "-"
+            cells = ["-" if v is None else f"{v:.2f}" for v in values]
+            lines.append(f"| {name} | {' | '.join(cells)} | {mean} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--markdown", type=Path)
+    args = parser.parse_args()
+    found = []
+    for folder in args.runs:
+        found.append(measure(folder, args.split))
+        print(f"{folder}: " + ", ".join(f"{name} {value:.2f}" for name, value in found[-1]["psnr"].items()), flush=True)
+        if args.json:
+            args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    text = markdown(found)
+    print(text)
+    if args.markdown:
+        args.markdown.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
