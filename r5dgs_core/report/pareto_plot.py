@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from . import labels, report_rows, report_table
+from . import image_rows, labels, report_rows, report_table
 from .report_rows import Row
 
 # A panel's kind of error, its label, and the factor on the numbers.
@@ -25,6 +25,7 @@ _FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "images": 1e-3, "raster": 1e-4}  # w
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
 _DPI = 110
+LEAST_SPAN = 2.0  # of the times that an axis shows
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,11 @@ def png(report: dict[str, Any]) -> bytes:
 
     groups = report_rows.by_task(report_rows.from_dicts(report["rows"]))
     panels = {task: found for task, rows in groups.items() if (found := _points(task, rows))}
+    oracle = {
+        row.task: _pixel_error(row.error)
+        for row in groups.get("images", [])
+        if row.method == image_rows.ORACLE and row.error_kind == "psnr"
+    }
     columns = min(2, max(1, len(panels)))
     lines = max(1, math.ceil(len(panels) / 2))
     figure = Figure(figsize=(9.2 * columns, 6.9 * lines), dpi=_DPI, layout="constrained")
@@ -64,13 +70,15 @@ def png(report: dict[str, Any]) -> bytes:
     drawn = []
     for axes, (task, points) in zip(grid, panels.items(), strict=False):
         _draw(axes, task, points, report)
+        if task in oracle:
+            axes.axhline(oracle[task], color="0.35", linestyle="--", linewidth=1, zorder=0)
         drawn.append((axes, task, points))
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
     canvas.draw()  # lays the panels out, so that pixels are known
     figure.set_layout_engine("none")
     for axes, task, points in drawn:
-        _name(axes, canvas.get_renderer(), task, points)
+        _name(axes, canvas.get_renderer(), task, points, oracle.get(task))
     buffer = io.BytesIO()
     canvas.print_png(buffer)
     return buffer.getvalue()
@@ -82,10 +90,15 @@ def _points(task: str, rows: Sequence[Row]) -> list[_Point]:
     series = list(dict.fromkeys(_series(row) for row in shown))
     points = []
     for row in shown:
-        y = 255 * 10 ** (-row.error / 20) if kind == "psnr" else factor * row.error
+        y = _pixel_error(row.error) if kind == "psnr" else factor * row.error
         color = _COLORS[series.index(_series(row)) % len(_COLORS)]
         points.append(_Point(row.ms, max(y, _FLOOR[task]), row, _name_of(row), color))
     return points
+
+
+def _pixel_error(psnr: float) -> float:
+    """Root mean square in 8-bit levels."""
+    return 255 * 10 ** (-psnr / 20)
 
 
 def _series(row: Row) -> tuple[str, str]:
@@ -95,14 +108,14 @@ def _series(row: Row) -> tuple[str, str]:
     if row.task == "raster":
         return row.mode, row.setting.split()[0]
     base = row.mode.split("/")[0]
-    return (base, "models") if row.mode == "rigid/fitted" else (base, row.method if row.method == "true poses" else "")
+    return base, "models" if row.mode == "rigid/fitted" else ""
 
 
 def _name_of(row: Row) -> str:
     if row.task == "raster":
         return row.setting
     if row.task == "images":
-        return row.method if row.method == "true poses" else row.mode
+        return row.mode
     if row.task == "poses":
         return row.method if row.mode == "rigid/fitted" else f"mode {row.mode}"
     return row.setting.removesuffix(" steps").removesuffix(" step")
@@ -140,6 +153,10 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]
     if front:
         axes.step([p.x for p in front], [p.y for p in front], where="post", color=_FRONT, linewidth=1.2, zorder=1)
     axes.margins(x=0.16, y=0.12)
+    low, high = axes.get_xlim()
+    if high < LEAST_SPAN * low:  # else noise would look like a difference
+        middle = math.sqrt(low * high)
+        axes.set_xlim(middle / math.sqrt(LEAST_SPAN), middle * math.sqrt(LEAST_SPAN))
     axes.grid(alpha=0.25, which="major")
     _ticks(axes)
     if kind == "psnr":
@@ -171,12 +188,15 @@ def _ticks(axes: Any) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point]) -> None:
-    """Write the names: those of the front first, then of the others while there is room."""
+def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point], oracle: float | None) -> None:
+    """Write the names: those of lines first, then of points of the front, then of the others while there is room."""
     frame = axes.get_window_extent(renderer)
     places = axes.transData.transform([(p.x, p.y) for p in points])
     markers = np.concatenate([places - 4, places + 4], axis=1)
     texts: list[tuple[np.ndarray, str, str, bool, float]] = []  # place, text, colour, on the front, size
+    if oracle is not None:
+        height = axes.transData.transform((points[0].x, oracle))[1]
+        texts.append((np.array([frame.x1 - 60, height]), "with true poses", "0.35", False, 8.5))
     if task == "dynamics":
         for series in dict.fromkeys(_series(p.row) for p in points):
             last = max(i for i, p in enumerate(points) if _series(p.row) == series)

@@ -11,7 +11,7 @@ import pytest
 from r5dgs_core import cli, errors
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
-from r5dgs_core.motion import models
+from r5dgs_core.motion import candidates, models
 from r5dgs_core.report import (
     dynamics_rows,
     error_time,
@@ -29,10 +29,19 @@ from tests import pictures, scenes
 BACKEND = pictures.BACKEND
 
 
+FAMILY = ("static", "translation, quadratic", "constant twist", "hinge", "ballistic + spin, accelerating")
+
+
+def hurry(patch):
+    """One call a turn, and few motions to choose from: what is fitted how well is for the tests of the fit."""
+    patch.setattr(turns, "SAMPLE_MS", 0.0)
+    patch.setattr(pose_rows, "MODELS", ("static", "hinge"))
+    patch.setattr(candidates, "FAMILY", tuple(candidates.BY_NAME[name] for name in FAMILY))
+
+
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(turns, "SAMPLE_MS", 0.0)
-    monkeypatch.setattr(pose_rows, "MODELS", ("static", "translation", "ballistic + spin"))
+    hurry(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -245,8 +254,7 @@ def test_without_a_data_set_the_cameras_of_the_scene_serve(scene):
 @pytest.fixture(scope="module")
 def report(field, data):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(turns, "SAMPLE_MS", 0.0)
-        patch.setattr(pose_rows, "MODELS", ("static", "hinge", "pendulum"))
+        hurry(patch)
         return error_time.measure(field, data, rounds=1, backend=BACKEND)
 
 
