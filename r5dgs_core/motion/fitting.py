@@ -156,6 +156,8 @@ def fit(
     model = _to_model(solution, radius, span, evidence, sigmas)
     near_solutions = [] if rested else list(solutions.values())
     band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
+    if rested:  # a body that came to rest may go on: twice the variance
+        band = math.sqrt(2.0) * band
     return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.motion import dynamics, rotations, se3
+from r5dgs_core.motion import dynamics, propagation, rotations, se3
 
 RNG = np.random.default_rng(0)
 STATE = RNG.normal(size=(5, 12)) * [1, 1, 1, 2, 2, 2, 1, 1, 1, 1, 1, 1]
@@ -30,9 +33,77 @@ def test_points_at_rest_and_no_time_give_the_identity_to_the_bit():
 
 
 def test_rk2_converges_with_order_two():
-    _, exact = se3.integrate(W, V, E, A, np.full(5, 0.5), 4096)
-    errors = [np.abs(dynamics.rk2(np.zeros((5, 3)), V, W, A, E, 0.5, h)[0] - exact).max() for h in (0.05, 0.025)]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.25)
+    w, e = np.array([0.0, 0.6, 2.9]), np.array([0.7, 0.2, 0.1])
+    v, a, points = np.array([0.5, 0.3, -0.9]), np.array([-0.2, 0.8, 0.5]), np.random.default_rng(1).normal(size=(9, 3))
+    quat, shift = se3.integrate(w, v, e, a, 2.0, 4096)
+    exact = rotations.rotate(quat, points) + shift
+    errors, angles = [], []
+    for steps in (16, 64):
+        places, turns = dynamics.rk2(points, v, w, a, e, 2.0, 2.0 / steps)
+        errors.append(np.linalg.norm(places - exact, axis=-1).max())
+        angles.append(rotations.angle_between(turns, quat).max())
+    assert 0.5 * math.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    assert 0.5 * math.log2(angles[0] / angles[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.1, 0.5, 1.0, math.pi])
+def test_midpoint_steps_let_a_spinning_body_grow_as_they_must(angle):
+    still, spin = np.zeros(3), np.array([0.0, 0.0, angle])
+    points, _ = dynamics.rk2(np.array([1.0, 0.0, 0.0]), still, spin, still, still, 3.0, 1.0)
+    assert np.linalg.norm(points) == pytest.approx((1 + angle**4 / 4) ** 1.5, rel=1e-9)
+
+
+def test_midpoint_steps_that_are_too_long_warn_once(caplog):
+    def play(angle, duration=1.0, kind=np.array):
+        dynamics._warn_of_coarse_steps.cache_clear()
+        caplog.clear()
+        arrays = [kind(x) for x in (np.ones((2, 3)), np.zeros(3), np.array([0.0, 0.0, angle / 0.1]), np.zeros(3))]
+        for _ in range(3):
+            dynamics.rk2(*arrays, kind(np.zeros(3)), duration, 0.1)
+        return len(caplog.records)
+
+    with caplog.at_level(logging.WARNING):
+        assert play(0.11) == 1
+        assert "rad a step" in caplog.text
+        assert play(0.09) == 0
+        assert play(5.0, duration=0.0) == 0
+        assert play(5.0, kind=torch.tensor) == 0
+
+
+@pytest.mark.parametrize(
+    ("duration", "count"), [(1.0, 60), (10.0, 600), (1000.0, 60000), (0.01, 1), (0.0, 0), (-1.0, 60)]
+)
+def test_steps_are_counted_once(duration, count):
+    sizes = dynamics.step_sizes(duration, dynamics.TRACE_STEP)
+    assert len(sizes) == count
+    assert math.fsum(sizes) == pytest.approx(duration, abs=1e-12)
+    assert all(abs(h) <= dynamics.TRACE_STEP * (1 + 1e-9) for h in sizes)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e200])
+@pytest.mark.parametrize("column", range(12))
+def test_one_bad_point_changes_no_bit_of_the_others(bad, column, caplog):
+    propagation.warn_of_wild_dynamics.cache_clear()
+    still, spoiled = STATE.copy(), STATE.copy()
+    still[2], spoiled[2, column] = 0.0, bad
+    with caplog.at_level(logging.WARNING):
+        turns, moves = dynamics.propagate(spoiled, 0.8, 1e-6)
+    expected = dynamics.propagate(still, 0.8, 1e-6)
+    others = [0, 1, 3, 4]
+    np.testing.assert_array_equal(turns[others], expected[0][others])
+    np.testing.assert_array_equal(moves[others], expected[1][others])
+    assert np.isfinite(turns[2]).all() and np.isfinite(moves[2]).all()
+    if not math.isfinite(bad):
+        assert (turns[2] == [1, 0, 0, 0]).all() and (moves[2] == 0).all()
+        assert "1 of 5 points" in caplog.text
+
+
+def test_huge_dynamics_stay_finite_in_single_precision():
+    for column in range(6):  # velocity and spin
+        state = np.zeros((1, 12), np.float32)
+        state[0, column] = 1e30
+        for part in dynamics.propagate(state, 0.8, 1e-6):
+            assert np.isfinite(part.astype(np.float32)).all()
 
 
 def test_rk2_does_not_depend_on_where_the_origin_is():

@@ -73,6 +73,45 @@ def test_at_low_noise_the_choice_is_never_clearly_worse_than_the_largest():
         assert ours <= max(1.3 * full, 0.3), name
 
 
+def observe_tumbling(rng, sigma_t, sigma_r):
+    """Poses of a tumbling box, its last true pose, and its inertia in the bind state as its surface would give it."""
+    truth = problems.TUMBLING
+    quats, d, last_quat, last = problems.observe(truth, TIMES, rng, sigma_t, sigma_r)
+    back = rotations.quats_to_rotmats(rotations.conjugate(last_quat))
+    return quats, d, last_quat, last, back.T @ truth.inertia @ back
+
+
+def test_a_tumbling_box_is_predicted_by_its_inertia():
+    rng, ours, without = np.random.default_rng(20), [], []
+    for _ in range(3):
+        quats, d, last_quat, last, inertia = observe_tumbling(rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
+        for result, body in ((ours, inertia), (without, None)):
+            fit = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=body)
+            assert (fit.chosen == "free top") == (body is not None)
+            result.append(problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last)[1])
+    assert np.median(ours) < 0.5 * np.median(without)
+
+
+def test_a_tumbling_box_is_recovered_without_noise():
+    quats, d, last_quat, last, inertia = observe_tumbling(np.random.default_rng(21), 1e-7 * SIZE, 1e-7)
+    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=inertia)
+    assert fit.chosen == "free top"
+    assert problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last).max() < 0.1
+    assert np.isfinite(fit.band).all() and (np.diff(fit.band) >= 0).all()
+
+
+def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
+    box = np.diag([0.4, 0.8, 1.0])
+    rng = np.random.default_rng(22)
+    for name in ("static", "uniform", "ballistic", "spin", "hinge", "rolling, slowing", "pendulum"):
+        quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.003 * SIZE, 0.01)
+        plain = fitting.fit(TIMES, quats, d, radius=RADIUS)
+        assert fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=box).model == plain.model
+    quats, d, _, _, _ = observe_tumbling(rng, 0.003 * SIZE, 0.01)
+    cube = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=np.eye(3))
+    assert cube.chosen != "free top"
+
+
 def test_one_gross_outlier_is_shrugged_off():
     rng = np.random.default_rng(4)
     truth = MOTIONS["ballistic, spinning"][0]
@@ -301,6 +340,7 @@ def test_exact_rest_is_static_to_the_bit():
         ({"radius": 0.0}, "radius"),
         ({"weights": -np.ones(15)}, "weights"),
         ({"candidates": ["warp"]}, "warp"),
+        ({"candidates": ["free top"]}, "inertia"),
     ],
 )
 def test_unusable_tracks_are_refused(change, message):
@@ -313,3 +353,74 @@ def test_unusable_tracks_are_refused(change, message):
     }
     with pytest.raises(ValueError, match=message):
         fitting.fit(**arguments)
+
+
+NOISE = 0.005 * SIZE, np.radians(1) / 3**0.5
+STUDIED = [name for name in MOTIONS if name not in ("pendulum", "spring", "screw")]
+
+
+@pytest.mark.slow
+def test_over_many_seeds_the_right_family_is_chosen_and_costs_little():
+    rng, right, ratios = np.random.default_rng(30), [], []
+    for name in STUDIED:
+        truth, names = MOTIONS[name]
+        ours, known = [], []
+        for _ in range(20):
+            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE)
+            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            true = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=names[-1:])
+            right.append(fit.chosen in names)
+            for result, model in ((ours, fit.model), (known, true.model)):
+                result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
+        ratios.append(np.median(ours) / np.median(known))
+    assert np.mean(right) >= 0.85
+    assert np.exp(np.mean(np.log(ratios))) <= 1.3
+
+
+@pytest.mark.slow
+def test_over_many_seeds_stops_are_found_and_slow_movers_move():
+    rng, stopped, frozen = np.random.default_rng(31), [], []
+    for _ in range(40):
+        way = np.minimum(TIMES, rng.uniform(0.4, 0.5))[:, None]
+        path = way * [0.8, 0.1, 0] + NOISE[0] * rng.normal(size=(15, 3))
+        turns = rotations.rotvecs_to_quats(way * [0, 0, 2.0] + NOISE[1] * rng.normal(size=(15, 3)))
+        quats = rotations.multiply(turns, rotations.conjugate(turns[-1]))
+        fit = fitting.fit(TIMES, quats, path - path[-1], radius=RADIUS)
+        stopped.append(fit.chosen == "static" and fit.rested)
+        axis = rng.normal(size=3)
+        slow = models.MotionModel("translation", velocity=0.1 * SIZE * axis / np.linalg.norm(axis))
+        quats, d, _, _ = problems.observe(slow, TIMES, rng, *NOISE)
+        frozen.append(fitting.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
+    assert np.mean(stopped) >= 0.9
+    assert np.mean(frozen) <= 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("correlation", [0.0, 0.5])
+def test_over_many_seeds_the_band_holds_the_true_error(correlation):
+    rng, inside = np.random.default_rng(32), []
+    for name in STUDIED:
+        truth = MOTIONS[name][0]
+        for _ in range(8):
+            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE, correlation)
+            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
+            inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
+    assert np.mean(inside) >= 0.9
+
+
+@pytest.mark.slow
+def test_over_many_seeds_an_outlier_costs_little():
+    rng, clean, dirty = np.random.default_rng(33), [], []
+    for name in ("uniform", "ballistic", "spin", "hinge", "rolling", "ballistic, spinning"):
+        truth = MOTIONS[name][0]
+        for _ in range(8):
+            quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE)
+            row = int(rng.integers(1, 12))
+            spoiled_quats, spoiled = quats.copy(), d.copy()
+            spoiled[row] += [0.5, -0.4, 0.3]
+            spoiled_quats[row] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[row])
+            for result, (q, x) in ((clean, (quats, d)), (dirty, (spoiled_quats, spoiled))):
+                model = fitting.fit(TIMES, q, x, radius=RADIUS).model
+                result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
+    assert np.median(dirty) <= 1.3 * np.median(clean)
