@@ -17,7 +17,7 @@ from .scene import Scene
 TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
 ANGLE_TOLERANCE = 1e-3  # error of its rotations, rad
 Cubic = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # values and slopes at both ends
-UNEXPLAINED = 0.1  # of the group's radius: residuals from there on belong to no motion of a group
+UNEXPLAINED = 0.3  # of the group's radius: residuals from there on belong to no motion of a group
 
 
 class Residuals:
@@ -34,7 +34,8 @@ class Residuals:
         rows = scene.residual_rows
         there = rows is not None and len(rows) > 0 and all(part is not None for part in parts)
         self.rows = np.asarray(rows, np.int64) if there and rows is not None else np.zeros(0, np.int64)
-        self._parts = tuple(part for part in parts if part is not None) if there else ()
+        # [C, S, R]: what is asked for lies together.
+        self._parts = [np.ascontiguousarray(part.transpose(2, 1, 0)) for part in parts if there and part is not None]
         self.runs = runs(scene.motion_ids[self.rows])
         self.bind_quats = np.ascontiguousarray(scene.quats[self.rows].T)
         self._times, self._t_max = scene.track_times, scene.t_max
@@ -50,7 +51,7 @@ class Residuals:
             return None
         times = self._times
         if t <= times[0]:
-            offsets, turns, growths = (np.ascontiguousarray(part[:, 0].T, np.float64) for part in self._parts)
+            offsets, turns, growths = (part[:, 0].astype(np.float64) for part in self._parts)
             return offsets, _unit(turns), growths
         k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
         if self._interval is None or self._interval[0] != k:
@@ -69,16 +70,13 @@ def _unit(quats: np.ndarray) -> np.ndarray:
 
 
 def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
-    """Values and slopes at the ends of interval k of curves through knots. [R, S, C] -> four times [C, R] float64"""
+    """Values and slopes at the ends of interval k of curves through knots. [C, S, R] -> four times [C, R] float64"""
     window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope asks for the neighbours of its knot alone
     near = values[:, window].astype(np.float64)
-    if values.shape[-1] == 4:
-        flip = np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(-1) < 0, -1.0, 1.0), axis=1)
-        near[:, 1:] *= flip[..., None]
+    if len(values) == 4:
+        near[:, 1:] *= np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(0) < 0, -1.0, 1.0), axis=0)
     rates, i = keyframes.slopes(times[window], near), k - window.start
-    ends = (near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1])
-    a, b, left, right = (np.ascontiguousarray(part.T) for part in ends)
-    return a, b, left, right
+    return near[:, i], near[:, i + 1], rates[:, i], rates[:, i + 1]
 
 
 def unexplained(scene: Scene) -> np.ndarray:
