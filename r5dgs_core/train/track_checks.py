@@ -20,9 +20,10 @@ def sound(group: GroupTrack, name: str) -> GroupTrack:
         group: A motion group.
         name: Of its object, for the warning.
     """
-    if np.isfinite(group.quats).all() and np.isfinite(group.displacements).all():
+    track = np.concatenate([group.quats, group.displacements], axis=1)
+    bad = np.asarray(~np.isfinite(track).all(1))
+    if not bad.any():
         return group
-    bad = ~(np.isfinite(group.quats).all(-1) & np.isfinite(group.displacements).all(-1))
     if group.role == "body":  # its shadow follows it
         log.warning(
             "%s: %d of %d poses are not finite; it stays where it is, the others are as they were. Remedy: train again",
