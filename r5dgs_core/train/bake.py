@@ -81,6 +81,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         classified,
         wanted,
         bent,
+        motion.moves,
     )
     keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
     identities = cloud.identities if needs.is_on(decisions, "classifier") else None
@@ -130,11 +131,14 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
                 "finished": state.finished,
             },
         },
+        needs=(*decisions, *bound.of_objects),
         near_plane=NEAR_PLANE * norm.scale,
         **single,
     )
-    regrouped = needs.regrouping(motion.moves, len(residuals.unexplained(scene)), wanted)
-    return dataclasses.replace(scene, needs=(*decisions, *regrouped, *bound.of_objects))
+    if motion.moves is None:
+        return scene
+    counts = dataclasses.asdict(motion.moves) | {"unexplained": len(residuals.unexplained(scene))}
+    return dataclasses.replace(scene, provenance=scene.provenance | {"regrouping": counts})
 
 
 @dataclass

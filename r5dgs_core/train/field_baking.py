@@ -85,7 +85,8 @@ def observed_motion(
     if not own.any():  # nobody said what belongs to what before training: the labels do
         own = labels[rows.numpy()].astype(np.int64)
     motion_ids[rows.numpy()] = own
-    resting = ~np.isin(labels, own)  # objects of which nothing moves are groups all the same
+    resting = ~np.isin(labels, own)  # objects of which nothing moves are groups all the same,
+    resting[rows.numpy()] = False  # but what moves goes with its group even where the masks call it background
     motion_ids[resting] = labels[resting]
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
     nearest = np.abs(times[None] - at[:, None]).argmin(1)

@@ -86,6 +86,7 @@ def decide(
     classified: bool,
     wanted: NeedsSection | None = None,
     residuals: tuple[float, float, bool, str] = (0.0, 0.0, False, "none was tried"),
+    moves: Moves | None = None,
 ) -> tuple[dict[str, Any], ...]:
     """The needs table of a baked scene.
 
@@ -100,6 +101,7 @@ def decide(
         classified: Whether identities and their classifier were trained.
         wanted: The user's word on each row; by default everything is measured.
         residuals: Value and threshold of the residuals of single Gaussians, whether there are any, what the value is.
+        moves: Gaussians that went to groups that explain them better, or None where none was asked.
 
     Returns:
         Rows with name, value, threshold, decision ("on" or "off") and reason, which says where the user decided. What
@@ -112,7 +114,7 @@ def decide(
     moving = sum(not is_still(track_poses[g.id], g.model.radius) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
-    sky = len(background_sh)
+    sky, moved_over = len(background_sh), 0 if moves is None else moves.moved
     moved, turned = f"{moving} of {len(bodies)} objects move or turn", "largest turn in the observed time, rad"
     lit = bool(np.any(shading) and np.any(light))
     followers = "Gaussians that follow a caster on its support"
@@ -126,6 +128,7 @@ def decide(
         ("sky_gradient", sky, 2, sky > 1, sky > 1, "spherical harmonics bases of the sky"),
         ("classifier", len(bodies), 1, classified, classified, "objects with masks"),
         ("residuals", residuals[0], residuals[1], residuals[2], residuals[2], residuals[3]),
+        ("regrouping", moved_over, 1, moved_over > 0, moved_over > 0, _said(moves)),
     ]
     return tuple(
         _row(name, value, threshold, on, there, reason, getattr(wanted, name))
@@ -133,26 +136,15 @@ def decide(
     )
 
 
-def regrouping(moves: Moves | None, unexplained: int, wanted: NeedsSection) -> list[dict[str, Any]]:
-    """The row of the needs table on Gaussians that go with another group than that of their object; none where no
-    Gaussian moves on its own and the user does not ask.
-
-    Args:
-        moves: What was moved; None where nothing was asked.
-        unexplained: Gaussians that no group explains; mode "hybrid" moves them one by one.
-        wanted: The user's word.
-    """
+def _said(moves: Moves | None) -> str:
+    """What became of the Gaussians that move, in words."""
     if moves is None:
-        if wanted.regrouping == "auto":
-            return []
-        return [_row("regrouping", 0, 1, False, False, "each goes with the group it was made for", wanted.regrouping)]
-    reason = (
+        return "each Gaussian goes with the group that it was made for"
+    said = (
         f"of {moves.moving} Gaussians that move, {moves.to_bodies} went to another body, {moves.to_shadows} to a "
-        f"shadow, {moves.to_rest} to rest; no group explains {unexplained}"
+        f"shadow, {moves.to_rest} to rest"
     )
-    if moves.resting_shadows:
-        reason += f"; {moves.resting_shadows} shadows rest"
-    return [_row("regrouping", moves.moved, 1, moves.moved > 0, moves.moved > 0, reason, wanted.regrouping)]
+    return said + (f"; {moves.resting_shadows} shadows rest" if moves.resting_shadows else "")
 
 
 def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:

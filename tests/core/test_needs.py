@@ -18,7 +18,18 @@ RADIUS = 0.4
 
 
 def table(
-    travel=0.0, turn=0.0, *, shading=0.0, sky=1, bases=1, shadow=False, bodies=1, classified=True, wanted=None, bent=0
+    travel=0.0,
+    turn=0.0,
+    *,
+    shading=0.0,
+    sky=1,
+    bases=1,
+    shadow=False,
+    bodies=1,
+    classified=True,
+    wanted=None,
+    bent=0,
+    moves=None,
 ):
     """The decisions for bodies of which the first moves by ``travel`` diameters and turns by ``turn`` radians."""
     poses = [np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1)) for _ in range(bodies + 2)]
@@ -33,7 +44,7 @@ def table(
     gradients = np.full((len(ids), 3), shading)
     light, behind, given = np.array([0, 0, 1.0]), np.zeros((sky, 3)), config.NeedsSection(**(wanted or {}))
     bending = (float(bent), 0.5, bent > 0, "gain")
-    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given, bending)
+    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given, bending, moves)
     return {row["name"]: row for row in rows}
 
 
@@ -110,6 +121,7 @@ def test_the_tiny_scene_is_judged_by_what_it_shows(baked):
 
 
 EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
+EVERYTHING["moves"] = groups.Moves(3, moving=9)
 NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
 
 
@@ -200,14 +212,10 @@ def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
         bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
 
 
-def test_the_table_says_what_was_regrouped_and_nothing_where_nothing_could_be():
-    auto, off = config.NeedsSection(), config.NeedsSection(regrouping="off")
-    assert needs.regrouping(None, 0, auto) == []
-    (row,) = needs.regrouping(groups.Moves(3, 2, 1, 1, 60), 7, auto)
+def test_the_table_says_what_was_regrouped():
+    row = table(moves=groups.Moves(3, 2, 1, 1, 60))["regrouping"]
     assert (row["value"], row["decision"]) == (6, "on")
-    for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "explains 7", "1 shadows rest"):
+    for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "1 shadows rest"):
         assert part in row["reason"]
-    (row,) = needs.regrouping(groups.Moves(moving=60), 0, auto)
-    assert row["decision"] == "off" and "rest" in row["reason"]
-    (row,) = needs.regrouping(None, 0, off)
-    assert row["decision"] == "off" and "set off by you" in row["reason"]
+    assert table(moves=groups.Moves(moving=60))["regrouping"]["decision"] == "off"
+    assert table()["regrouping"]["decision"] == "off"
