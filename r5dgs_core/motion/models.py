@@ -240,8 +240,9 @@ class Stack:
                 elif kind == "world_twist":
                     quats[rows], displacements[rows] = prepared.rows_of(float(tau))
                 else:
-                    for g, model in zip(rows, prepared, strict=True):
-                        quats[g], displacements[g], _, _ = curve(model, tau)
+                    tops, frequencies = prepared
+                    once, twice = clocks(frequencies, span)
+                    quats[rows], displacements[rows] = tops.turns(float(tau)), v * once + a * twice
             if len(self._faded):
                 s = -np.expm1(-tau / self._fade_times)
                 faded = rotations.rotvecs_to_quats(s * self._rotvecs)
@@ -253,13 +254,14 @@ class Stack:
 
 def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray, ...]) -> Any:
     """What motions of one kind are evaluated with, beside their rates."""
+    frequencies = np.array([[model.frequency] for model in models])
     if kind == "world_twist":
         v, a, w, eps, _ = rates
         radii = np.array([model.radius for model in models])
         return propagation.Propagator(np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii)
     if kind == "free_top":
-        return models
-    return np.array([[model.frequency] for model in models])
+        return top.Tops(np.array([model.inertia for model in models]), rates[2]), frequencies
+    return frequencies
 
 
 def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -10,7 +10,8 @@ rate and a Fourier series: everything is in closed form, and any time costs the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -74,6 +75,29 @@ def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray,
     return np.where(still, rotations.identity(), quats), (to_world @ spins[..., 1:, :, None])[..., 0]
 
 
+class Tops:
+    """Several free bodies at any time: what does not depend on it is computed once.
+
+    Args:
+        bodies: Inertia of each in the world at tau = 0. [K, 3, 3]
+        w: Angular velocities at tau = 0, world frame. [K, 3]
+    """
+
+    def __init__(self, bodies: np.ndarray, w: np.ndarray):
+        paths = [_solve(body, spin) for body, spin in zip(bodies, w, strict=True)]
+        names = [field.name for field in fields(_Path)]
+        self._path = _Path(**{name: np.stack([getattr(path, name) for path in paths]) for name in names})
+        self._still = (np.asarray(w) == 0).all(-1)
+        frames, _ = self._path.at(np.zeros(1))
+        self._from_start = self._path.axes @ np.swapaxes(frames[:, 0], -1, -2)
+
+    def turns(self, tau: float) -> np.ndarray:
+        """Rotations since tau = 0, as `turns`. [K, 4]"""
+        frames, _ = self._path.at(np.array([tau], np.float64))
+        quats = rotations.rotmats_to_quats(self._from_start @ frames[:, 0] @ np.swapaxes(self._path.axes, -1, -2))
+        return np.where((self._still | (tau == 0))[:, None], rotations.identity(), quats)
+
+
 @dataclass(frozen=True)
 class _Path:
     """The solution for B spins; principal axes in Jacobi's order.
@@ -126,8 +150,9 @@ class _Path:
         turn = np.stack([np.stack([c, -s, zero], -1), np.stack([s, c, zero], -1), np.stack([zero, zero, 1 + zero], -1)])
         return np.moveaxis(turn, 0, -2) @ body, spins
 
-    def _angle(self, tau: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Integral of the precession from a time of its own to tau. [B, S]"""
+    @functools.cached_property
+    def _waves(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean rate of the precession [B, 1], sizes of the waves of its integral, and their numbers per clock."""
         quarter = complete(self.m1)
         grid = 2 * quarter[..., None] * np.arange(_SAMPLES) / _SAMPLES  # a period of the squares
         waves = np.fft.rfft(self.precession(self.spins(grid)), axis=-1) / _SAMPLES
@@ -136,8 +161,12 @@ class _Path:
         # The rates are even in u, so that their series has cosines alone; sines integrate them.
         sizes = 2 * waves[..., 1:-1].real / (numbers * pace[..., None])
         sizes = np.where(self.rate[..., None] > 0, sizes, 0.0)
-        phases = u[..., None] * (np.pi / quarter)[..., None, None] * numbers
-        return waves[..., :1].real * tau + (np.sin(phases) @ sizes[..., None])[..., 0]
+        return waves[..., :1].real, sizes, (np.pi / quarter)[..., None] * numbers
+
+    def _angle(self, tau: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Integral of the precession from a time of its own to tau. [B, S]"""
+        mean, sizes, numbers = self._waves
+        return mean * tau + (np.sin(u[..., None] * numbers[..., None, :]) @ sizes[..., None])[..., 0]
 
 
 def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
