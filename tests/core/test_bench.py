@@ -311,13 +311,13 @@ def test_the_end_of_a_process_is_put_into_words(status, complaint, words):
 
 
 def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch):
-    drawn, frame = [], playback.frame
+    drawn, frame = [], playback.Player.frame
 
-    def watch(scene, t, mode="rigid"):
+    def watch(player, t, origin=None):
         drawn.append(t)
-        return frame(scene, t, mode)
+        return frame(player, t, origin)
 
-    monkeypatch.setattr(playback, "frame", watch)
+    monkeypatch.setattr(playback.Player, "frame", watch)
     views = datasets.read(tiny.root).test
     found = playing.measure(baked, views[::-1], ["rigid"])["rigid"]
     round_ = drawn[: len(views)]
