@@ -92,6 +92,8 @@ def fit_rigid(
         current = current / current.sum()
         quat, center, moved, residuals = _kabsch(source, target, current)
 
+    if size <= 1e-14 * float(np.abs(source).max()):  # all in one place: what is left is rounding of their centroid
+        size = 0.0
     axes, covariance = _uncertainty(source - center, residuals, current, size)
     if len(axes):
         known = np.array([1.0, 0, 0, 0]) if hint is None else rotations.normalize(np.asarray(hint, np.float64))

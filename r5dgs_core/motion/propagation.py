@@ -30,7 +30,7 @@ class Propagator:
 
     Points at rest are left out, twists without angular acceleration have a closed form, and the others take
     fourth-order Magnus steps, as many as their neighbours in difficulty need. Points whose dynamics are not finite or
-    lead beyond all numbers rest, with a warning; they change no bit of the others.
+    lead beyond all numbers rest, with a warning; the others stay within the tolerance.
 
     Args:
         dynamics: Velocity, angular velocity and the rates of both, about the centre of each point. [N, 12]
