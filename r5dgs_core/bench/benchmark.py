@@ -12,6 +12,7 @@ import torch
 from ..data import dataset as datasets
 from ..errors import CheckpointError, R5dgsError, TrainingError
 from ..progress import make as make_progress
+from ..raster import machine as machines
 from ..report import bench_plot, bench_tables, evaluate
 from ..scene import playback, scene_file
 from ..train import bake, checkpoint, stopping, warming
@@ -206,4 +207,4 @@ def _show(plan: Plan, result: dict[str, Any]) -> None:
 
 def machine() -> dict[str, Any]:
     """What times are measured on in this process."""
-    return {**checkpoint.machine(), "torch_threads": torch.get_num_threads(), "versions": checkpoint.versions()}
+    return {**machines.describe(), "torch_threads": torch.get_num_threads(), "versions": machines.versions()}

@@ -14,9 +14,9 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..errors import ConfigError
+from ..raster import machine
 from ..scene import files
 from ..scene.scene import Scene
-from ..train import checkpoint
 from . import dynamics_rows, image_rows, pareto_plot, pose_rows, raster_rows, report_rows, report_table, turns
 from .report_rows import Row
 
@@ -107,7 +107,7 @@ def measure(
         "horizon": {"tau": tau, "why": why},
         "rounds": rounds,
         "clock": clock,
-        "machine": {**checkpoint.machine(), "versions": checkpoint.versions()},
+        "machine": {**machine.describe(), "versions": machine.versions()},
         "kinds": {k: {"label": v.label, "more_is_better": v.more_is_better} for k, v in report_rows.KINDS.items()},
         "absent": absent,
         "rows": [row.to_dict() for row in rows],

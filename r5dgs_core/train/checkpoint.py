@@ -10,14 +10,11 @@ import dataclasses
 import datetime
 import io
 import json
-import os
-import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,7 +22,7 @@ from .. import __version__
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model.gaussians import PARAMETERS
-from ..raster import compile as compilation
+from ..raster import machine
 from ..scene import files
 from . import config as configs
 from .config import Config
@@ -106,39 +103,6 @@ class Checkpoint:
     seconds: float = 0.0
 
 
-def versions() -> dict[str, str]:
-    """Versions that a result may depend on."""
-    import numba
-    import OpenImageIO as oiio
-
-    return {
-        "r5dgs": __version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "numba": numba.__version__,
-        "openimageio": oiio.VERSION_STRING,
-    }
-
-
-def machine() -> dict[str, Any]:
-    """What a run's times, and in the last bits its numbers, depend on beside the versions."""
-    processor = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), processor)
-    except OSError:
-        pass  # another system
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "system": platform.platform(),
-        "processor": processor,
-        "cores": usable,
-        "raster_threads": compilation.threads(),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-    }
-
-
 def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
     """The run that `create_run` would make; nothing is written.
 
@@ -156,7 +120,7 @@ def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         raise CheckpointError(f"{folder}: cannot be read: {error}; choose another --out") from error
     if foreign:
         raise CheckpointError(f"{folder}: exists and is not a run folder; choose another --out")
-    return Run(folder, Path(dataset.root).resolve(), dataset.digest, config, versions(), machine())
+    return Run(folder, Path(dataset.root).resolve(), dataset.digest, config, machine.versions(), machine.describe())
 
 
 def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:

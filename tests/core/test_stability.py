@@ -11,7 +11,9 @@ from rich.console import Console
 
 from r5dgs_core import cli
 from r5dgs_core.motion import models, poses, rotations, se3
-from r5dgs_core.report import stability, stability_cases, stability_scenes
+from r5dgs_core.report import stability
+from r5dgs_core.report.stability import cases as stability_cases
+from r5dgs_core.report.stability import scenes as stability_scenes
 from r5dgs_core.scene import validation
 
 

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
-from ..motion import fitting, models, poses, rotations
-from ..scene import group_dynamics
-from .stability_cases import ROUNDING, Case, angle, largest, logged, model_of
-from .stability_scenes import DIAGONAL, T_MAX, TIMES, scene_of
+from ...motion import fitting, models, poses, rotations
+from ...scene import group_dynamics
+from .cases import ROUNDING, Case, angle, largest, logged, model_of
+from .scenes import DIAGONAL, T_MAX, TIMES, scene_of
 
 _SIGMA = 0.003  # noise of each point, half a percent of the body's length
 _TURN = np.array([0.4, -0.9, 0.6])  # rad

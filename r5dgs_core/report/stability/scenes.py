@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..motion import models, rotations, se3
-from ..motion.models import MotionModel
-from ..scene.scene import MotionGroup, Scene, SceneObject
-from .stability_cases import body, model_of
+from ...motion import models, rotations, se3
+from ...motion.models import MotionModel
+from ...scene.scene import MotionGroup, Scene, SceneObject
+from .cases import body, model_of
 
 T_MAX = 0.75
 TIMES = np.linspace(0.0, T_MAX, 16)

@@ -18,27 +18,27 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from .. import errors
-from ..scene import files
+from ... import errors
+from ...scene import files
 from . import (
-    stability_cases_extremes,
-    stability_cases_groups,
-    stability_cases_keys,
-    stability_cases_orders,
-    stability_cases_playback,
-    stability_cases_rotations,
-    stability_cases_steps,
+    extremes,
+    groups,
+    keys,
+    orders,
+    playback,
+    rotations,
+    steps,
 )
-from .stability_cases import Case, logged
+from .cases import Case, logged
 
 CASES: tuple[Case, ...] = (
-    *stability_cases_orders.CASES,
-    *stability_cases_steps.CASES,
-    *stability_cases_extremes.CASES,
-    *stability_cases_rotations.CASES,
-    *stability_cases_groups.CASES,
-    *stability_cases_playback.CASES,
-    *stability_cases_keys.CASES,
+    *orders.CASES,
+    *steps.CASES,
+    *extremes.CASES,
+    *rotations.CASES,
+    *groups.CASES,
+    *playback.CASES,
+    *keys.CASES,
 )
 _CAPTION = (
     "less is better; trace_rk2: the same value for TRACE's integrator on each point, where it has a part in the case. "

@@ -8,8 +8,8 @@ from decimal import Decimal
 
 import numpy as np
 
-from ..motion import rotations
-from .stability_cases import ROUNDING, Case, angle, body, different, largest, ratios
+from ...motion import rotations
+from .cases import ROUNDING, Case, angle, body, different, largest, ratios
 
 _SMALL = (0.0, 1e-300, 1e-160, 1e-30, 1e-12, 1e-8, 1e-6, 1e-4, 1e-2, 0.3, 0.7, 0.99, 1.01, 1.4, 2.0)
 _RATIOS = (rotations.sine_ratio, rotations.versine_ratio, rotations.remainder_ratio)

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from ..motion import dynamics, models, rotations, se3
-from .stability_cases import (
+from ...motion import dynamics, models, rotations, se3
+from .cases import (
     POINT_ERROR,
     RADIUS,
     ROUNDING,

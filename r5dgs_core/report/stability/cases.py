@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..motion import dynamics, models, rotations
+from ...motion import dynamics, models, rotations
 
 RADIUS = 0.3
 POINT_ERROR = "error of a point / radius"

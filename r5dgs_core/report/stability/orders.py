@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..motion import rotations, se3
-from .stability_cases import (
+from ...motion import rotations, se3
+from .cases import (
     POINT_ERROR,
     RADIUS,
     ROUNDING,

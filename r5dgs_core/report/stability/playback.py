@@ -9,12 +9,12 @@ import math
 
 import numpy as np
 
-from ..motion import models, rotations
-from ..motion.models import MotionModel
-from ..scene import playback
-from ..scene.scene import Scene
-from .stability_cases import RADIUS, Case, Twist, body, different, largest, model_of, rk2_points, shape_error
-from .stability_scenes import DIAGONAL, HORIZON, MOTIONS, T_MAX, every_motion, scene_of
+from ...motion import models, rotations
+from ...motion.models import MotionModel
+from ...scene import playback
+from ...scene.scene import Scene
+from .cases import RADIUS, Case, Twist, body, different, largest, model_of, rk2_points, shape_error
+from .scenes import DIAGONAL, HORIZON, MOTIONS, T_MAX, every_motion, scene_of
 
 _MODES = ("rigid", "hybrid", "standard")
 _EVERY_MODE = (*_MODES, "rigid_paper")

@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 
-from ..motion import keyframes, rotations
-from .stability_cases import RADIUS, Case, body, largest, model_of, moved
-from .stability_scenes import MOTIONS, T_MAX
+from ...motion import keyframes, rotations
+from .cases import RADIUS, Case, body, largest, model_of, moved
+from .scenes import MOTIONS, T_MAX
 
 _KEYED = 1.0  # units past t_max that get keys
 _SHARE = 1e-3  # of the body's size: tolerance of keys
