@@ -300,7 +300,8 @@ def measure(scene: Scene, dataset: datasets.Dataset) -> dict[str, Any]:
         ("shadows as at t_max", False, True),
         ("both as at t_max", True, True),
     ):
-        errors = [p.squares.mean() for p in pictures(*_views(frozen(scene, shading, shadows), dataset.test))]
+        still, move = frozen(scene, shading, shadows)
+        errors = [p.squares.mean() for p in pictures(still, dataset.test, move)]
         rows.append({"appearance": name, "psnr": float(np.mean([metrics.psnr_of_mse(e) for e in errors]))})
     return {
         "data": dataset.name,
@@ -315,10 +316,6 @@ def measure(scene: Scene, dataset: datasets.Dataset) -> dict[str, Any]:
         ],
         "extrapolation": rows,
     }
-
-
-def _views(played: tuple[Scene, Move], views: Sequence[datasets.View]) -> tuple[Scene, Sequence[datasets.View], Move]:
-    return played[0], views, played[1]
 
 
 def write_sheet(scene: Scene, dataset: datasets.Dataset, folder: Path, rows: int = 6) -> Path:
