@@ -71,19 +71,26 @@ def tidy(
 
 
 def voters(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """Weights of members that say where a group is: opacity of those that can be seen and do not float apart. [n]
+    """Weights of members in their group's motion: their opacities, without those that float apart. [n]
+
+    Faint members have little say by their weight; to leave them out makes tracks worse (measured against true poses).
 
     Args:
         points: Centres at the last knot. [n, 3]
-        opacities: Where none can be seen, all are. [n]
+        opacities: [n]
     """
-    weights = np.where(opacities > SEEN_OPACITY, opacities, 0.0)
-    weights = weights if weights.any() else np.maximum(opacities, 1e-12)
+    weights = np.maximum(opacities, 1e-12)
     if len(points) == 0:
         return weights
-    counted = weights > 0
-    distances = np.linalg.norm(points - np.median(points[counted], axis=0), axis=1)
-    return np.where(distances <= FLOATING * np.quantile(distances[counted], 0.9), weights, 0.0)
+    seen = _seen(opacities)
+    distances = np.linalg.norm(points - np.median(points[seen], axis=0), axis=1)
+    return np.where(distances <= FLOATING * np.quantile(distances[seen], 0.9), weights, 0.0)
+
+
+def _seen(opacities: np.ndarray) -> np.ndarray:
+    """Which members can be seen; all, where none can. [n] bool"""
+    seen = opacities > SEEN_OPACITY
+    return seen if seen.any() else np.ones(len(opacities), bool)
 
 
 def radii(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Sequence[GroupTrack]) -> np.ndarray:
@@ -226,9 +233,9 @@ def _alone(
 
 
 def _voting(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, group: int) -> np.ndarray:
-    """Rows of the members of a group that vote."""
+    """Rows of the members of a group that say where it is: those that can be seen and do not float apart."""
     rows = np.flatnonzero(ids == group)
-    return rows[voters(points[rows], opacities[rows]) > 0]
+    return rows[(voters(points[rows], opacities[rows]) > 0) & _seen(opacities[rows])]
 
 
 def _distances(points: np.ndarray, members: np.ndarray, limit: float) -> np.ndarray:

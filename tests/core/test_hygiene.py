@@ -101,10 +101,10 @@ def test_what_moves_alike_far_away_stays_with_its_own():
     assert moves.moved == 0 and spread_of(groups, carried) < 0.01
 
 
-def test_faint_members_do_not_vote():
+def test_faint_members_have_little_say():
     path, ids, opacities = scene()
     draw = np.random.default_rng(1)
-    faint = draw.random(len(ids)) < 0.7
+    faint = draw.random(len(ids)) < 0.4
     opacities[faint] = 0.05
     wild = path + faint[:, None, None] * np.cumsum(draw.normal(size=path.shape), axis=1)
     wild[:, -1] = path[:, -1]
