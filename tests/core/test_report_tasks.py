@@ -33,8 +33,11 @@ FAMILY = ("static", "translation, quadratic", "constant twist", "hinge", "ballis
 
 
 def hurry(patch):
-    """One call a turn, and few motions to choose from: what is fitted how well is for the tests of the fit."""
+    """One call a turn, few frames, and few motions to choose from: what is fitted how well is for the tests of it."""
     patch.setattr(turns, "SAMPLE_MS", 0.0)
+    patch.setattr(image_rows, "FRAMES", 1)
+    patch.setattr(raster_rows, "VIEWS", 1)
+    patch.setattr(raster_rows, "SETTINGS", ({}, *({"alpha_min": a} for a in (1 / 1000, 4 / 255, 16 / 255))))
     patch.setattr(pose_rows, "MODELS", ("static", "hinge"))
     patch.setattr(candidates, "FAMILY", tuple(candidates.BY_NAME[name] for name in FAMILY))
 
@@ -216,13 +219,6 @@ def test_true_poses_are_the_oracle_of_a_scene_with_a_wrong_future(scene, data):
     assert only(rows, method="playback", error_kind="miou").error < 1
 
 
-def test_every_mode_is_shown_past_t_max_and_one_before(field, data):
-    rows, absent = image_rows.measure(field, data, ("test", "val"), 1, backend=BACKEND)
-    assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(playback.modes(field))
-    assert {row.mode for row in pick(rows, error_kind="psnr@val")} == {"rigid"}
-    assert any("up to t_max all are the same" in text for text in absent)
-
-
 def test_there_is_no_oracle_without_true_poses_at_the_times_of_the_views(scene, data):
     blind = dataclasses.replace(data, ground_truth=None)
     rows, absent = image_rows.measure(scene, blind, ("test",), 1, backend=BACKEND)
@@ -255,7 +251,7 @@ def test_without_a_data_set_the_cameras_of_the_scene_serve(scene):
 def report(field, data):
     with pytest.MonkeyPatch.context() as patch:
         hurry(patch)
-        return error_time.measure(field, data, rounds=1, backend=BACKEND)
+        return error_time.measure(field, data, rounds=1, backend=BACKEND, splits=("test", "val"))
 
 
 def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
@@ -277,6 +273,13 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
         assert word in text
     picture = images.read_png(by_name["report.png"])
     assert picture.ndim == 3 and picture.std() > 5
+
+
+def test_every_mode_is_shown_past_t_max_and_one_before(report, field):
+    rows = report_rows.from_dicts(report["rows"])
+    assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(playback.modes(field))
+    assert {row.mode for row in pick(rows, error_kind="psnr@val")} == {"rigid"}
+    assert any("up to t_max all are the same" in text for text in report["absent"])
 
 
 def test_every_task_has_a_front(report):
