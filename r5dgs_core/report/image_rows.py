@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -80,10 +81,10 @@ def measure(
         motion, raster = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend)
         for mode, move in plan.items():
             found = evaluate.measure(scene, views, move, backend=backend, measured=count)
-            label = {"mode": mode, "method": "playback"}
+            label: dict[str, Any] = {"mode": mode, "method": "playback"}
             if mode == ORACLE:  # nothing that could be chosen, so it is not timed and on no front
                 label = {"mode": "rigid", "method": ORACLE, "note": "motion is given, not predicted"}
-                times: dict[str, float] = {}
+                times: dict[str, Any] = {}
             else:
                 times = {"ms_motion": motion[mode].ms(clock), "ms_raster": raster[mode].ms(clock)}
                 times |= (motion[mode] + raster[mode]).columns(clock)

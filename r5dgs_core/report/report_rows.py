@@ -181,4 +181,5 @@ def kinds_of(rows: Sequence[Row]) -> list[str]:
 
 def from_dicts(rows: Sequence[dict[str, Any]]) -> list[Row]:
     """Inverse of `Row.to_dict`: numbers that were not measured become NaN."""
-    return [Row(**{name: math.nan if value is None else value for name, value in row.items()}) for row in rows]
+    found: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in row.items()} for row in rows]
+    return [Row(**values) for values in found]
