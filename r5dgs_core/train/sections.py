@@ -338,8 +338,8 @@ class ResidualSection:
     """
 
     start: float = 0.4
-    trial_steps: int = 150
-    threshold: float = 0.5
+    trial_steps: int = 300
+    threshold: float = 0.0
     nodes: int = 40
     size: float = 1e-3
     roughness: float = 0.01
