@@ -60,7 +60,8 @@ class Fit:
         sigma_t: Noise of the displacements, per component, world units.
         sigma_r: Noise of the rotations, per component, rad.
         band_tau: Times past t_max of `band`. [H]
-        band: Two standard deviations of the position of a point of the body, world units. [H]
+        band: Two standard deviations of the position of a point of the body, world units; wider by the held-out error
+            of the chosen candidate where that is above the noise. [H]
     """
 
     model: models.MotionModel
@@ -158,6 +159,9 @@ def fit(
     band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
     if rested:  # a body that came to rest may go on: twice the variance
         band = math.sqrt(2.0) * band
+    else:  # what was held out was missed by so many times the noise: so will be what follows
+        missed = tops[0].held_out if chosen.name == families.FREE_TOP.name else scores[chosen.name]
+        band = max(1.0, missed) * band
     return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
 
 

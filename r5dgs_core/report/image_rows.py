@@ -18,7 +18,6 @@ KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")
 FRAMES = 6  # of the views that are timed
 ORACLE = "true poses"
 _SAME = 1e-6
-TURNS_DEG = 5.0  # a body whose observed rotations are farther from the true ones is turned as the scene turns it
 Move = Callable[[float], playback.Frame]
 
 
@@ -138,7 +137,7 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
             return player.frame(t)
         k = int(np.abs(known - t).argmin())
         for body in bodies:
-            if body.group.role == "body" and body.turn_error_deg > TURNS_DEG:
+            if body.group.role == "body" and not body.turn_seen:
                 displacements[body.group.id] = body.path[k] - body.group.pivot
             elif body.group.role == "body":
                 q, d = true_poses.pose(body.group.pivot, body.motion[k])

@@ -202,7 +202,8 @@ def _band(
 ) -> tuple[list[Row], list[str]]:
     """Share of true errors that lie outside two standard deviations, over bodies and times that the band reaches.
 
-    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2.
+    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2; of one whose
+    rotation the images do not tell, that of its place.
     """
     inside, count, widths = 0, 0, []
     for body, fit in zip(bodies, chosen.fits, strict=True):
@@ -211,6 +212,9 @@ def _band(
         reached = taus <= fit.band_tau[-1] + _SAME
         truth = body.motion[np.isin(body.times, times)]
         distances, angles = metrics.pose_errors(_model_motion(body, fit.model, taus), truth, body.group.pivot)
+        if not body.turn_seen:  # its rotation says nothing, and so not how the scene's pivot lies in the true body
+            places = body.group.pivot + models.evaluate(fit.model, taus)[1]
+            distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
         errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * fit.model.radius) ** 2)
         band = np.interp(taus, fit.band_tau, fit.band)
         inside += int((errors <= band)[reached].sum())

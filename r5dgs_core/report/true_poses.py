@@ -19,6 +19,8 @@ from ..scene import playback
 from ..scene.scene import MotionGroup, Scene
 from . import metrics
 
+TURNS_DEG = 5.0
+
 
 @dataclass(frozen=True)
 class Body:
@@ -45,6 +47,11 @@ class Body:
     motion: np.ndarray
     path: np.ndarray
     turn_error_deg: float
+
+    @property
+    def turn_seen(self) -> bool:
+        """Whether the images told how it turns: the scene's rotations are within `TURNS_DEG` of the true ones."""
+        return self.turn_error_deg <= TURNS_DEG
 
 
 def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> tuple[Body, ...]:
