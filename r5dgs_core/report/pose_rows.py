@@ -202,8 +202,8 @@ def _band(
 ) -> tuple[list[Row], list[str]]:
     """Share of true errors that lie outside two standard deviations, over bodies and times that the band reaches.
 
-    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2; of one whose
-    rotation the images do not tell, that of its place.
+    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2; of one
+    whose rotation the images do not tell, that of its place.
     """
     inside, count, widths = 0, 0, []
     for body, fit in zip(bodies, chosen.fits, strict=True):
