@@ -160,8 +160,8 @@ def fit(
     if rested:  # a body that came to rest may go on: twice the variance
         band = math.sqrt(2.0) * band
     else:  # what was held out was missed by so many times the noise: so will be what follows
-        missed = tops[0].held_out if chosen.name == families.FREE_TOP.name else scores[chosen.name]
-        band = max(1.0, missed) * band
+        missed = next(row.held_out for row in (*tops, *table) if row.name == chosen.name)
+        band = max(1.0, missed if math.isfinite(missed) else 1.0) * band
     return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
 
 

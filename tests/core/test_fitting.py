@@ -240,6 +240,22 @@ def test_the_band_holds_the_true_error():
     assert (np.diff(fit.band) > 0).all()
 
 
+def test_the_band_is_wider_where_the_held_out_poses_surprised():
+    """Steady motion that bends in its last fifth, as no candidate of the first poses says."""
+    tau = (TIMES - TIMES[-1]) / (TIMES[-1] - TIMES[0])
+    steady = np.stack([TIMES, 0 * TIMES, 0 * TIMES], -1)
+    late = np.stack([0 * TIMES, 0.05 * RADIUS * np.maximum(tau + 0.2, 0) / 0.2, 0 * TIMES], -1)
+    noise = 0.002 * RADIUS * np.random.default_rng(0).standard_normal(steady.shape)
+    still = np.tile([1.0, 0, 0, 0], (len(TIMES), 1))
+    names = ("translation",)
+    calm, surprised = (
+        fitting.fit(TIMES, still, d - d[-1], radius=RADIUS, candidates=names)
+        for d in (steady + noise, steady + late + noise)
+    )
+    assert surprised.scores[0].held_out > 2 > calm.scores[0].held_out
+    assert (surprised.band > 2 * calm.band).all()
+
+
 def test_the_noise_is_estimated():
     fit, _ = fitted("hinge", np.random.default_rng(8), 0.004, 0.02)
     assert fit.sigma_t == pytest.approx(0.004, rel=0.4)
