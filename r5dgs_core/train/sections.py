@@ -339,7 +339,7 @@ class ResidualSection:
 
     start: float = 0.4
     trial_steps: int = 300
-    threshold: float = 0.0
+    threshold: float = 0.4
     nodes: int = 40
     size: float = 1e-3
     roughness: float = 0.01
