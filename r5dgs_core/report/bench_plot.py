@@ -50,7 +50,7 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
             kind = kinds.index((bench_tables.method(record), record["mode"]))
             marker = _MARKERS[scenes.index(record["scene"]) % len(_MARKERS)]
             x = ms / 1e3 if work == "training" else ms
-            axes.plot(x, psnr, marker, color=f"C{kind % 10}", alpha=0.8)
+            axes.plot(x, psnr, marker, color=_color(kind), alpha=0.8)
             right = max(right, x)
         low, high = axes.get_ylim()
         axes.set(
@@ -58,7 +58,7 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
         )
         axes.grid(alpha=0.3)
     handles = [
-        Line2D([], [], linestyle="", marker="o", color=f"C{i % 10}", label=f"{name}, {mode}")
+        Line2D([], [], linestyle="", marker="o", color=_color(i), label=f"{name}, {mode}")
         for i, (name, mode) in enumerate(kinds)
     ]
     handles += [
@@ -74,3 +74,11 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
     except OSError as error:
         raise ConfigError(f"{path}: the plot cannot be written: {error}") from error
     return path
+
+
+def _color(index: int) -> tuple[float, float, float, float]:
+    """Twenty colours that can be told apart, the strong ones first."""
+    import matplotlib
+
+    place = index % 20
+    return matplotlib.colormaps["tab20"](2 * place if place < 10 else 2 * (place - 10) + 1)
