@@ -366,8 +366,9 @@ def _band(
     slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
     covariance = _covariance(chosen, track, sigmas)
     spread = np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
-    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2.
-    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1)
+    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state, which
+    # all this starts from, is one of the poses and as noisy as they are.
+    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1) + 3 * sigmas[0] ** 2 + 2 * sigmas[1] ** 2
     others = [s for s in near if s.candidate.name != candidate.name]
     total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0
     for other in others:
