@@ -140,6 +140,7 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
         classifier_bias=bias,
         dynamics=None if motion is None or motion.dynamics is None else motion.dynamics[order],
         near_plane=foreign.near_plane,
+        harmonics_turn=False,
         **residuals,
         **rest,
     )

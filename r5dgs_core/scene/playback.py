@@ -206,8 +206,8 @@ class Player:
             group_quats=quats,
             group_displacements=displacements,
             origin=center,
-            turned_rows=moved.rows,
-            turned_quats=moved.turns,
+            turned_rows=moved.rows if scene.harmonics_turn else None,
+            turned_quats=moved.turns if scene.harmonics_turn else None,
         )
 
     def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:

@@ -122,6 +122,8 @@ class Scene:
         provenance: Configuration, data hash, versions.
         needs: The needs table: rows of ``name, value, threshold, decision, reason``.
         near_plane: Gaussians whose centre lies nearer than this depth are not drawn, as in training; world units.
+        harmonics_turn: Whether harmonics turn with Gaussians that turn on their own, too; those of other projects stay
+            in the world's frame.
     """
 
     name: str
@@ -159,6 +161,7 @@ class Scene:
     provenance: dict[str, Any] = field(default_factory=dict)
     needs: tuple[dict[str, Any], ...] = ()
     near_plane: float = NEAR_PLANE
+    harmonics_turn: bool = True
 
     @property
     def extent(self) -> float:

@@ -27,6 +27,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         "frames_per_unit": float(scene.frames_per_unit),
         "world_convention": scene.world_convention,
         "near_plane": float(scene.near_plane),
+        "harmonics_turn": bool(scene.harmonics_turn),
         "objects": [
             {
                 "id": o.id,
@@ -89,6 +90,7 @@ def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
         "provenance": get(data, "provenance", dict, place),
         "needs": tuple(each(data, "needs", lambda row, place: dict(row), place)),
         "near_plane": get(data, "near_plane", float, place) if "near_plane" in data else NEAR_PLANE,
+        "harmonics_turn": get(data, "harmonics_turn", bool, place) if "harmonics_turn" in data else True,
     }
 
 

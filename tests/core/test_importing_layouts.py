@@ -131,7 +131,7 @@ def test_trace_turns_before_the_canonical_rotation_and_flies_on(tmp_path, light)
     foreign.write_weights(folder / "deform" / "iteration_40000" / "deform.pth", deform | foreign.gate_weights())
     foreign.write_weights(folder / "deform" / "iteration_40000" / "vel.pth", velocity)
     scene = imported(folder, tmp_path, knots=KNOTS)
-    assert scene.t_max == T_MAX and playback.modes(scene) == ("rigid", "standard")
+    assert scene.t_max == T_MAX and playback.available(scene, "standard")
     assert scene.world_convention == "blender" and scene.near_plane == 0.8
 
     def rule(t: float) -> Drawn:
@@ -207,7 +207,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
     for name, weights in {"deform": deform, "vel": velocity, "code_field": codes}.items():
         foreign.write_weights(folder / f"{name}.pth", weights)
     scene = imported(tmp_path / "run", tmp_path, knots=KNOTS)
-    assert playback.modes(scene) == ("rigid", "standard")
+    assert playback.available(scene, "standard") and not playback.available(scene, "rigid_paper")
 
     def rule(t: float) -> Drawn:
         code, shares = code_and_shares(codes, cloud)
