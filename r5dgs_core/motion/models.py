@@ -39,6 +39,7 @@ _VECTORS = (
     "offset_displacement",
 )
 _STEP_TOLERANCE = 1e-9  # of the radius; Magnus-4 error of `world_twist`
+_MOST_STEPS = 1 << 20  # of these
 
 
 def _zeros() -> np.ndarray:
@@ -258,7 +259,7 @@ def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray,
     if kind == "world_twist":
         v, a, w, eps, _ = rates
         radii = np.array([model.radius for model in models])
-        return propagation.Propagator(np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii)
+        return propagation.Propagator(np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii, _MOST_STEPS)
     if kind == "free_top":
         return top.Tops(np.array([model.inertia for model in models]), rates[2]), frequencies
     return frequencies
@@ -390,7 +391,7 @@ def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
     flat = tau.reshape(-1)
     tolerance = _STEP_TOLERANCE * model.radius
     needed = se3.steps_needed(w, v, eps, a, flat, model.radius, tolerance)
-    steps = 1 << np.minimum(np.ceil(np.log2(needed)), 20).astype(np.int64)
+    steps = np.minimum(1 << np.ceil(np.log2(needed)).astype(np.int64), _MOST_STEPS)
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
     hopeless = needed >= se3.MOST_STEPS
     quats[hopeless] = np.nan

@@ -15,11 +15,11 @@ import math
 
 import numpy as np
 
-from . import columns, rotations
+from . import columns, rotations, se3
 
 log = logging.getLogger(__name__)
 
-MAX_STEPS = 512
+MAX_STEPS = 512  # of thousands of points, so that no frame takes for ever
 WILD = 1e12  # difficulty of a point that no number of steps follows
 CHUNK = 2048  # points at once: their columns stay in the cache
 _TINY = 1e-30
@@ -30,16 +30,24 @@ class Propagator:
 
     Points at rest are left out, twists without angular acceleration have a closed form, and the others take
     fourth-order Magnus steps, as many as their neighbours in difficulty need. Points whose dynamics are not finite or
-    lead beyond all numbers rest, with a warning; the others stay within the tolerance.
+    lead beyond all numbers rest, with a warning; the others stay within the tolerance as far as ``most_steps`` do.
 
     Args:
         dynamics: Velocity, angular velocity and the rates of both, about the centre of each point. [N, 12]
         tolerance: Largest allowed error of a point, in the units of its velocity times time, > 0. A number or [N]
         radius: Distance at which an error of the rotation counts as one of the point. A number or [N]
+        most_steps: Bound of the steps to any time, >= 1: beyond, errors grow above the tolerance.
     """
 
-    def __init__(self, dynamics: np.ndarray, tolerance: float | np.ndarray, radius: float | np.ndarray = 0.0):
+    def __init__(
+        self,
+        dynamics: np.ndarray,
+        tolerance: float | np.ndarray,
+        radius: float | np.ndarray = 0.0,
+        most_steps: int = MAX_STEPS,
+    ):
         state = np.asarray(dynamics)
+        self._most_steps = most_steps
         self.count = len(state)
         sound = np.isfinite(state).all(-1)
         moving = np.flatnonzero((state != 0).any(-1) & sound)
@@ -109,9 +117,9 @@ class Propagator:
         omitted, turning = self._omitted[i], self._turning[i]
         error = (omitted[0] + omitted[1] * span + omitted[2] * span**2) * span**5
         by_turn = (turning[0] + turning[1] * span) * span / 2
-        if not (math.isfinite(error) and math.isfinite(by_turn)):
-            return MAX_STEPS
-        return int(min(max(1, math.ceil(error**0.25), math.ceil(by_turn)), MAX_STEPS))
+        if not (error**0.25 < se3.MOST_STEPS and by_turn < se3.MOST_STEPS):  # no number of steps would do
+            return min(MAX_STEPS, self._most_steps)
+        return min(max(1, math.ceil(error**0.25), math.ceil(by_turn)), self._most_steps)
 
 
 @functools.cache

@@ -67,6 +67,17 @@ def test_many_models_at_once_are_each_by_itself(tau):
         models.evaluate_all(group, -0.1)
 
 
+@pytest.mark.parametrize("tau", [1.0, 10.0, 30.0])
+def test_far_in_the_future_twists_are_where_keys_put_them(tau):
+    rates = {"velocity": [1, 0, 0], "acceleration": [0, 1, 0]}
+    twist = MotionModel("world_twist", **rates, angular_velocity=[5, 0, 0], angular_acceleration=[0, 5, 0])
+    stack = models.Stack([twist])
+    quat, displacement = models.evaluate(twist, tau)
+    quats, displacements = stack.poses(tau)
+    assert rotations.angle_between(quats[0], quat) < 1e-8
+    np.testing.assert_allclose(displacements[0], displacement, rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_rates_are_the_exact_derivative(name):
     model, tau, h = with_offsets(CASES[name]), np.array([0.01, 0.4, 1.7]), 1e-6
