@@ -82,6 +82,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             return {"CANCELLED"}
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
         self.report({"INFO"}, f"{path.name}: {len(scene.means)} Gaussians, {named} objects")
+        if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say
+            count = len(scene.residual_rows)
+            self.report({"WARNING"}, f"{count} Gaussians bend while observed; here they move with their group alone")
         return {"FINISHED"}
 
     def draw(self, context):

@@ -79,6 +79,15 @@ def test_points_stand_where_playback_has_them_at_any_time(blender, tmp_path, con
     assert_plays_like_the_core(blender, load(blender, path), scene_file.read(path), TIMES)
 
 
+def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
+    scene = datasets.make_truth()
+    bending = datasets.breathing(scene, 0.3)
+    for name, wanted in (("rigid", scene), ("bending", bending)):
+        load(blender, scene_file.write(wanted, tmp_path / f"{name}.r5dgs"))
+        warned = f"{len(bending.residual_rows)} Gaussians bend" in capfd.readouterr().out
+        assert warned == (name == "bending")
+
+
 def test_frame_mapping_and_later_horizon_keep_playback(blender, scene_path):
     collection = load(blender, scene_path, frame_zero=-7.5, t_end=1.6)
     assert_plays_like_the_core(blender, collection, scene_file.read(scene_path), (*TIMES, 1.333, 1.6))
