@@ -113,6 +113,3 @@ def step_sizes(duration: float, step: float) -> list[float]:
         return []
     whole = math.copysign(step, duration)
     return [whole] * (count - 1) + [duration - whole * (count - 1)]
-
-
-_steps = step_sizes

@@ -18,6 +18,7 @@ from .report_rows import Row, spread
 MODELS = tuple(candidates.BY_NAME)  # tried one by one
 STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # what a swing is where nothing swings
 _SAME = 1e-9
+_LEAST_MOMENT = 1e-6  # share of the largest: members on a line have none about it, where a top needs some
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,10 @@ def _fit(scene: Scene, bodies: tuple[true_poses.Body, ...], names: tuple[str, ..
             continue
         first, last = group.seen or (-np.inf, np.inf)
         rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
-        # A free top is told by its shape; baking tries it no otherwise.
-        shape = top.inertia(scene.means[rows] - group.pivot, weights) if names == (candidates.FREE_TOP.name,) else None
+        # A free top is told by its shape, and offered by it where all motions are.
+        shape = None
+        if names is None or names == (candidates.FREE_TOP.name,):
+            shape = top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
         seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
         fits.append(
             fitting.fit(

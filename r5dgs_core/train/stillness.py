@@ -125,7 +125,7 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
 
 
 def _changes(first: TrainView, second: TrainView) -> bool:
-    """Whether two views of one camera differ by more than noise, in a block of pixels or in their masks' objects."""
+    """Whether two views of one camera differ by more than noise in a block of pixels."""
     difference = np.abs(_blocks(first.image) - _blocks(second.image))
     noise = max(1.4826 * float(np.median(difference)), NOTHING)
     return bool((difference > max(CHANGE, NOISE * noise)).any())
