@@ -467,10 +467,17 @@ def _dispatch(args: argparse.Namespace) -> int:
             args.target, args.data, modes=args.mode or ["rigid"], json_path=args.json, progress_kind=args.progress
         )
     elif args.command == "report":
+        measured = (args.target, args.out, args.tasks, args.splits, args.repeats)
+        if args.stability and any(given is not None for given in measured):
+            raise errors.ConfigError("report --stability: needs no scene; takes --json FILE alone")
+        if args.json is not None and not args.stability:
+            raise errors.ConfigError("report --json: is for --stability; a report's JSON goes to --out DIR/report.json")
         if args.stability:
             return 0 if run_stability(args.json, progress_kind=args.progress) else 1
         if args.target is None or args.out is None:
             raise errors.ConfigError("report: expected RUN|SCENE and --out DIR, or --stability")
+        if args.json is not None:
+            raise errors.ConfigError(f"--json {args.json}: goes with --stability; report.json is written to --out")
         options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "clock": args.clock}
         run_report(args.target, args.data, args.out, **options, progress_kind=args.progress)
     elif args.command == "bench":

@@ -314,3 +314,17 @@ def test_the_help_of_train_names_every_preset(capsys):
         cli.parser().parse_args(["train", "--help"])
     text = capsys.readouterr().out
     assert all(f"{name} " in text or f"{name}\n" in text for name in presets.PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--stability", "--out", "x"], "report --stability: needs no scene"),
+        (["scene.r5dgs", "--stability"], "report --stability: needs no scene"),
+        (["scene.r5dgs", "--out", "x", "--json", "x.json"], "report --json: is for --stability"),
+        (["scene.r5dgs"], "report: expected RUN|SCENE and --out DIR"),
+    ],
+)
+def test_a_report_refuses_what_it_would_not_heed(given, said, capsys):
+    assert cli.main(["report", *given]) == 1
+    assert said in capsys.readouterr().err
