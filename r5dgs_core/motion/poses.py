@@ -153,7 +153,7 @@ def _uncertainty(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Axes that the points leave open, and the covariance of the rotation, both in the source frame."""
     relative = weights / weights.max()
-    inertia = np.einsum("n,nij->ij", relative, _inertias(offsets))
+    inertia = np.einsum("n,nij->ij", relative, inertias(offsets))
     dof = max(3 * float(relative.sum()) - 6, 1.0)
     sigma2 = float(np.sum(relative * residuals**2)) / dof
     values, vectors = np.linalg.eigh(inertia)
@@ -167,7 +167,7 @@ def _uncertainty(
     return vectors[:, free].T.copy(), (vectors * variances) @ vectors.T
 
 
-def _inertias(offsets: np.ndarray) -> np.ndarray:
+def inertias(offsets: np.ndarray) -> np.ndarray:
     """|r|^2 I - r r^T of each point. [n, 3] -> [n, 3, 3]"""
     squares = (offsets**2).sum(-1)[:, None, None] * np.eye(3)
     return squares - offsets[:, :, None] * offsets[:, None, :]

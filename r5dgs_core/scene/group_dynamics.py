@@ -204,7 +204,7 @@ def _screw(
     for remaining in range(_ROUNDS, -1, -1):
         center, mean = current @ arms, current @ speeds
         x, u = arms - center, speeds - mean
-        values, axes = np.linalg.eigh(np.einsum("n,nij->ij", current, _inertias(x)))
+        values, axes = np.linalg.eigh(np.einsum("n,nij->ij", current, poses.inertias(x)))
         torque = current @ rotations.cross(x, u)
         floor = 1e-12 * max(float(values[-1]), 1e-300)
         w = axes @ (axes.T @ torque / np.maximum(values, floor))
@@ -221,11 +221,6 @@ def _screw(
         current = weights / (1 + (distances / scale) ** 2)
         current = current / current.sum()
     return mean - rotations.cross(w, center), w
-
-
-def _inertias(arms: np.ndarray) -> np.ndarray:
-    """|r|^2 I - r r^T of each point. [n, 3] -> [n, 3, 3]"""
-    return (arms**2).sum(-1)[:, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :]
 
 
 def _kabsch(
