@@ -476,8 +476,6 @@ def _dispatch(args: argparse.Namespace) -> int:
             return 0 if run_stability(args.json, progress_kind=args.progress) else 1
         if args.target is None or args.out is None:
             raise errors.ConfigError("report: expected RUN|SCENE and --out DIR, or --stability")
-        if args.json is not None:
-            raise errors.ConfigError(f"--json {args.json}: goes with --stability; report.json is written to --out")
         options = {"tasks": args.tasks, "splits": args.splits, "rounds": args.repeats, "clock": args.clock}
         run_report(args.target, args.data, args.out, **options, progress_kind=args.progress)
     elif args.command == "bench":
