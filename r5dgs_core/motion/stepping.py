@@ -7,10 +7,14 @@ import numpy as np
 from . import dynamics, rotations
 
 State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotations, v, w
+MOST_STEPS = 20000  # that are taken and kept; later times are those of the last one
 
 
 class SteppedPath:
     """`dynamics.rk2` of the same points at many times, to the bit.
+
+    A point that the midpoint rule throws beyond all numbers stays where it last was, and so does everything after
+    `MOST_STEPS`.
 
     Args:
         points: Where the points start. [..., 3]
@@ -31,7 +35,7 @@ class SteppedPath:
             raise ValueError(f"duration: expected a time >= 0, got {duration}")
         if duration == 0:
             return self._states[0][0], self._states[0][1]
-        steps = dynamics.step_sizes(duration, self._step)
+        steps = dynamics.step_sizes(min(duration, MOST_STEPS * self._step), self._step)
         while len(self._states) < len(steps):
             self._states.append(self._next(self._states[-1], self._step))
         points, quats, _, _ = self._next(self._states[len(steps) - 1], steps[-1])
@@ -40,6 +44,9 @@ class SteppedPath:
     def _next(self, state: State, h: float) -> State:
         """Points, rotations and twist a step later."""
         (points, quats, v, w), (a, e) = state, self._rates
-        points, turn = dynamics.rk2(points, v, w, a, e, h, h)
         half_v, half_w = 0.5 * h * a, 0.5 * h * e
-        return points, rotations.multiply(turn, quats), v + half_v + half_v, w + half_w + half_w
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved, turn = dynamics.rk2(points, v, w, a, e, h, h)
+            turned = rotations.multiply(turn, quats)
+        lost = ~(np.isfinite(moved).all(-1) & np.isfinite(turned).all(-1))[..., None]
+        return np.where(lost, points, moved), np.where(lost, quats, turned), v + half_v + half_v, w + half_w + half_w

@@ -103,7 +103,8 @@ def _of_models(
     sets = {
         name: [_model(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
     }
-    timed = turns.take({n: lambda s=s: models.evaluate_all(s, float(taus[-1])) for n, s in sets.items()}, rounds)
+    stacks = {name: models.Stack(some) for name, some in sets.items()}
+    timed = turns.take({name: lambda s=stack: s.poses(float(taus[-1])) for name, stack in stacks.items()}, rounds)
     rows = []
     for name, some in found.items():
         predicted = np.stack([_model_motion(b, m, taus) for b, m in zip(bodies, sets[name], strict=True)])

@@ -68,10 +68,11 @@ def reduce(name: str, times: np.ndarray, poses: np.ndarray, fit: fitting.Fit) ->
         model = dataclasses.replace(model, offset_displacement=np.zeros(3))
     travel = float(np.linalg.norm(poses[:, 4:], axis=1).max()) / size
     chosen = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
+    why = f"; goes with its motion, {chosen}" if bends and bend <= bend_allowed else ", likewise"
     rows = (
         _row(name, "motion", travel, 0.0, travel > 0 or turns, f"largest displacement in diameters; {chosen}"),
         _row(name, "rotation", turn, turn_allowed, turns, "spread of its turns, rad; threshold: that of noise"),
-        _row(name, "curved_path", bend, bend_allowed, bends, "distance from a straight path in diameters, likewise"),
+        _row(name, "curved_path", bend, bend_allowed, bends, "distance from a straight path in diameters" + why),
     )
     return PlainMotion(poses, shift, model, rows)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.motion import dynamics, propagation, rotations, se3
+from r5dgs_core.motion import dynamics, propagation, rotations, se3, stepping
 
 RNG = np.random.default_rng(0)
 STATE = RNG.normal(size=(5, 12)) * [1, 1, 1, 2, 2, 2, 1, 1, 1, 1, 1, 1]
@@ -128,3 +128,14 @@ def test_the_last_step_is_shorter_so_that_the_time_is_met():
     state = np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3))
     points, _ = dynamics.rk2(*state, 1.0, 0.3)
     np.testing.assert_allclose(points, 1.0, atol=1e-15)
+
+
+def test_a_path_that_explodes_stays_where_it_last_was_however_far_ahead():
+    start = np.zeros((2, 3))
+    v, w = np.array([[0.1, 0, 0], [0.1, 0, 0]]), np.array([[0, 0, 400.0], [0, 0, 0.5]])
+    path = stepping.SteppedPath(start, v, w, 0 * v, np.array([[300.0, 0, 0], [0, 0, 0]]), 1 / 60)
+    points, quats = path.at(1000.0)
+    assert np.isfinite(points).all() and np.isfinite(quats).all()
+    alone, _ = stepping.SteppedPath(start[1:], v[1:], w[1:], 0 * v[1:], 0 * v[1:], 1 / 60).at(1000.0)
+    np.testing.assert_array_equal(alone[0], points[1])
+    np.testing.assert_array_equal(path.at(1e6)[0], path.at(stepping.MOST_STEPS / 60)[0])
