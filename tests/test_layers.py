@@ -32,10 +32,11 @@ ALLOWED = {
     "progress": set(),
     "demo": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
     "bench": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
-    "cli": {
-        *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress", "demo"),
-        *("bench", "importing"),
+    "commands": {
+        *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
+        "importing",
     },
+    "cli": {"commands", "demo", "bench", "scene"},
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}

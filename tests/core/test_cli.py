@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core import __version__, cli, demo, progress
+from r5dgs_core import __version__, cli, commands, demo, progress
 from r5dgs_core.bench import variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
@@ -240,7 +240,7 @@ def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, t
     for target in made:
         caplog.clear()
         assert cli.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
-        assert [r.getMessage() for r in caplog.records if r.name == cli.__name__] == [
+        assert [r.getMessage() for r in caplog.records if r.name == commands.__name__] == [
             f"{other.root}: {target} was trained on other data; measured all the same"
         ]
 
