@@ -21,7 +21,6 @@ import numpy as np
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data.dataset import Dataset
-from r5dgs_core.motion import candidates, fitting
 from r5dgs_core.report import evaluate, image_rows, pose_rows
 from r5dgs_core.scene import playback
 from r5dgs_core.scene.scene import Scene
@@ -35,19 +34,8 @@ def refitted(scene: Scene, name: str) -> Scene:
     names = (name, pose_rows.STEADY[name]) if name in pose_rows.STEADY else (name,)
     groups = []
     for group in scene.groups:
-        track = scene.track_poses[group.id]
-        if group.role == "body" and np.any(track[:, 1:] != 0):
-            first, last = group.seen or (-np.inf, np.inf)
-            seen = (scene.track_times >= first - 1e-9) & (scene.track_times <= last + 1e-9)
-            fit = fitting.fit(
-                scene.track_times,
-                track[:, :4],
-                track[:, 4:],
-                radius=group.model.radius,
-                weights=seen.astype(np.float64),
-                candidates=names,
-            )
-            group = dataclasses.replace(group, model=fit.model)
+        if group.role == "body" and np.any(scene.track_poses[group.id][:, 1:] != 0):
+            group = dataclasses.replace(group, model=pose_rows.fit_group(scene, group, names).model)
         groups.append(group)
     return dataclasses.replace(scene, groups=tuple(groups))
 
@@ -61,11 +49,7 @@ def measure(folder: Path, split: str) -> dict[str, Any]:
     if scene.dynamics is not None:
         ways = {mode: playback.Player(scene, mode).frame for mode in playback.modes(scene)}
     else:
-        ways = {
-            name: playback.Player(refitted(scene, name)).frame
-            for name in pose_rows.MODELS
-            if name != candidates.FREE_TOP.name
-        }
+        ways = {name: playback.Player(refitted(scene, name)).frame for name in pose_rows.MODELS}
         ways["chosen"] = playback.Player(scene).frame
     views = dataset.views(split)
     oracle, why = image_rows.true_move(scene, dataset, [view.t for view in views])

@@ -11,7 +11,7 @@ import numpy as np
 from ..data.dataset import GroundTruth
 from ..motion import candidates, fitting, models, poses, top
 from ..scene import group_dynamics, playback
-from ..scene.scene import Scene
+from ..scene.scene import MotionGroup, Scene
 from . import metrics, true_poses, turns
 from .report_rows import Row, spread
 
@@ -121,31 +121,36 @@ def _of_models(
 
 def _fit(scene: Scene, bodies: tuple[true_poses.Body, ...], names: tuple[str, ...] | None) -> _Fitted:
     """Fit the tracks of the bodies as baking does, with one family of motions or several."""
-    started, fits = time.process_time(), []
-    for body in bodies:
-        group, track = body.group, scene.track_poses[body.group.id]
-        if group.role != "body":
-            fits.append(None)
-            continue
-        first, last = group.seen or (-np.inf, np.inf)
-        rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
-        # A free top is told by its shape, and offered by it where all motions are.
-        shape = None
-        if names is None or names == (candidates.FREE_TOP.name,):
-            shape = top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
-        seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
-        fits.append(
-            fitting.fit(
-                scene.track_times,
-                track[:, :4],
-                track[:, 4:],
-                radius=group.model.radius,
-                weights=seen.astype(np.float64),
-                candidates=names,
-                inertia=shape,
-            )
-        )
-    return _Fitted(tuple(fits), 1e3 * (time.process_time() - started))
+    started = time.process_time()
+    fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
+    return _Fitted(fits, 1e3 * (time.process_time() - started))
+
+
+def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -> fitting.Fit:
+    """Fit the track of a body as baking does.
+
+    Args:
+        scene: The scene.
+        group: Of role "body".
+        names: Motion models to choose from, of `MODELS`; all where None.
+    """
+    track = scene.track_poses[group.id]
+    first, last = group.seen or (-np.inf, np.inf)
+    rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
+    # A free top is told by its shape, and offered by it where all motions are.
+    shape = None
+    if names is None or names == (candidates.FREE_TOP.name,):
+        shape = top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
+    seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
+    return fitting.fit(
+        scene.track_times,
+        track[:, :4],
+        track[:, 4:],
+        radius=group.model.radius,
+        weights=seen.astype(np.float64),
+        candidates=names,
+        inertia=shape,
+    )
 
 
 def _model(body: true_poses.Body, fit: fitting.Fit | None) -> models.MotionModel:
