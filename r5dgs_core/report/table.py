@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rich import box
+from rich.console import Group
 from rich.table import Table
 
 # Rows of the table: key in METRICS, what the user reads, format.
@@ -22,25 +24,37 @@ _ROWS = (
     ("ms_raster", "rasterization, per frame (ms)", "{:.1f}"),
     ("images", "images", "{:d}"),
 )
+# With several modes, of which each is a row: the same, shorter.
+_SHORT = (
+    ("psnr", "PSNR", "{:.2f}"),
+    ("psnr_objects", "objects", "{:.2f}"),
+    ("ssim", "SSIM", "{:.4f}"),
+    ("flip", "FLIP", "{:.4f}"),
+    ("lpips", "LPIPS", "{:.4f}"),
+    ("miou", "mIoU", "{:.3f}"),
+    ("ms_motion", "motion", "{:.2f}"),
+    ("ms_raster", "raster", "{:.1f}"),
+)
 _CAPTION = "val: held-out views in the observed time; test: later times (as the data set splits them)"
 ABSENT = "not computed"
 
 
-def make(evaluation: dict[str, Any]) -> Table:
+def make(evaluation: dict[str, Any]) -> Table | Group:
     """Lay out an evaluation (`evaluate.evaluate`): images above, pose errors of the objects below.
 
     Args:
         evaluation: The evaluation, as in ``evaluation.json``.
 
     Returns:
-        The table, to print with rich.
+        The table, to print with rich; with several modes, one whose rows they are, and the poses below.
     """
     columns = [(split, mode, values) for split, modes in evaluation["splits"].items() for mode, values in modes.items()]
-    several = len({mode for _, mode, _ in columns}) > 1
+    if len({mode for _, mode, _ in columns}) > 1:
+        return Group(_of_modes(evaluation, columns), *_poses(evaluation))
     table = Table(title=_title(evaluation), title_justify="left", caption=_CAPTION, caption_justify="left")
     table.add_column("")
-    for split, mode, _ in columns:
-        table.add_column(f"{split} {mode}" if several else split, justify="right")
+    for split, _, _ in columns:
+        table.add_column(split, justify="right")
     padding = [""] * max(0, 2 - len(columns))
     for _ in padding:
         table.add_column("")
@@ -57,6 +71,38 @@ def make(evaluation: dict[str, Any]) -> Table:
         position, angle = f"{row['position_error']:.4f}", f"{row['rotation_error_deg']:.2f} deg"
         table.add_row(f"{row['name']} ({row['id']})", position, angle, *rest)
     return table
+
+
+def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[str, Any]]]) -> Table:
+    """A row for each split and mode; what was computed for none of them is left out."""
+    table = Table(title=_title(evaluation), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.caption, table.caption_justify = f"{_CAPTION}; motion and raster in ms per frame", "left"
+    shown = [entry for entry in _SHORT if any(metrics[entry[0]] is not None for _, _, metrics in rows)]
+    for name in ("", *(label for _, label, _ in shown)):
+        table.add_column(name, justify="right" if name else "left", no_wrap=True)
+    before = None
+    for split, mode, metrics in rows:
+        if split != before:
+            table.add_section()
+            table.add_row(f"[bold]{split}[/bold]")
+        cells = ("-" if metrics[key] is None else form.format(metrics[key]) for key, _, form in shown)
+        table.add_row(mode, *cells)
+        before = split
+    return table
+
+
+def _poses(evaluation: dict[str, Any]) -> list[Table]:
+    """Pose errors of the objects, which are those of mode "rigid" whatever else was played; none without true poses."""
+    rows = [row for row in evaluation["objects"] if row["position_error"] is not None]
+    if not rows:
+        return []
+    table = Table(title="pose at the last time, mode rigid", title_justify="left")
+    for name, side in (("", "left"), ("position error", "right"), ("rotation error", "right")):
+        table.add_column(name, justify=side)  # type: ignore[arg-type]
+    for row in rows:
+        errors = (f"{row['position_error']:.4f}", f"{row['rotation_error_deg']:.2f} deg")
+        table.add_row(f"{row['name']} ({row['id']})", *errors)
+    return [table]
 
 
 def needs(rows: Sequence[dict[str, Any]]) -> Table:

@@ -171,6 +171,17 @@ def test_the_table_shows_every_number_that_there_is(result):
     assert "LPIPS" not in text
 
 
+def test_several_modes_are_rows_that_fit_a_narrow_terminal(result):
+    modes = ("rigid", "rigid/least_squares", "hybrid", "standard")
+    splits = {split: {mode: found["rigid"] for mode in modes} for split, found in result["splits"].items()}
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(table.make({**result, "splits": splits}))
+    text = console.export_text()
+    assert all(text.count(f" {mode} ") == len(splits) for mode in modes[1:])
+    for word in ("PSNR", "SSIM", "mIoU", "motion", "100.00", "mug", "deg", "mode rigid"):
+        assert word in text
+
+
 def test_numbers_are_of_the_eight_bit_picture(scene):
     shown = evaluate.render(scene, scenes.orbit_camera(0.5, pictures.WIDTH, pictures.HEIGHT), 0.5, backend=BACKEND)
     np.testing.assert_allclose(shown.color * 255, np.rint(shown.color * 255), atol=1e-4)
