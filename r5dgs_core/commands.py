@@ -243,6 +243,9 @@ def run_report(
         scene = scene_file.read(target)
         dataset = None if data is None else datasets.read(data)
         trained_on = scene.provenance.get("dataset_digest")
+    if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
+        given = " ".join(tasks)
+        raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
     with make(progress_kind) as progress:

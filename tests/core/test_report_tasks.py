@@ -314,6 +314,10 @@ def test_the_command_reports_a_scene_file(scene, data, tmp_path, capsys):
     assert cli.main([*given, "--tasks", "dynamics", "poses", "--progress", "none"]) == 0
     assert "written" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"report.json", "report.csv", "report.md", "report.png"}
+    alone = ["report", str(path), "--out", str(tmp_path / "alone"), "--tasks", "images"]
+    assert cli.main([*alone, "--progress", "none"]) == 1
+    assert f"--tasks images: needs the data set: r5dgs report {path} DATA" in capsys.readouterr().err
+    assert not (tmp_path / "alone").exists()
 
 
 @pytest.mark.parametrize(
