@@ -9,31 +9,20 @@ from rich import box
 from rich.console import Group
 from rich.table import Table
 
-# Rows of the table: key in METRICS, what the user reads, format.
-_ROWS = (
-    ("psnr", "PSNR, mean over images (dB)", "{:.2f}"),
-    ("psnr_pooled", "PSNR of the pooled error (dB)", "{:.2f}"),
-    ("psnr_objects", "PSNR on object pixels (dB)", "{:.2f}"),
-    ("ssim", "SSIM", "{:.4f}"),
-    ("ssim_objects", "SSIM on object pixels", "{:.4f}"),
-    ("flip", "FLIP (less is better)", "{:.4f}"),
-    ("lpips", "LPIPS (less is better)", "{:.4f}"),
-    ("miou", "mIoU, same ids", "{:.3f}"),
-    ("miou_matched", "mIoU, matched ids", "{:.3f}"),
-    ("ms_motion", "motion, per frame (ms)", "{:.2f}"),
-    ("ms_raster", "rasterization, per frame (ms)", "{:.1f}"),
-    ("images", "images", "{:d}"),
-)
-# With several modes, of which each is a row: the same, shorter.
-_SHORT = (
-    ("psnr", "PSNR", "{:.2f}"),
-    ("psnr_objects", "objects", "{:.2f}"),
-    ("ssim", "SSIM", "{:.4f}"),
-    ("flip", "FLIP", "{:.4f}"),
-    ("lpips", "LPIPS", "{:.4f}"),
-    ("miou", "mIoU", "{:.3f}"),
-    ("ms_motion", "motion", "{:.2f}"),
-    ("ms_raster", "raster", "{:.1f}"),
+# What the tables show: key in METRICS, what the user reads, its short form in rows of modes ("": left out), format.
+_SHOWN = (
+    ("psnr", "PSNR, mean over images (dB)", "PSNR", "{:.2f}"),
+    ("psnr_pooled", "PSNR of the pooled error (dB)", "", "{:.2f}"),
+    ("psnr_objects", "PSNR on object pixels (dB)", "objects", "{:.2f}"),
+    ("ssim", "SSIM", "SSIM", "{:.4f}"),
+    ("ssim_objects", "SSIM on object pixels", "", "{:.4f}"),
+    ("flip", "FLIP (less is better)", "FLIP", "{:.4f}"),
+    ("lpips", "LPIPS (less is better)", "LPIPS", "{:.4f}"),
+    ("miou", "mIoU, same ids", "mIoU", "{:.3f}"),
+    ("miou_matched", "mIoU, matched ids", "", "{:.3f}"),
+    ("ms_motion", "motion, per frame (ms)", "motion", "{:.2f}"),
+    ("ms_raster", "rasterization, per frame (ms)", "raster", "{:.1f}"),
+    ("images", "images", "", "{:d}"),
 )
 _CAPTION = "val: held-out views in the observed time; test: later times (as the data set splits them)"
 ABSENT = "not computed"
@@ -58,7 +47,7 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
     padding = [""] * max(0, 2 - len(columns))
     for _ in padding:
         table.add_column("")
-    for key, label, form in _ROWS:
+    for key, label, _, form in _SHOWN:
         values = [metrics[key] for _, _, metrics in columns]
         if any(value is not None for value in values):
             table.add_row(label, *(ABSENT if value is None else form.format(value) for value in values), *padding)
@@ -77,8 +66,12 @@ def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[st
     """A row for each split and mode; what was computed for none of them is left out."""
     table = Table(title=_title(evaluation), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.caption, table.caption_justify = f"{_CAPTION}; motion and raster in ms per frame", "left"
-    shown = [entry for entry in _SHORT if any(metrics[entry[0]] is not None for _, _, metrics in rows)]
-    for name in ("", *(label for _, label, _ in shown)):
+    shown = [
+        (key, short, form)
+        for key, _, short, form in _SHOWN
+        if short and any(metrics[key] is not None for _, _, metrics in rows)
+    ]
+    for name in ("", *(short for _, short, _ in shown)):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)
     before = None
     for split, mode, metrics in rows:

@@ -19,7 +19,7 @@ from torch import Tensor
 from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
-from . import gating, motion_clusters, representation
+from . import gating, motion_clusters, needs, representation
 from .config import Config
 from .field import FieldRepresentation
 from .posing import Splats
@@ -36,14 +36,6 @@ SPECK = 0.1  # smaller pieces of a mask are dropped, as a share of its largest p
 CAP = 12000  # Gaussians of the short run
 
 
-def wanted(dataset: Dataset, config: Config) -> bool:
-    """Whether a run looks for what moves: it starts with tracks, there is no mask, and there are several times."""
-    tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
-    unmasked = all(view.mask_path is None for view in dataset.train)
-    several = len({view.t for view in dataset.train}) > 1
-    return tracks and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
-
-
 def find(
     dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
 ) -> list[np.ndarray] | None:
@@ -55,12 +47,13 @@ def find(
         progress: Called with an event when it begins and when it ends.
 
     Returns:
-        Ids per pixel, 0 for what rests [H, W], for each training view; None where `wanted` says no or nothing moves.
+        Ids per pixel, 0 for what rests [H, W], for each training view; None where `needs.discovery`
+        says no or nothing moves.
 
     Raises:
         DatasetError, TrainingError: As of a run.
     """
-    if not wanted(dataset, config):
+    if not needs.discovery(dataset, config):
         return None
     progress = progress or (lambda event: None)
     progress({"event": "prepare", "text": "no masks: looking for what moves"})

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError
-from ..model import deformation, spherical_harmonics
+from ..model import deformation, group_poses, spherical_harmonics
 from ..model.gaussians import Gaussians
-from ..model.tracks import GroupPoses, Tracks
+from ..model.tracks import Tracks
 from ..model.trd import SHAPES as TRD_SHAPES
 from ..model.trd import TRD
 from ..motion import rotations
@@ -133,7 +133,7 @@ class FieldRepresentation:
             torch.zeros(len(gaussians), 3),
             torch.zeros(3),
             torch.zeros(len(gaussians), dtype=torch.int64),
-            _pinned(),
+            group_poses.at_rest(1),
             torch.zeros(1, 3),
         )
 
@@ -259,11 +259,6 @@ class FieldRepresentation:
             tensors["light"].numpy().astype(np.float64),
             config.needs.regrouping,
         )
-
-
-def _pinned() -> GroupPoses:
-    """The pose of one group that rests."""
-    return GroupPoses(torch.tensor([[1.0, 0, 0, 0]]), torch.eye(3)[None], torch.zeros(1, 3))
 
 
 def _motion_of(times: np.ndarray, config: Config) -> Motion:

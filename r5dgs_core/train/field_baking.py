@@ -103,8 +103,9 @@ def observed_motion(
         if len(shadows) == 0:  # none was made in training, yet the floor may imitate some
             casters = hygiene.imitators(path, own, opacities, groups, normal)
             shadows = np.unique(casters[casters > 0]).tolist()
-            own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
-            own, groups, moves = hygiene.tidy(path, own, opacities, fit, made_for)
+            if shadows:
+                own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
+                own, groups, moves = hygiene.tidy(path, own, opacities, fit, made_for)
         motion_ids[rows.numpy()] = own
     points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
     return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points, moves=moves)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..data.dataset import Dataset
 from ..motion import rotations
 from ..scene.scene import MotionGroup
 from .config import Config
@@ -46,6 +47,14 @@ def resolve(config: Config) -> Config:
     if wanted.rotation == "off":
         changes["rates.rotvecs"] = 0.0
     return config.replace(**changes)
+
+
+def discovery(dataset: Dataset, config: Config) -> bool:
+    """Whether a run looks for what moves: it starts with tracks, there is no mask, and there are several times."""
+    tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
+    unmasked = all(view.mask_path is None for view in dataset.train)
+    several = len({view.t for view in dataset.train}) > 1
+    return tracks and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
 
 
 def is_pinned(role: str, poses: np.ndarray, radius: float, wanted: NeedsSection) -> bool:
@@ -148,10 +157,16 @@ def _said(moves: Moves | None) -> str:
 
 
 def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:
+    """`row`, with the user's word."""
     if wanted != "auto":
         on = wanted == "on" and there
         missing = wanted == "on" and not there
         reason = f"set {wanted} by you{', but this run has none' if missing else ''}; {reason}"
+    return row(name, value, threshold, on, reason)
+
+
+def row(name: str, value: float, threshold: float, on: bool, reason: str) -> dict[str, Any]:
+    """A row of the table."""
     return {
         "name": name,
         "value": float(value),

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..motion import candidates, fitting, rotations
 from ..motion.models import MotionModel
+from . import needs
 
 WITHIN = 2.0  # noise levels that may be dropped
 LIMIT = 0.01  # root mean square that may be dropped: displacements in diameters
@@ -70,24 +71,13 @@ def reduce(name: str, times: np.ndarray, poses: np.ndarray, fit: fitting.Fit) ->
     chosen = f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
     why = f"; goes with its motion, {chosen}" if bends and bend <= bend_allowed else ", likewise"
     rows = (
-        _row(name, "motion", travel, 0.0, travel > 0 or turns, f"largest displacement in diameters; {chosen}"),
-        _row(name, "rotation", turn, turn_allowed, turns, "spread of its turns, rad; threshold: that of noise"),
-        _row(name, "curved_path", bend, bend_allowed, bends, "distance from a straight path in diameters" + why),
+        needs.row("motion", travel, 0.0, travel > 0 or turns, f"largest displacement in diameters; {chosen}"),
+        needs.row("rotation", turn, turn_allowed, turns, "spread of its turns, rad; threshold: that of noise"),
+        needs.row("curved_path", bend, bend_allowed, bends, "distance from a straight path in diameters" + why),
     )
-    return PlainMotion(poses, shift, model, rows)
+    return PlainMotion(poses, shift, model, tuple({"object": name, **row} for row in rows))
 
 
 def _spread(vectors: np.ndarray) -> float:
     """Root mean square per component. [S, 3]"""
     return float(np.sqrt((vectors**2).mean()))
-
-
-def _row(owner: str, name: str, value: float, threshold: float, on: bool, reason: str) -> dict[str, Any]:
-    return {
-        "object": owner,
-        "name": name,
-        "value": float(value),
-        "threshold": float(threshold),
-        "decision": "on" if on else "off",
-        "reason": reason,
-    }

@@ -18,7 +18,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, mask_stack, probing, stopping
+from . import checkpoint, curves, identity, mask_stack, needs, probing, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -131,9 +131,9 @@ def _found_masks(
 ) -> list[np.ndarray] | None:
     """Masks of what moves where the data set has none: those that the run began with, or found now."""
     if state is None:
-        if len({view.t for view in dataset.train}) < 2 or any(view.mask_path is not None for view in dataset.train):
+        if not needs.discovery(dataset, config):
             return None
-        from . import discovery
+        from . import discovery  # with the networks of its short run, which others do without
 
         return discovery.find(dataset, config, progress)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]

@@ -121,12 +121,16 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
         of_camera.setdefault(sweep.camera_key(view.camera), []).append(view)
     if any(len({view.t for view in group}) < 2 for group in of_camera.values()):
         return False
-    return not any(_changes(group[0], view) for group in of_camera.values() for view in group[1:])
+    for first, *others in of_camera.values():
+        blocks = _blocks(first.image)
+        if any(_changes(blocks, _blocks(view.image)) for view in others):
+            return False
+    return True
 
 
-def _changes(first: TrainView, second: TrainView) -> bool:
-    """Whether two views of one camera differ by more than noise in a block of pixels."""
-    difference = np.abs(_blocks(first.image) - _blocks(second.image))
+def _changes(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two images of one camera, as blocks, differ by more than noise in a block."""
+    difference = np.abs(first - second)
     noise = max(1.4826 * float(np.median(difference)), NOTHING)
     return bool((difference > max(CHANGE, NOISE * noise)).any())
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from ..model.group_poses import GroupPoses
+from ..model import group_poses
 from ..raster import warming
 from . import losses, posing
 
@@ -35,8 +35,7 @@ def warm_up(progress: Callable[[str], object] | None = None) -> float:
 
 
 def _poses() -> None:
-    row, quat = torch.ones(1, 3, requires_grad=True), torch.ones(1, 4)
-    group = GroupPoses(quat, torch.eye(3)[None], torch.zeros(1, 3))
+    row, quat, group = torch.ones(1, 3, requires_grad=True), torch.ones(1, 4), group_poses.at_rest(1)
     ids = torch.zeros(1, dtype=torch.int64)
     splats = posing.pose(row, quat, row, torch.ones(1), row, row, torch.ones(3), ids, group, torch.zeros(1, 3))
     splats.means.sum().backward()

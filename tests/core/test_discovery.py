@@ -11,7 +11,7 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import validation
-from r5dgs_core.train import bake, checkpoint, discovery, mask_stack, run
+from r5dgs_core.train import bake, checkpoint, discovery, mask_stack, needs, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -48,13 +48,13 @@ def test_what_moves_is_found_and_told_apart(unmasked, tiny):
 
 def test_a_run_looks_only_where_it_has_to(unmasked, tiny):
     config = tiny_datasets.settings()
-    assert discovery.wanted(datasets.read(unmasked.root), config)
-    assert not discovery.wanted(datasets.read(tiny.root), config)
+    assert needs.discovery(datasets.read(unmasked.root), config)
+    assert not needs.discovery(datasets.read(tiny.root), config)
     for off in ("discovery.iterations=0", "needs.tracks='off'", "train.representation='field'"):
-        assert not discovery.wanted(datasets.read(unmasked.root), tiny_datasets.settings(off))
+        assert not needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
         assert discovery.find(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
     field = tiny_datasets.settings("train.representation='field'", "field.tracks_share=0.2")
-    assert discovery.wanted(datasets.read(unmasked.root), field)
+    assert needs.discovery(datasets.read(unmasked.root), field)
 
 
 def test_where_nothing_moves_no_masks_are_made(unmasked, monkeypatch):
