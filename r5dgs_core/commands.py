@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from . import errors
 
 if TYPE_CHECKING:
+    from .data.dataset import Dataset
     from .scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -108,11 +109,10 @@ def run_evaluate(
     """
     from rich.console import Console
 
-    from .data import dataset as datasets
     from .progress import make
     from .report import evaluate, table
-    from .scene import playback, scene_file
-    from .train import bake, checkpoint
+    from .scene import playback
+    from .train import checkpoint
 
     for mode in modes:
         try:
@@ -120,24 +120,10 @@ def run_evaluate(
         except ValueError:
             raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
     _check_json(json_path)
-    trained_on = None
-    if target.is_dir():
-        run = checkpoint.open_run(target)
-        dataset = datasets.read(run.data(data))
-        scene = bake.bake(run, dataset)
-        trained_on = run.digest
-        default = target / checkpoint.EVALUATION_FILE
-    else:
-        scene = scene_file.read(target)
-        if data is None:
-            raise errors.DatasetError(
-                f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR"
-            )
-        dataset = datasets.read(data)
-        trained_on = scene.provenance.get("dataset_digest")
-        default = target.with_suffix(".evaluation.json")
-    if trained_on is not None and trained_on != dataset.digest:
-        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+    scene, dataset = _open(target, data)
+    if dataset is None:
+        raise errors.DatasetError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
+    default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
     for mode in modes:
         if not playback.available(scene, mode):
             raise errors.ConfigError(f"--mode {mode}: {target} has data for {', '.join(playback.modes(scene))} only")
@@ -189,6 +175,25 @@ def run_stability(json_path: Path | None = None, *, progress_kind: str = "none")
     return all(row.passed for row in rows)
 
 
+def _open(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]:
+    """The scene of a run folder or a scene file, and the data set: of a file only where it is named."""
+    from .data import dataset as datasets
+    from .scene import scene_file
+    from .train import bake, checkpoint
+
+    if target.is_dir():
+        run = checkpoint.open_run(target)
+        dataset = datasets.read(run.data(data))
+        scene, trained_on = bake.bake(run, dataset), run.digest
+    else:
+        scene = scene_file.read(target)
+        dataset = None if data is None else datasets.read(data)
+        trained_on = scene.provenance.get("dataset_digest")
+    if dataset is not None and trained_on is not None and trained_on != dataset.digest:
+        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+    return scene, dataset
+
+
 def _check_json(path: Path | None) -> None:
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
@@ -224,8 +229,6 @@ def run_report(
     from .data import dataset as datasets
     from .progress import make
     from .report import error_time, report_rows, report_table
-    from .scene import scene_file
-    from .train import bake, checkpoint
 
     for kind, given, known in (("tasks", tasks, report_rows.TASKS), ("splits", splits, datasets.SPLITS)):
         for name in given or ():
@@ -235,19 +238,10 @@ def run_report(
         raise errors.ConfigError(f"--repeats {rounds}: expected 1 or more")
     if out.exists() and not out.is_dir():
         raise errors.ConfigError(f"--out {out}: expected a folder, or nothing yet; found a file")
-    if target.is_dir():
-        run = checkpoint.open_run(target)
-        dataset = datasets.read(run.data(data))
-        scene, trained_on = bake.bake(run, dataset), run.digest
-    else:
-        scene = scene_file.read(target)
-        dataset = None if data is None else datasets.read(data)
-        trained_on = scene.provenance.get("dataset_digest")
+    scene, dataset = _open(target, data)
     if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
         given = " ".join(tasks)
         raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")
-    if dataset is not None and trained_on is not None and trained_on != dataset.digest:
-        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
     with make(progress_kind) as progress:
         result = error_time.measure(
             scene,

@@ -15,7 +15,6 @@ from torch import Tensor
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "shading")
 # What only some runs train: identity encodings.
 OPTIONAL = ("identities",)
-SEEN_OPACITY = 0.3  # fainter Gaussians do not say where an object is
 
 
 class Gaussians:

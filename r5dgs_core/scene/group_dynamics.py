@@ -13,10 +13,10 @@ import numpy as np
 
 from ..motion import keyframes, models, poses, propagation, rotations, se3
 from ..motion.models import STATIC, MotionModel
+from . import visibility
 from .scene import MotionGroup, Scene
 
 SOURCES = ("fitted", "representative", "median", "least_squares", "kabsch")
-VOTING_OPACITY = 0.3  # fainter members do not vote where others do
 HORIZON = 1 / 3  # of the observed span: how far past t_max members of "kabsch" are followed
 _FUTURES = 6  # times within it
 _ROUNDS = 6  # of reweighting
@@ -39,8 +39,8 @@ def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
     Raises:
         ValueError: There is no such source, or the scene has no dynamics.
 
-    Source: "representative" is the anchor of the R5DGS paper. Members fainter than `VOTING_OPACITY` do not vote, and
-        fits are weighted by opacity and robust (Cauchy).
+    Source: "representative" is the anchor of the R5DGS paper. Members fainter than
+        `visibility.SEEN_OPACITY` do not vote, and fits are weighted by opacity and robust (Cauchy).
     """
     if source not in SOURCES:
         raise ValueError(f"source: expected one of {', '.join(SOURCES)}, got {source!r}")
@@ -122,9 +122,7 @@ def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Those of some Gaussians that are opaque enough to vote, all where none is, and their opacities. [n] each"""
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
-    seen = opacities > VOTING_OPACITY
-    if not seen.any():
-        seen[:] = True
+    seen = visibility.seen(opacities)
     return rows[seen], np.maximum(opacities[seen], 1e-12)
 
 

@@ -20,10 +20,9 @@ from ..data import dataset as datasets
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
-from ..model.gaussians import SEEN_OPACITY
 from ..motion import fitting, gravity, rotations, top
 from ..motion.models import MotionModel
-from ..scene import residuals
+from ..scene import residuals, visibility
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 from . import checkpoint, falling, groups, mask_stack, needs, plain_motion, point_baking, representation, track_checks
 from . import shading as shading_vectors
@@ -273,7 +272,7 @@ def _bind(
         if group.role == "body" and np.any(poses[:, 1:] != 0):
             track_checks.warn_of_aliasing(names[group.object_id], motion.times, poses)
             track = gravity.Track(motion.times, poses[:, :4], poses[:, 4:], group.observed.astype(np.float64))
-            body = top.inertia(cloud.means[members][_voters(opacities[members])])
+            body = top.inertia(cloud.means[members][visibility.seen(opacities[members])])
             fit = fitting.fit(
                 track.times, track.quats, track.displacements, radius=radius, weights=track.weights, inertia=body
             )
@@ -309,21 +308,15 @@ def _radius(means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> floa
     """Distance from the pivot that holds nine of ten members that can be seen."""
     if len(means) == 0:
         return 1.0
-    return max(float(np.quantile(np.linalg.norm(means - pivot, axis=1)[_voters(opacities)], 0.9)), 1e-9)
+    return max(float(np.quantile(np.linalg.norm(means - pivot, axis=1)[visibility.seen(opacities)], 0.9)), 1e-9)
 
 
 def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> int:
     """Row of the member nearest to the pivot among those that can be seen, -1 without members."""
     if len(rows) == 0:
         return -1
-    distance = np.where(_voters(opacities), np.linalg.norm(means - pivot, axis=1), np.inf)
+    distance = np.where(visibility.seen(opacities), np.linalg.norm(means - pivot, axis=1), np.inf)
     return int(rows[np.argmin(distance)])
-
-
-def _voters(opacities: np.ndarray) -> np.ndarray:
-    """Members that say where a group is: those that can be seen, or all where none can. [N] bool"""
-    seen = opacities > SEEN_OPACITY
-    return seen if seen.any() else np.ones(len(opacities), bool)
 
 
 def _motion_group(

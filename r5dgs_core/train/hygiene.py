@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import spatial
 
-from ..model.gaussians import SEEN_OPACITY
 from ..motion import rotations
+from ..scene import visibility
 from .groups import GroupTrack, Moves
 
 log = logging.getLogger(__name__)
@@ -82,15 +82,9 @@ def voters(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     weights = np.maximum(opacities, 1e-12)
     if len(points) == 0:
         return weights
-    seen = _seen(opacities)
+    seen = visibility.seen(opacities)
     distances = np.linalg.norm(points - np.median(points[seen], axis=0), axis=1)
     return np.where(distances <= FLOATING * np.quantile(distances[seen], 0.9), weights, 0.0)
-
-
-def _seen(opacities: np.ndarray) -> np.ndarray:
-    """Which members can be seen; all, where none can. [n] bool"""
-    seen = opacities > SEEN_OPACITY
-    return seen if seen.any() else np.ones(len(opacities), bool)
 
 
 def radii(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Sequence[GroupTrack]) -> np.ndarray:
@@ -235,7 +229,7 @@ def _alone(
 def _voting(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, group: int) -> np.ndarray:
     """Rows of the members of a group that say where it is: those that can be seen and do not float apart."""
     rows = np.flatnonzero(ids == group)
-    return rows[(voters(points[rows], opacities[rows]) > 0) & _seen(opacities[rows])]
+    return rows[(voters(points[rows], opacities[rows]) > 0) & visibility.seen(opacities[rows])]
 
 
 def _distances(points: np.ndarray, members: np.ndarray, limit: float) -> np.ndarray:

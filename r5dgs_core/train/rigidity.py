@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..model.gaussians import SEEN_OPACITY
 from ..motion import rotations
+from ..scene.visibility import SEEN_OPACITY
 
 QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
 SOFTENING = 1e-6  # length that keeps the slope of a distance finite at 0
