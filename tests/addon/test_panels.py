@@ -9,43 +9,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
-
-PANELS = ("R5DGS_PT_scene", "R5DGS_PT_prompt", "R5DGS_PT_preview", "R5DGS_PT_capture")
-
-
-class Layout:
-    """Stands in for `UILayout`, which exists only while a window is drawn: keeps what is said, refuses what is not."""
-
-    def __init__(self, bpy, said):
-        self.bpy, self.said = bpy, said
-
-    def row(self, **_):
-        return Layout(self.bpy, self.said)
-
-    column = box = row
-
-    def label(self, text="", icon="NONE"):
-        assert icon in self.bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items
-        self.said.append(text)
-
-    def prop(self, data, name, **_):
-        assert name in data.bl_rna.properties
-        self.said.append(name)
-
-    def operator(self, idname, text="", icon="NONE"):
-        module, name = idname.split(".")
-        properties = getattr(getattr(self.bpy.ops, module), name).get_rna_type().properties
-        self.said.append(idname)
-        return SetOnly({p.identifier for p in properties})
-
-
-class SetOnly:
-    def __init__(self, names):
-        object.__setattr__(self, "names", names)
-
-    def __setattr__(self, name, value):
-        assert name in self.names
+from tests import layouts, scenes
 
 
 @pytest.fixture
@@ -53,12 +17,7 @@ def sidebar(blender):
     panels = importlib.import_module("r5dgs.r5dgs_addon.panels")
 
     def draw():
-        said = []
-        for name in PANELS:
-            panel = getattr(panels, name)
-            if not hasattr(panel, "poll") or panel.poll(blender.context):
-                panel.draw(SimpleNamespace(layout=Layout(blender, said)), blender.context)
-        return said
+        return layouts.draw(blender, *(panel for module in panels.MODULES for panel in module.CLASSES))
 
     return draw
 
@@ -106,7 +65,7 @@ def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender
         ours = [function for function in functions if function.__module__.startswith("r5dgs.")]
         said = []
         for function in ours:
-            function(SimpleNamespace(layout=Layout(blender, said)), blender.context)
+            function(SimpleNamespace(layout=layouts.Layout(blender, said)), blender.context)
         assert said == [operator]
     handler = blender.types.R5DGS_FH_scene
     assert (handler.bl_import_operator, handler.bl_file_extensions) == ("r5dgs.load_scene", ".r5dgs")

@@ -1,0 +1,21 @@
+"""The sidebar of the 3D view: tab R5DGS. Each module lists its panels in ``CLASSES``, in the order of the sidebar."""
+
+import bpy
+
+from . import capture, preview, prompt, scene
+
+MODULES = (scene, prompt, preview, capture)
+
+
+def register():
+    """Register the panels."""
+    for module in MODULES:
+        for cls in module.CLASSES:
+            bpy.utils.register_class(cls)
+
+
+def unregister():
+    """Undo `register`."""
+    for module in reversed(MODULES):
+        for cls in reversed(module.CLASSES):
+            bpy.utils.unregister_class(cls)

@@ -1,0 +1,27 @@
+"""Panel *Preview*."""
+
+import bpy
+
+from .. import worker
+from . import sidebar
+
+
+class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
+    """Render what Blender shows in the worker."""
+
+    bl_idname = "R5DGS_PT_preview"
+    bl_label = "Preview"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.operator("r5dgs.preview", icon="RENDER_STILL")
+        if worker.notice():
+            layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
+        session = context.window_manager.r5dgs
+        if session.preview_size:
+            layout.label(text=f"{session.preview_size} in {session.preview_ms:.0f} ms", icon="TIME")
+        if context.scene.camera is None:
+            layout.label(text="The scene has no camera", icon="INFO")
+
+
+CLASSES = (R5DGS_PT_preview,)

@@ -1,0 +1,38 @@
+"""Panel *Scene*: load one and see what it holds."""
+
+import bpy
+
+from .. import objects, timeline
+from . import sidebar
+
+
+class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
+    """Load a scene and see what it holds."""
+
+    bl_idname = "R5DGS_PT_scene"
+    bl_label = "Scene"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.operator("r5dgs.load_scene", text="Load R5DGS Scene", icon="IMPORT")
+        collection = objects.active_collection(context)
+        if collection is None:
+            layout.label(text="No scene loaded", icon="INFO")
+            return
+        state = collection.r5dgs
+        times = timeline.of_collection(collection)
+        t = times.time(context.scene.frame_current_final)
+        column = layout.column(align=True)
+        named = sum(entry.object_id > 0 for entry in state.table)
+        column.label(
+            text=f"{state.scene_name}: {named} objects, {state.gaussians:,} Gaussians", icon="OUTLINER_COLLECTION"
+        )
+        column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
+        if t > times.t_max + 1e-6:
+            column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
+        else:
+            column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
+        layout.prop(state, "filepath")
+
+
+CLASSES = (R5DGS_PT_scene,)
