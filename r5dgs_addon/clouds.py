@@ -55,6 +55,24 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
 
 
+def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
+    """Write `display_color` of a filled point cloud anew: its own colours times a tint.
+
+    Args:
+        cloud: The point cloud; one without `radiance:base` is left as it is.
+        tint: Factors on display-referred sRGB. [3]
+    """
+    stored = cloud.attributes.get("radiance:base")
+    if stored is None:
+        return
+    base = np.empty(4 * len(cloud.points), np.float32)
+    stored.data.foreach_get("color", base)
+    colors = base.reshape(-1, 4).astype(np.float64)
+    colors[:, :3] = srgb_to_linear(tint * (0.5 + C0 * colors[:, :3]))
+    _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", colors)
+    cloud.update_tag()
+
+
 def material(name: str) -> bpy.types.Material:
     """A material that shows `display_color` as it is, without light."""
     result = bpy.data.materials.new(name)
