@@ -7,6 +7,7 @@ d_g(t_max) = 0. A residual changes a Gaussian in the bind state before its group
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -163,7 +164,7 @@ class Scene:
     near_plane: float = NEAR_PLANE
     harmonics_turn: bool = True
 
-    @property
+    @functools.cached_property
     def extent(self) -> float:
         """Diagonal of the box that holds the middle 98 % of the centres on each axis: the scene's size."""
         if len(self.means) == 0:
