@@ -19,6 +19,7 @@ from .scene import Scene
 THRESHOLD = 0.5
 EMBEDDING_THRESHOLD = 0.25  # cosine; encoders put unrelated words of one scene below it
 _TYPO_RATIO = 0.75
+_SUGGESTED = 0.5  # least closeness of a word that someone may have meant
 _FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
 _HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
 _SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
@@ -48,6 +49,31 @@ class Label:
     aliases: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Meanings:
+    """Embeddings that a scene stores, by which words find objects that are called otherwise.
+
+    Attributes:
+        object_ids: Ids of the M objects, in the order of ``embeddings``.
+        embeddings: One row per object, unit. [M, D]
+        vocabulary: The V words with an embedding.
+        vocabulary_embeddings: One row per word, unit. [V, D]
+    """
+
+    object_ids: tuple[int, ...]
+    embeddings: np.ndarray
+    vocabulary: tuple[str, ...]
+    vocabulary_embeddings: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene) -> Meanings | None:
+        """Those of a scene; None where it stores none."""
+        if scene.embeddings is None or scene.vocabulary_embeddings is None:
+            return None
+        ids = tuple(item.id for item in scene.objects)
+        return cls(ids, scene.embeddings, scene.vocabulary, scene.vocabulary_embeddings)
+
+
 def search(scene: Scene, text: str, threshold: float = THRESHOLD) -> list[Match]:
     """Objects that a text names, best first.
 
@@ -60,30 +86,50 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD) -> list[Match]
         Matches with score >= threshold, ranked by score, then by id; empty where nothing matches.
     """
     labels = [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
-    found = {match.object_id: match for match in search_labels(labels, text, threshold)}
-    for match in _by_embedding(scene, text):
-        known = found.get(match.object_id)
-        if match.score >= threshold and (known is None or match.score > known.score):
-            found[match.object_id] = match
-    return _ranked(found.values())
+    return search_labels(labels, text, threshold, Meanings.of(scene))
 
 
-def search_labels(labels: Sequence[Label], text: str, threshold: float = THRESHOLD) -> list[Match]:
-    """As `search`, on names and aliases alone."""
+def search_labels(
+    labels: Sequence[Label], text: str, threshold: float = THRESHOLD, meanings: Meanings | None = None
+) -> list[Match]:
+    """As `search`, on names and aliases, and on stored embeddings where they are given."""
+    found = [match for wish in wishes(text) for label in labels if (match := _match(label, wish)) is not None]
+    if meanings is not None:
+        known = {label.object_id for label in labels}
+        found += [match for match in _by_meaning(meanings, text) if match.object_id in known]
     best: dict[int, Match] = {}
-    for wish in wishes(text):
-        for label in labels:
-            match = _match(label, wish)
-            known = best.get(label.object_id)
-            if match is not None and match.score >= threshold and (known is None or match.score > known.score):
-                best[label.object_id] = match
+    for match in found:
+        if match.score >= threshold and (match.object_id not in best or match.score > best[match.object_id].score):
+            best[match.object_id] = match
     return _ranked(best.values())
 
 
-def explain_nothing(labels: Iterable[Label], text: str) -> str:
-    """A sentence for the user when nothing matched, with the names that would."""
-    names = ", ".join(label.name for label in labels)
-    return f"nothing matches {text.strip()!r}; the scene has: {names or 'no objects'}"
+def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
+    """Names and aliases that someone may have meant who typed a text that nothing matches.
+
+    Args:
+        labels: What the objects answer to.
+        text: What was typed.
+        count: Most suggestions.
+
+    Returns:
+        The closest word of each object that is close at all, the best first.
+    """
+    ranked = []
+    for label in labels:
+        nearest = max(((_closeness(text, name), name) for name in (label.name, *label.aliases)), key=lambda c: c[0])
+        if nearest[0] >= _SUGGESTED:
+            ranked.append((-nearest[0], label.object_id, nearest[1]))
+    return [name for _, _, name in sorted(ranked)[:count]]
+
+
+def explain_nothing(labels: Sequence[Label], text: str) -> str:
+    """A sentence for the user when nothing matched: what is close, else the names that there are."""
+    said = f"nothing matches {text.strip()!r}"
+    meant = suggest(labels, text)
+    if meant:
+        return f"{said}; did you mean {' or '.join(repr(name) for name in meant)}?"
+    return f"{said}; the scene has: {', '.join(label.name for label in labels) or 'no objects'}"
 
 
 def wishes(text: str) -> list[list[str]]:
@@ -163,19 +209,28 @@ def _similarity(word: str, present: str) -> float:
     return 0.9 * ratio if ratio >= _TYPO_RATIO else 0.0
 
 
-def _by_embedding(scene: Scene, text: str) -> list[Match]:
+def _closeness(text: str, name: str) -> float:
+    """How alike two texts are, in [0, 1]: the best of their words, or all of them run together."""
+    asked = [word for wish in wishes(text) for word in wish]
+    present = words_of(name)
+    if not asked or not present:
+        return 0.0
+    pairs = [(a, b) for a in asked for b in present] + [("".join(asked), "".join(present))]
+    return max(difflib.SequenceMatcher(None, a, b, autojunk=False).ratio() for a, b in pairs)
+
+
+def _by_meaning(meanings: Meanings, text: str) -> list[Match]:
     """Cosine between the stored embedding of a known word and those of the objects, rescaled to a score."""
-    if scene.embeddings is None or scene.vocabulary_embeddings is None:
-        return []
-    rows = {tuple(words_of(word)): i for i, word in enumerate(scene.vocabulary)}
+    rows = {tuple(words_of(word)): i for i, word in enumerate(meanings.vocabulary)}
+    objects = np.asarray(meanings.embeddings, np.float64)
     matches = []
     for wish in wishes(text):
         row = rows.get(tuple(wish))
         if row is None:
             continue
-        cosines = np.asarray(scene.embeddings, np.float64) @ np.asarray(scene.vocabulary_embeddings[row], np.float64)
-        for item, cosine in zip(scene.objects, cosines, strict=True):
-            if item.id >= 0 and cosine >= EMBEDDING_THRESHOLD:
+        cosines = objects @ np.asarray(meanings.vocabulary_embeddings[row], np.float64)
+        for object_id, cosine in zip(meanings.object_ids, cosines, strict=True):
+            if object_id >= 0 and cosine >= EMBEDDING_THRESHOLD:
                 score = 0.5 + 0.45 * (float(min(cosine, 1.0)) - EMBEDDING_THRESHOLD) / (1 - EMBEDDING_THRESHOLD)
-                matches.append(Match(item.id, score, f"meaning of {scene.vocabulary[row]!r} ({cosine:.2f})"))
+                matches.append(Match(object_id, score, f"meaning of {meanings.vocabulary[row]!r} ({cosine:.2f})"))
     return matches

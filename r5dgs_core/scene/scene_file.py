@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from . import files, playback, scene_json, validation
+from . import files, lookup, playback, scene_json, validation
 from .scene import Scene
 
 FORMAT = "r5dgs scene"
@@ -104,13 +104,41 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
 
 def read(path: str | Path) -> Scene:
     """Read and check a scene. Raises `SceneFileError` naming the member and what was expected."""
-    path = Path(path)
+    with _open(Path(path)) as archive:
+        scene = _read_zip(archive, str(path))
+    validation.check(scene, str(path))
+    return scene
+
+
+def read_meanings(path: str | Path) -> lookup.Meanings | None:
+    """Only the stored embeddings of a scene, None where it has none. Raises as `read` does."""
+    place = str(path)
+    with _open(Path(path)) as archive:
+        data = _read_json(archive, place)
+        json_place = f"{place}: {JSON_MEMBER}"
+        listed = scene_json.words(data, "arrays", json_place)
+        objects, words = (
+            _read_array(archive, name, place, name in listed) for name in ("embeddings", "vocabulary_embeddings")
+        )
+        if objects is None or words is None:
+            return None
+        ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
+        vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
+    if len(objects) != len(ids) or len(words) != len(vocabulary) or objects.shape[1:] != words.shape[1:]:
+        raise errors.SceneFileError(
+            f"{place}: expected embeddings of {len(ids)} objects and {len(vocabulary)} words of one length, found "
+            f"shapes {objects.shape} and {words.shape}"
+        )
+    return lookup.Meanings(ids, objects, vocabulary, words)
+
+
+def _open(path: Path) -> zipfile.ZipFile:
     if not path.is_file():
         raise errors.SceneFileError(
             f"{path}: expected a .r5dgs file, found {'a folder' if path.is_dir() else 'nothing'}"
         )
     try:
-        archive = zipfile.ZipFile(path)
+        return zipfile.ZipFile(path)
     except PermissionError as error:
         raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
     except (*_BROKEN, struct.error) as error:
@@ -118,10 +146,6 @@ def read(path: str | Path) -> Scene:
             f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "
             "bake or copy it again"
         ) from error
-    with archive:
-        scene = _read_zip(archive, str(path))
-    validation.check(scene, str(path))
-    return scene
 
 
 def info(scene: Scene) -> dict[str, Any]:

@@ -123,3 +123,28 @@ def test_a_sentence_says_what_there_is(scene):
     said = lookup.explain_nothing(labels, " giraffe ")
     assert said.startswith("nothing matches 'giraffe'")
     assert "mug" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"), [("bug", ["mug"]), ("aplle tree", ["red apple"]), ("cap", ["cup"]), ("zzz", [])]
+)
+def test_what_nothing_matches_may_be_close_to_a_name_or_an_alias(scene, text, meant):
+    labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id > 0]
+    assert lookup.suggest(labels, text)[: len(meant) or None] == meant
+    if meant:
+        assert lookup.search_labels(labels, meant[0])
+        assert f"did you mean {meant[0]!r}" in lookup.explain_nothing(labels, text)
+
+
+def test_suggestions_are_the_closest_first_and_no_more_than_wanted():
+    labels = [lookup.Label(1, "handle"), lookup.Label(2, "candle"), lookup.Label(3, "sandal"), lookup.Label(4, "rock")]
+    assert lookup.suggest(labels, "candel", count=2) == ["candle", "handle"]
+    assert lookup.suggest([], "candel") == [] and lookup.suggest(labels, " ?") == []
+
+
+def test_embeddings_answer_beside_labels_that_were_renamed():
+    meanings = lookup.Meanings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
+    labels = [lookup.Label(1, "planet"), lookup.Label(2, "desk")]
+    assert [m.object_id for m in lookup.search_labels(labels, "spheres", meanings=meanings)] == [1]
+    assert lookup.search_labels(labels[1:], "spheres", meanings=meanings) == []
+    assert lookup.search_labels(labels, "spheres", 0.96, meanings) == []

@@ -85,6 +85,23 @@ def test_optional_members_may_be_absent_or_present(tmp_path):
     assert back.provenance == {"seed": 3, "rates": [1.0, 2.0], "nested": {"ok": True, "none": None}}
 
 
+def test_meanings_are_read_without_the_rest(scene, path, tmp_path):
+    assert scene_file.read_meanings(path) is None
+    rng = np.random.default_rng(1)
+    rich = dataclasses.replace(
+        scene,
+        embeddings=rng.normal(size=(len(scene.objects), 8)).astype(np.float32),
+        vocabulary=("mug", "fruit"),
+        vocabulary_embeddings=rng.normal(size=(2, 8)).astype(np.float32),
+    )
+    meanings = scene_file.read_meanings(scene_file.write(rich, tmp_path / "rich.r5dgs"))
+    assert meanings.object_ids == tuple(item.id for item in scene.objects) and meanings.vocabulary == rich.vocabulary
+    np.testing.assert_array_equal(meanings.embeddings, rich.embeddings)
+    np.testing.assert_array_equal(meanings.vocabulary_embeddings, rich.vocabulary_embeddings)
+    with pytest.raises(errors.SceneFileError, match="nothing"):
+        scene_file.read_meanings(tmp_path / "gone.r5dgs")
+
+
 def test_a_file_keeps_its_near_plane_and_one_without_has_the_default(scene, path, tmp_path):
     near = dataclasses.replace(scene, near_plane=2.5e-4)
     assert scene_file.read(scene_file.write(near, tmp_path / "near.r5dgs")).near_plane == 2.5e-4
