@@ -1,0 +1,155 @@
+"""Gaussians carried by an affine map, with their shapes, their colours and the shading of that pose written out.
+
+What others draw without knowing our scenes: nothing is left to be turned, tinted or shaded later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..motion import rotations
+from . import harmonics, posing, tints
+from .ply import Splats
+from .scene import Scene
+
+SIMILARITY_TOLERANCE = 1e-5
+
+
+def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
+    """Gaussians after an affine map.
+
+    Rotation, translation, mirror and uniform scale are exact in every respect. Under any other map the ellipsoids are
+    still mapped exactly, and the harmonics are the best fit over all directions (`harmonics.change_of_basis`).
+
+    Args:
+        splats: The Gaussians.
+        matrix: Affine map. [4, 4]
+        factor: On their display-referred colour, >= 0; none where None. [3], [N, 1] or [N, 3]
+
+    Returns:
+        New Gaussians; ids and identities are the given ones.
+
+    Raises:
+        ValueError: The matrix flattens space or is not finite.
+    """
+    linear, offset = affine(matrix)
+    means = np.empty(splats.means.shape, np.float32)
+    posing.move_points(splats.means, linear, offset, means)
+    quats, log_scales = map_shapes(linear, splats.quats, splats.log_scales)
+    sh = harmonics.carried(splats.sh, linear)
+    if factor is not None:
+        sh = tints.tint_sh(sh, factor)
+    return Splats(means, quats, log_scales, splats.opacity_logits, sh, splats.identities, splats.object_ids)
+
+
+def place(scene: Scene, start: int, count: int, matrix: np.ndarray, tint: np.ndarray | None = None) -> Splats:
+    """A range of a scene's Gaussians, carried from the bind state, with the shading of the pose it brings them to.
+
+    Args:
+        scene: The scene.
+        start: First row.
+        count: Number of rows.
+        matrix: Affine map from the bind state to the wanted world. Shading turns with its nearest rotation. [4, 4]
+        tint: Factor on the display-referred colour, or None. [3]
+
+    Returns:
+        The Gaussians.
+
+    Raises:
+        ValueError: The range leaves the scene, or the matrix flattens space or is not finite.
+    """
+    if not 0 <= start <= start + count <= len(scene.means):
+        raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.means)} Gaussians")
+    rows = slice(start, start + count)
+    factor = shading_factors(scene, rows, nearest_rotation(affine(matrix)[0]))
+    if tint is not None:
+        factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
+    return carry(bind_state(scene, rows), matrix, factor)
+
+
+def bind_state(scene: Scene, rows: slice) -> Splats:
+    """Rows of a scene as they are in its file, without shading."""
+    identities = scene.identities
+    return Splats(
+        scene.means[rows],
+        scene.quats[rows],
+        scene.log_scales[rows],
+        scene.opacity_logits[rows],
+        scene.sh[rows],
+        None if identities is None else identities[rows].astype(np.float32),
+        scene.object_ids[rows],
+    )
+
+
+def join(parts: Sequence[Splats]) -> Splats:
+    """Several sets of Gaussians as one, in this order; the degree is the highest one, absent coefficients are zero.
+
+    Identities are kept where all parts have them in the same width, ids where all have them.
+    """
+    bases = max((part.sh.shape[1] for part in parts), default=1)
+    sh = [np.pad(part.sh, ((0, 0), (0, bases - part.sh.shape[1]), (0, 0))) for part in parts]
+    widths = {None if part.identities is None else part.identities.shape[1] for part in parts}
+    kept = [part.identities for part in parts if part.identities is not None] if len(widths) == 1 else []
+    ids = [part.object_ids for part in parts if part.object_ids is not None]
+    return Splats(
+        np.concatenate([np.empty((0, 3), np.float32), *(part.means for part in parts)]),
+        np.concatenate([np.empty((0, 4), np.float32), *(part.quats for part in parts)]),
+        np.concatenate([np.empty((0, 3), np.float32), *(part.log_scales for part in parts)]),
+        np.concatenate([np.empty(0, np.float32), *(part.opacity_logits for part in parts)]),
+        np.concatenate([np.empty((0, bases, 3), np.float32), *sh]),
+        np.concatenate(kept) if kept else None,
+        np.concatenate(ids) if parts and len(ids) == len(parts) else None,
+    )
+
+
+def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linear part and translation of a [4, 4] matrix that can be undone. Raises ValueError for any other."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"expected a finite matrix [4, 4], got {matrix!r}")
+    singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if singular[-1] <= 1e-9 * max(singular[0], 1e-30):
+        raise ValueError("the matrix flattens space (scale 0)")
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def is_similarity(linear: np.ndarray) -> bool:
+    """Whether a linear map only turns, mirrors and scales uniformly. [3, 3]"""
+    singular = np.linalg.svd(linear, compute_uv=False)
+    return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
+
+
+def nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """The rotation nearest to a linear map, without mirror. [3, 3] -> [3, 3]"""
+    u, _, vt = np.linalg.svd(linear)
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def map_shapes(
+    linear: np.ndarray,  # [3, 3]
+    quats: np.ndarray,  # [N, 4]
+    log_scales: np.ndarray,  # [N, 3]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and log scales of ellipsoids under a linear map, exact for any. [N, 4] and [N, 3] float32"""
+    linear = np.asarray(linear, np.float64)
+    singular = np.linalg.svd(linear, compute_uv=False)
+    if is_similarity(linear) and np.linalg.det(linear) > 0:
+        new_quats = np.empty(quats.shape, np.float32)
+        posing.turn_quats(quats, rotations.rotmats_to_quats(nearest_rotation(linear)), new_quats)
+        return new_quats, log_scales + np.float32(np.log(singular.mean()))
+    axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
+    u, singular, _ = np.linalg.svd(axes)
+    u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
+    turned = rotations.rotmats_to_quats(u).astype(np.float32)
+    return turned, np.log(np.maximum(singular, 1e-30)).astype(np.float32)
+
+
+def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
+    """Factor on the colour of rows that have turned by a rotation since the bind state, or None. [3, 3] -> [n, 1]"""
+    if scene.shading is None or scene.light_direction is None:
+        return None
+    light = np.asarray(scene.light_direction, np.float64)
+    change = (rotation.T @ light - light).astype(np.float32)
+    return np.maximum(posing.rest_factors(scene)[rows] + scene.shading[rows] @ change, 0)[:, None]
