@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture_dataset, check_worker, load_scene, preview, select_by_prompt
+from . import capture_dataset, check_worker, load_scene, preview, select_by_prompt, set_display
 
-MODULES = (load_scene, select_by_prompt, preview, check_worker, capture_dataset)
+MODULES = (load_scene, set_display, select_by_prompt, preview, check_worker, capture_dataset)
 
 
 def _menu_import(menu, context):

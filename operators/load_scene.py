@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import keyframes, objects
+from ..r5dgs_addon import displays, keyframes, objects
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
@@ -15,6 +15,14 @@ CONVENTIONS = (
     ("colmap", "COLMAP (Y down)", "Structure from motion: x right, y down, z forward"),
     ("opengl", "OpenGL (Y up)", "x right, y up, z backward"),
 )
+SH_DEGREES = (
+    ("ALL", "As Trained", "All harmonics of the file"),
+    ("0", "None", "One color from all sides; the smallest .blend files"),
+    ("1", "Degree 1", "3 harmonics beside the color"),
+    ("2", "Degree 2", "8 harmonics beside the color"),
+    ("3", "Degree 3", "15 harmonics beside the color"),
+)
+OPTIONS = ("world_convention", "frame_zero", "t_end", "key_tolerance", "fit_timeline", "sh_degree", "display")
 
 
 class R5DGS_OT_load_scene(bpy.types.Operator):
@@ -47,14 +55,26 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     fit_timeline: BoolProperty(
         name="Fit Timeline", description="Set the frame range and mark the last observed time", default=True
     )
-    view_dependence: BoolProperty(
-        name="View Dependence", description="Store how colours change with the viewing direction", default=True
+    sh_degree: EnumProperty(
+        name="View Dependence",
+        description="How finely the points store how colors change with the viewing direction",
+        items=SH_DEGREES,
+        default="ALL",
+    )
+    display: EnumProperty(
+        name="Display",
+        description="What stands for Gaussians where the viewport draws no splats",
+        items=displays.ITEMS,
+        default=displays.POINTS,
     )
 
     @classmethod
     def poll(cls, context):
         if context.mode != "OBJECT":
             cls.poll_message_set("Switch to Object Mode first")
+            return False
+        if context.scene.library is not None:
+            cls.poll_message_set("This Blender scene is linked from another file: switch to one of your own first")
             return False
         return True
 
@@ -65,6 +85,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context):
+        if not self.filepath:
+            self.report({"ERROR"}, "No file given: choose a .r5dgs file")
+            return {"CANCELLED"}
         path = Path(bpy.path.abspath(self.filepath))
         options = objects.Options(
             world_convention="" if self.world_convention == "FILE" else self.world_convention,
@@ -72,7 +95,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             t_end=self.t_end or None,
             key_tolerance=self.key_tolerance,
             fit_timeline=self.fit_timeline,
-            view_dependence=self.view_dependence,
+            sh_degree=3 if self.sh_degree == "ALL" else int(self.sh_degree),
+            display=self.display,
         )
         try:
             scene = scene_file.read(path)
@@ -82,6 +106,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             return {"CANCELLED"}
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
         self.report({"INFO"}, f"{path.name}: {len(scene.means)} Gaussians, {named} objects")
+        if named == 0:
+            self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
         if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say
             count = len(scene.residual_rows)
             self.report({"WARNING"}, f"{count} Gaussians bend while observed; here they move with their group alone")
@@ -91,7 +117,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("world_convention", "frame_zero", "t_end", "key_tolerance", "fit_timeline", "view_dependence"):
+        for name in OPTIONS:
             layout.prop(self, name)
 
 

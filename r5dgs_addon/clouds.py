@@ -8,6 +8,7 @@ from . import compat
 
 # A colour attribute named exactly `color` renders black in Cycles, hence this name.
 DISPLAY_COLOR = "display_color"
+ROW = "gaussian"
 # Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
 DISPLAY_SIGMAS = 1.2
 LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
@@ -20,19 +21,19 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, view_dependence: bool) -> None:
+def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, sh_degree: int) -> None:
     """Write Gaussians to a point cloud of as many points.
 
     Attributes: `position`; `scale` (standard deviations) and `rotation` (wxyz); `radiance:base` (degree-0 coefficients
-    and opacity) and `radiance:sh_<k>` (the others), as trained: display-referred; `object_id`; and for display `radius`
-    and `display_color` (linear).
+    and opacity) and `radiance:sh_<k>` (the others), as trained: display-referred; `object_id`; `gaussian`, the row in
+    the scene file, which a point keeps when others are deleted; and for display `radius` and `display_color` (linear).
 
     Args:
         cloud: The point cloud.
         scene: The scene.
         rows: Its rows to write.
         extent: The scene's size.
-        view_dependence: Whether to write the coefficients above degree 0.
+        sh_degree: Highest degree of the coefficients to write, at most 3.
     """
     sh = scene.sh[rows]
     log_scales = scene.log_scales[rows]
@@ -46,10 +47,10 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales))
     _write(cloud, "rotation", "QUATERNION", "value", scene.quats[rows])
     _write(cloud, "radiance:base", "FLOAT_COLOR", "color", base)
-    if view_dependence:
-        for k in range(1, sh.shape[1]):
-            _write(cloud, f"radiance:sh_{k - 1}", "FLOAT_VECTOR", "vector", sh[:, k])
+    for k, plane in enumerate(_planes(sh[:, 1 : (sh_degree + 1) ** 2])):
+        _write(cloud, f"radiance:sh_{k}", "FLOAT_VECTOR", "vector", plane)
     _write(cloud, "object_id", "INT", "value", scene.object_ids[rows], np.int32)
+    _write(cloud, ROW, "INT", "value", np.arange(rows.start, rows.stop), np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
     compat.make_gaussian_splat(cloud)
     cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
@@ -76,14 +77,46 @@ def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
 def material(name: str) -> bpy.types.Material:
     """A material that shows `display_color` as it is, without light."""
     result = bpy.data.materials.new(name)
-    tree = compat.emission_nodes(result)
-    attribute = tree.nodes.new("ShaderNodeAttribute")
-    attribute.attribute_name = DISPLAY_COLOR
-    emission = tree.nodes.new("ShaderNodeEmission")
-    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    nodes = compat.empty_nodes(result)
+    _, emission, output = _emission(nodes, "GEOMETRY")
+    nodes.links.new(emission.outputs["Emission"], output.inputs["Surface"])
+    return result
+
+
+def instance_material(name: str) -> bpy.types.Material:
+    """As `material`, for instances on the points; as opaque as the Gaussian."""
+    result = bpy.data.materials.new(name)
+    nodes = compat.empty_nodes(result)
+    attribute, emission, output = _emission(nodes, "INSTANCER")
+    clear, mix = nodes.nodes.new("ShaderNodeBsdfTransparent"), nodes.nodes.new("ShaderNodeMixShader")
+    clear.location, mix.location = (-150, 150), (50, 0)
+    output.location = (250, 0)
+    nodes.links.new(attribute.outputs["Alpha"], mix.inputs[0])
+    nodes.links.new(clear.outputs[0], mix.inputs[1])
+    nodes.links.new(emission.outputs[0], mix.inputs[2])
+    nodes.links.new(mix.outputs[0], output.inputs["Surface"])
+    return result
+
+
+def _emission(tree: bpy.types.NodeTree, source: str) -> list[bpy.types.Node]:
+    """Nodes attribute, emission and output, the first two linked."""
+    kinds = ("ShaderNodeAttribute", "ShaderNodeEmission", "ShaderNodeOutputMaterial")
+    attribute, emission, output = (tree.nodes.new(kind) for kind in kinds)
+    attribute.attribute_type, attribute.attribute_name = source, DISPLAY_COLOR
     attribute.location, emission.location, output.location = (-400, 0), (-150, 0), (50, 0)
     tree.links.new(attribute.outputs["Color"], emission.inputs["Color"])
-    tree.links.new(emission.outputs["Emission"], output.inputs["Surface"])
+    return [attribute, emission, output]
+
+
+def _planes(sh: np.ndarray) -> np.ndarray:
+    """Coefficients by themselves, some thousand Gaussians at a time so that the processor's cache holds them.
+
+    [N, K, 3] -> [K, N, 3]
+    """
+    count, bases, _ = sh.shape
+    result = np.empty((bases, count, 3), np.float32)
+    for start in range(0, count, 4096):
+        result[:, start : start + 4096] = sh[start : start + 4096].swapaxes(0, 1)
     return result
 
 

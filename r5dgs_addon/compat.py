@@ -1,6 +1,7 @@
 """What differs between Blender versions, found by feature and not by number. Nothing else asks for a version."""
 
 import atexit
+from collections.abc import Sequence
 
 import bpy
 
@@ -10,39 +11,44 @@ PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _SAYS_RELATIVE else set()
 KEYFRAME = bpy.types.Keyframe.bl_rna
 
 
-def new_point_cloud(name: str, count: int, collection: bpy.types.Collection) -> bpy.types.Object:
-    """Make a point cloud object of ``count`` points at the origin, linked to a collection of the active view layer.
+def new_point_clouds(counts: Sequence[int]) -> list[bpy.types.PointCloud]:
+    """Make point clouds of so many points each, at the origin; no object uses them yet.
 
-    `PointCloud.resize` came with 5.1; before it, a geometry-nodes Points node is applied.
+    `PointCloud.resize` came with 5.1; before it, what geometry nodes make in a scene of their own is copied.
 
     Args:
-        name: Name of the object and its data.
-        count: Number of points, at least 1.
-        collection: Where to link it. It has to be in the active view layer and not excluded there.
+        counts: Number of points of each, at least 1.
 
     Returns:
-        The object.
+        The point clouds, in that order.
     """
-    cloud = bpy.data.pointclouds.new(name)
-    obj = bpy.data.objects.new(name, cloud)
-    collection.objects.link(obj)
-    if hasattr(cloud, "resize"):
-        cloud.resize(count)
-        return obj
-    tree = bpy.data.node_groups.new("R5DGS points", "GeometryNodeTree")
+    if hasattr(bpy.types.PointCloud, "resize"):
+        clouds = [bpy.data.pointclouds.new("R5DGS points") for _ in counts]
+        for cloud, count in zip(clouds, counts, strict=True):
+            cloud.resize(count)
+        return clouds
+    scene, made = bpy.data.scenes.new("R5DGS points"), []
     try:
-        tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-        output = tree.nodes.new("NodeGroupOutput")
-        points = tree.nodes.new("GeometryNodePoints")
-        points.inputs["Count"].default_value = count
-        tree.links.new(points.outputs[0], output.inputs[0])
-        modifier = obj.modifiers.new("R5DGS points", "NODES")
-        modifier.node_group = tree
-        with bpy.context.temp_override(object=obj, active_object=obj):
-            bpy.ops.object.modifier_apply(modifier=modifier.name)
+        sources = []
+        for count in counts:
+            cloud = bpy.data.pointclouds.new("R5DGS points")
+            tree = bpy.data.node_groups.new("R5DGS points", "GeometryNodeTree")
+            source = bpy.data.objects.new("R5DGS points", cloud)
+            made += [source, cloud, tree]
+            sources.append(source)
+            scene.collection.objects.link(source)
+            tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+            output = tree.nodes.new("NodeGroupOutput")
+            points = tree.nodes.new("GeometryNodePoints")
+            points.inputs["Count"].default_value = count
+            tree.links.new(points.outputs[0], output.inputs[0])
+            source.modifiers.new("R5DGS points", "NODES").node_group = tree
+        layer = scene.view_layers[0]
+        layer.update()
+        return [source.evaluated_get(layer.depsgraph).data.copy() for source in sources]
     finally:
-        bpy.data.node_groups.remove(tree)
-    return obj
+        bpy.data.batch_remove(made)
+        bpy.data.scenes.remove(scene)
 
 
 def make_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:
@@ -77,15 +83,47 @@ def fcurves(obj: bpy.types.Object):
     animation = obj.animation_data
     if animation is None or animation.action is None:
         return ()
-    action = animation.action
+    return channels(animation.action, slot_of(animation))
+
+
+def slot_of(user: bpy.types.AnimData | bpy.types.NlaStrip):
+    """The slot of its action that an object or a strip of the NLA plays; None where actions have no slots."""
+    return getattr(user, "action_slot", None)
+
+
+def channels(action: bpy.types.Action, slot):
+    """The F-curves of an action for one of its slots; empty where it has none."""
     if "slots" not in action.bl_rna.properties:
         return action.fcurves
-    for layer in action.layers:
+    for layer in action.layers if slot is not None else ():
         for strip in layer.strips:
-            bag = strip.channelbag(animation.action_slot) if animation.action_slot else None
+            bag = strip.channelbag(slot)
             if bag is not None:
                 return bag.fcurves
     return ()
+
+
+def own_fcurves(obj: bpy.types.Object, name: str):
+    """The F-curves that move an object, where new ones can be added; an action is made where it has none."""
+    animation = obj.animation_data
+    if animation is None or animation.action is None:
+        return new_fcurves(obj, name)
+    action = animation.action
+    if "slots" not in action.bl_rna.properties:
+        return action.fcurves
+    if animation.action_slot is None:
+        animation.action_slot = action.slots.new(id_type="OBJECT", name=obj.name)
+    layer = action.layers[0] if action.layers else action.layers.new("Layer")
+    strip = layer.strips[0] if layer.strips else layer.strips.new(type="KEYFRAME")
+    return strip.channelbag(animation.action_slot, ensure=True).fcurves
+
+
+def play(obj: bpy.types.Object, action: bpy.types.Action, slot) -> None:
+    """Give an object an action, and in it the slot that a slot of the same action or of one it was copied from is."""
+    animation = obj.animation_data_create()
+    animation.action = action
+    if slot is not None:
+        animation.action_slot = next(other for other in action.slots if other.handle == slot.handle)
 
 
 def keyframe_enum(property_name: str, item: str) -> int:
@@ -93,7 +131,7 @@ def keyframe_enum(property_name: str, item: str) -> int:
     return KEYFRAME.properties[property_name].enum_items[item].value
 
 
-def emission_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
+def empty_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
     """The empty node tree of a material; ``use_nodes`` is deprecated, and always true, from 5.0 on."""
     if material.node_tree is None:
         material.use_nodes = True

@@ -25,6 +25,23 @@ def relative_to(path: str, blend_path: str) -> str:
         return path
 
 
+def places(collection: bpy.types.Collection) -> list[Path]:
+    """Where the file of a loaded scene may lie, likeliest first.
+
+    That is where the .blend says, which for linked data is the library; beside the open .blend, as both may have moved
+    together; and where the file was last seen, as appended data comes from a .blend elsewhere.
+    """
+    override = collection.override_library
+    library = collection.library or (override.reference.library if override and override.reference else None)
+    stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=library))
+    found = [stored]
+    if bpy.data.filepath:
+        found.append(Path(bpy.path.abspath("//")) / stored.name)
+    if collection.r5dgs.seen_at:
+        found.append(Path(collection.r5dgs.seen_at))
+    return found
+
+
 _open_file: list[tuple[str, dict[int, str]]] = []  # before saving: the open .blend, and the paths in it by session_uid
 
 
@@ -38,9 +55,9 @@ def _relink_before_save(target, *_):
     scenes = _own_scenes()
     _open_file.append((bpy.data.filepath, {scene.session_uid: scene.r5dgs.filepath for scene in scenes}))
     for collection in scenes:
-        found = Path(bpy.path.abspath(collection.r5dgs.filepath))
-        if found.is_file():
-            collection.r5dgs.filepath = relative_to(str(found.resolve()), target)
+        found = next((str(place.resolve()) for place in places(collection) if place.is_file()), None)
+        if found is not None:
+            collection.r5dgs.filepath, collection.r5dgs.seen_at = relative_to(found, target), found
 
 
 @persistent
@@ -58,7 +75,9 @@ def _restore_after_save(target, *_):
 
 
 def _own_scenes() -> list[bpy.types.Collection]:
-    return [c for c in bpy.data.collections if c.r5dgs.is_scene and c.library is None]
+    """Loaded scenes that this .blend stores; linked ones and their overrides belong to their library."""
+    every = bpy.data.collections
+    return [c for c in every if c.r5dgs.is_scene and c.library is None and c.override_library is None]
 
 
 def _hooks():

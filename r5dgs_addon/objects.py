@@ -14,9 +14,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
-from . import clouds, compat, handlers, keyframes, timeline
+from . import clouds, compat, displays, handlers, keyframes, timeline
 
 NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
 
@@ -31,7 +32,8 @@ class Options:
         t_end: Scene time up to which motion is extrapolated; None for `timeline.default_end`.
         key_tolerance: Error of the reduced keys, fraction of the scene's size.
         fit_timeline: Whether the frame range and the marker are set.
-        view_dependence: Whether spherical harmonics above degree 0 are stored on the points.
+        sh_degree: Highest degree of the spherical harmonics that are stored on the points.
+        display: What stands for Gaussians in viewports without splats, of `displays.ITEMS`.
     """
 
     world_convention: str = ""
@@ -39,7 +41,8 @@ class Options:
     t_end: float | None = None
     key_tolerance: float = keyframes.TOLERANCE
     fit_timeline: bool = True
-    view_dependence: bool = True
+    sh_degree: int = 3
+    display: str = displays.POINTS
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,14 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
 
     Returns:
         The collection ``R5DGS <name>``.
+
+    Raises:
+        SceneFileError: The scene has no Gaussians.
     """
+    if len(scene.means) == 0:
+        raise errors.SceneFileError(
+            f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
+        )
     with nothing_left_after_error():
         times = timeline.Times.of(scene, options.frame_zero, options.t_end)
         collection = bpy.data.collections.new(_name(f"R5DGS {scene.name}"))
@@ -109,9 +119,11 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         anchors = {}
         for part in homes(scene, parts):
             anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, parts, extent)
-        for part in parts:
-            anchor = anchors[_anchor_key(part)]
-            _cloud(children[part.object_id], anchor, scene, part, parts, material, extent, options.view_dependence)
+        for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
+            clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, options.sh_degree)
+            data.materials.append(material)
+            _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, parts, data)
+        displays.show(collection, options.display)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
         if options.fit_timeline:
@@ -160,6 +172,11 @@ def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None
             if active.name in collection.all_objects and collection.all_objects[active.name] == active:
                 return collection
     return candidates[0] if candidates else None
+
+
+def is_own(collection: bpy.types.Collection) -> bool:
+    """Whether a loaded scene belongs to the open .blend: neither linked from another one nor an override of that."""
+    return collection.library is None and collection.override_library is None
 
 
 def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Object]:
@@ -235,13 +252,11 @@ def _cloud(
     scene: Scene,
     part: Range,
     parts: list[Range],
-    material: bpy.types.Material,
-    extent: float,
-    view_dependence: bool,
+    data: bpy.types.PointCloud,
 ) -> bpy.types.Object:
-    cloud = compat.new_point_cloud(_name(_part_name(scene, part, parts)), part.count, collection)
-    clouds.fill(cloud.data, scene, slice(part.start, part.start + part.count), extent, view_dependence)
-    cloud.data.materials.append(material)
+    data.name = name = _name(_part_name(scene, part, parts))
+    cloud = bpy.data.objects.new(name, data)
+    collection.objects.link(cloud)
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
     cloud.color = (*color, 1.0)
     cloud.parent = anchor
@@ -267,6 +282,7 @@ def _describe(
     state.is_scene = True
     state.scene_name = scene.name
     state.filepath = handlers.relative_to(str(path.resolve()), bpy.data.filepath)
+    state.seen_at = str(path.resolve())
     state.gaussians = len(scene.means)
     state.root = root
     state.t_start, state.t_max, state.t_end = times.t_start, times.t_max, times.t_end

@@ -16,7 +16,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import compat
+from . import compat, displays
 
 ROLES = (
     ("NONE", "None", "Not part of an R5DGS scene"),
@@ -60,6 +60,12 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
         description="The .r5dgs file that the preview reads; relative to the .blend file where possible",
         subtype="FILE_PATH",
         options={"ANIMATABLE"} | compat.PATH_OPTIONS,
+    )
+    seen_at: StringProperty(
+        name="Seen At", description="Where the scene file was last seen: a .blend that appends this starts elsewhere"
+    )
+    display: EnumProperty(
+        name="Display", description="What stands for Gaussians where the viewport draws no splats", items=displays.ITEMS
     )
     gaussians: IntProperty(name="Gaussians", description="Number of Gaussians in the scene file")
     t_start: FloatProperty(name="First Time", description="First observed scene time", precision=4)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import objects, timeline
+from .. import displays, objects, timeline
 from . import sidebar
 
 
@@ -32,6 +32,9 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
         else:
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
+        row = layout.row(align=True)
+        for value, name, _ in displays.ITEMS:
+            row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
         layout.prop(state, "filepath")
 
 

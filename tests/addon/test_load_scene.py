@@ -145,6 +145,22 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
         ids = np.empty(obj.r5dgs.count, np.int32)
         obj.data.attributes["object_id"].data.foreach_get("value", ids)
         np.testing.assert_array_equal(ids, scene.object_ids[rows])
+        obj.data.attributes["gaussian"].data.foreach_get("value", ids)
+        np.testing.assert_array_equal(ids, np.arange(rows.start, rows.stop))
+
+
+@pytest.mark.parametrize("degree, kept", [("0", 0), ("1", 3), ("2", 8), ("3", 15), ("ALL", 15)])
+def test_only_the_wanted_harmonics_are_stored(blender, tmp_path, degree, kept):
+    scene = scenes.make_scene(n=5000, objects=2, sh_degree=3)
+    path = scene_file.write(scene, tmp_path / "scene.r5dgs")
+    stored = scene_file.read(path)
+    for obj in clouds(load(blender, path, sh_degree=degree)):
+        names = {a.name for a in obj.data.attributes if a.name.startswith("radiance:sh_")}
+        assert names == {f"radiance:sh_{k}" for k in range(kept)}
+        for k in range(kept):
+            rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
+            found = attribute(obj, f"radiance:sh_{k}", "vector", 3)
+            np.testing.assert_array_equal(found, stored.sh[rows, k + 1])
 
 
 def curves_of(anchor):

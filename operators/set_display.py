@@ -1,0 +1,34 @@
+"""Set Display: points or ellipsoids for the Gaussians of a loaded scene."""
+
+import bpy
+from bpy.props import EnumProperty
+
+from ..r5dgs_addon import displays, objects
+
+
+class R5DGS_OT_set_display(bpy.types.Operator):
+    """Choose what stands for the Gaussians of this scene where the viewport draws no splats"""
+
+    bl_idname = "r5dgs.set_display"
+    bl_label = "Set Display"
+    bl_options = {"REGISTER", "UNDO"}
+
+    display: EnumProperty(name="Display", description="What stands for a Gaussian", items=displays.ITEMS)
+
+    @classmethod
+    def poll(cls, context):
+        collection = objects.active_collection(context)
+        if collection is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        if not objects.is_own(collection):
+            cls.poll_message_set("This R5DGS scene is linked from another file: set its display there")
+            return False
+        return True
+
+    def execute(self, context):
+        displays.show(objects.active_collection(context), self.display)
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_set_display,)
