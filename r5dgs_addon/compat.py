@@ -145,9 +145,20 @@ def call_at_exit(unregister) -> None:
     Blender itself disables its extensions in time.
     """
     if not bpy.app.binary_path:  # true of the module only
+        atexit.unregister(_forget_properties)
+        atexit.register(_forget_properties)  # before the other: the last one registered is called first
         atexit.register(unregister)
 
 
 def do_not_call_at_exit(unregister) -> None:
     """Undo `call_at_exit`."""
     atexit.unregister(unregister)
+
+
+def _forget_properties() -> None:
+    """Take the properties off our classes: the bpy module crashes where one with a callback outlives it (4.2)."""
+    package = __package__.rpartition(".")[0]
+    for base in (bpy.types.PropertyGroup, bpy.types.Operator):
+        for cls in base.__subclasses__():
+            if cls.__module__.startswith(package + "."):
+                cls.__annotations__ = {}
