@@ -27,7 +27,7 @@ def animate(
     """Key an anchor with the motion of its group; a group that stays put gets no keys.
 
     Args:
-        anchor: Empty at the group's pivot, rotation mode quaternion.
+        anchor: Empty at the group's pivot, rotation mode quaternion; its action has no curves of location or rotation.
         scene: The scene.
         motion_id: The motion group.
         times: Scene times and their frames.
@@ -37,10 +37,10 @@ def animate(
         return
     motion = curves(scene, motion_id, times.t_end, tolerance)
     location, rotation = motion.location, motion.rotation
-    moves, turns = _varies(location.values), _varies(rotation.values)
+    moves, turns = varies(location.values), varies(rotation.values)
     if not (moves or turns):
         return
-    fcurves = compat.new_fcurves(anchor, anchor.name)
+    fcurves = compat.own_fcurves(anchor, anchor.name)
     if moves:
         pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
         placed = Keys(location.times, location.values + pivot, location.left_slopes, location.right_slopes)
@@ -106,7 +106,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
     Playback has a kink in its second derivative at each knot, so keys elsewhere do not help where no knot can go.
     """
     for keys, reach in ((exact.location, 1.0), (exact.rotation, 2.0 * radius)):
-        if len(keys.times) == 2 or not _varies(keys.values):
+        if len(keys.times) == 2 or not varies(keys.values):
             return True
         around = [slice(None, -2), slice(2, None)]
         (t0, t1), (v0, v1) = ([a[part] for part in around] for a in (keys.times, keys.values))
@@ -162,7 +162,7 @@ def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
     kinds = {kind: compat.keyframe_enum("type", kind) for kind in (OBSERVED_KEY, EXTRAPOLATED_KEY)}
     frames = times.frame(1.0) - times.frame(0.0)
     for index in range(curve.values.shape[1]):
-        keep = slice(None) if _varies(curve.values[:, index : index + 1]) else slice(0, 1)
+        keep = slice(None) if varies(curve.values[:, index : index + 1]) else slice(0, 1)
         t, value = curve.times[keep], curve.values[keep, index]
         gaps = np.diff(t)
         before = np.concatenate([gaps[:1], gaps]) if len(gaps) else np.ones(1)
@@ -185,5 +185,6 @@ def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
         fcurve.update()
 
 
-def _varies(values: np.ndarray) -> bool:
+def varies(values: np.ndarray) -> bool:
+    """Whether a curve changes. [K, C]"""
     return bool((values != values[:1]).any())

@@ -17,7 +17,7 @@ from mathutils import Matrix, Vector
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
-from . import clouds, compat, displays, handlers, keyframes, timeline
+from . import clouds, compat, displays, handlers, keyframes, motion_physics, timeline
 
 NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
 
@@ -126,6 +126,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         displays.show(collection, options.display)
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
+        motion_physics.remember(anchors, scene, times, options.key_tolerance)
         if options.fit_timeline:
             timeline.fit(context.scene, times)
         context.view_layer.update()

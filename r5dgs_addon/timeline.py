@@ -59,7 +59,12 @@ def default_end(scene: Scene) -> float:
 def fit(scene: bpy.types.Scene, times: Times) -> None:
     """Set a Blender scene's frame range to the scene's times and mark t_max."""
     scene.frame_start = max(math.floor(times.frame(times.t_start) + 1e-6), 0)
-    scene.frame_end = max(math.ceil(times.frame(times.t_end) - 1e-6), scene.frame_start)
+    fit_end(scene, times)
     frame = round(times.frame(times.t_max))
     if not any(marker.name == MARKER and marker.frame == frame for marker in scene.timeline_markers):
         scene.timeline_markers.new(MARKER, frame=frame)
+
+
+def fit_end(scene: bpy.types.Scene, times: Times) -> None:
+    """Set the last frame of a Blender scene to the last one that has keys."""
+    scene.frame_end = max(math.ceil(times.frame(times.t_end) - 1e-4), scene.frame_start)

@@ -1,0 +1,232 @@
+"""Write what anchors do past t_max anew, from the motion that their fields describe.
+
+The new motion starts from the pose that the curves have at t_max, wherever the user has brought it: it is continuous
+there, and a rotation acts on the turned object about its own place. Where nothing was edited it is the learned motion.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core import errors
+from ..r5dgs_core.motion import keyframes as reduction
+from ..r5dgs_core.motion import rotations
+from ..r5dgs_core.motion.keyframes import Keys
+from ..r5dgs_core.scene import scene_file
+from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What will be written for one anchor: everything that can fail is done.
+
+    Attributes:
+        anchor: The anchor.
+        place: Where its curves lie.
+        times: Its times, with the new end.
+        tails: Keys by path, over frames.
+    """
+
+    anchor: bpy.types.Object
+    place: motion_curves.Place
+    times: timeline.Times
+    tails: dict[str, Keys]
+
+
+def scene_of(anchor: bpy.types.Object) -> bpy.types.Collection | None:
+    """The loaded scene that an object belongs to."""
+    for collection in objects.scene_collections():
+        if anchor.name in collection.all_objects and collection.all_objects[anchor.name] == anchor:
+            return collection
+    return None
+
+
+def followers(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Anchors that take the path of one of these and are none of them, such as shadows."""
+    leaders = set(anchors)
+    return [
+        obj
+        for obj in bpy.data.objects
+        if obj.r5dgs.role == "ANCHOR" and obj not in leaders and obj.r5dgs_motion.leader in leaders
+    ]
+
+
+def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) -> list[bpy.types.Object]:
+    """Write the keys past t_max of anchors, and of what follows them, from their motions.
+
+    Args:
+        anchors: Anchors of loaded scenes.
+        t_end: Last scene time; None for that of each scene.
+
+    Returns:
+        The anchors that were written.
+
+    Raises:
+        ConfigError: One of them cannot be; nothing was written.
+    """
+    everyone = [*anchors, *followers(anchors)]
+    for plan in [_plan(anchor, t_end) for anchor in everyone]:
+        _apply(plan)
+    return everyone
+
+
+def _plan(anchor: bpy.types.Object, t_end: float | None) -> Plan:
+    times, place = times_of(anchor, t_end), motion_curves.place(anchor)
+    location, quat = motion_curves.pose_at(anchor, place, times.frame(times.t_max))
+    tails = {}
+    if times.t_end > times.t_max:
+        allowed, reach = motion_physics.key_error(anchor)
+        sample = _sampler(anchor, location, quat, times.t_max)
+        future = reduction.reduce(sample, times.t_max, times.t_end, allowed, reach)
+        tails = {
+            "location": motion_curves.frames(future.location, times),
+            "rotation_quaternion": motion_curves.frames(future.rotation, times),
+        }
+    return Plan(anchor, place, times, tails)
+
+
+def _apply(plan: Plan) -> None:
+    anchor, place = plan.anchor, plan.place
+    if place.strip is None and place.action is not None:
+        motion_curves.make_own(anchor)
+        place = motion_curves.place(anchor)
+    motion_curves.replace_after(anchor, place, plan.times.frame(plan.times.t_max), plan.tails)
+    motion_physics.sign(anchor, plan.times)
+    motion_confidence.refresh(anchor, plan.times)
+
+
+def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.Times:
+    """The times of the scene that an anchor belongs to, with another end if one is given.
+
+    Raises:
+        ConfigError: It belongs to none, or is from before motions were remembered.
+    """
+    collection = scene_of(anchor)
+    if collection is None or not motion_physics.has_motion(anchor):
+        raise errors.ConfigError(
+            f"{anchor.name}: expected the anchor of a loaded scene, found none of a motion; load the scene again"
+        )
+    times = timeline.of_collection(collection)
+    return times if t_end is None else replace(times, t_end=max(t_end, times.t_max))
+
+
+def _sampler(anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, t_max: float) -> reduction.Sampler:
+    """Poses past t_max that continue one at t_max: quaternions as long as that is, as keys may be."""
+    state = anchor.r5dgs_motion
+    follow = motion_physics.follow_matrix(state)
+    mover = anchor if follow is None else state.leader
+    model = motion_physics.model(mover)
+    if follow is None and model.inertia is not None:
+        turn = rotations.quats_to_rotmats(rotations.normalize(quat))
+        model = replace(model, inertia=turn @ model.inertia @ turn.T)
+    poses = reduction.model_sampler(model, t_max)
+
+    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        quats, displacements, quat_slopes, slopes = poses(at)
+        if follow is not None:
+            still = np.broadcast_to(quat, quats.shape).copy()
+            return still, location + displacements @ follow.T, np.zeros_like(quats), slopes @ follow.T
+        return (
+            rotations.multiply(quats, quat),
+            location + displacements,
+            rotations.multiply(quat_slopes, quat),
+            slopes,
+        )
+
+    return sample
+
+
+def extrapolate_until(
+    context: bpy.types.Context, collection: bpy.types.Collection, t_end: float, fit_timeline: bool
+) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+    """Extend or shorten the future of a loaded scene.
+
+    Anchors whose keys past t_max were edited by hand are left alone.
+
+    Args:
+        context: Its scene has the frame range.
+        collection: The loaded scene.
+        t_end: Last scene time; one before t_max counts as t_max.
+        fit_timeline: Whether the frame range follows.
+
+    Returns:
+        The anchors that were written, and those that were left alone.
+
+    Raises:
+        ConfigError: An anchor cannot be written; nothing was.
+    """
+    times = timeline.of_collection(collection)
+    anchors = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
+    kept = [anchor for anchor in anchors if motion_physics.hand_edited(anchor, times)]
+    plans = [_plan(anchor, t_end) for anchor in anchors if anchor not in kept]
+    for plan in plans:
+        _apply(plan)
+    collection.r5dgs.t_end = max(t_end, times.t_max)
+    if fit_timeline:
+        timeline.fit_end(context.scene, timeline.of_collection(collection))
+    return [plan.anchor for plan in plans], kept
+
+
+def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Bring the fields of anchors back to the learned motion, and the keys past t_max with them.
+
+    Returns:
+        The anchors that were written.
+
+    Raises:
+        ConfigError: One of them cannot be; nothing was changed.
+    """
+    for anchor in [*anchors, *followers(anchors)]:
+        times_of(anchor)
+        motion_curves.place(anchor)
+    for anchor in anchors:
+        motion_physics.show(anchor.r5dgs_motion, motion_physics.learned(anchor.r5dgs_motion))
+    return re_extrapolate(anchors)
+
+
+def reload(anchors: list[bpy.types.Object], path: Path) -> None:
+    """Give anchors the curves of their scene file again, those of the observed time too, up to their scene's end.
+
+    Curves of location and rotation that the user made are replaced; others, such as of scale, stay.
+
+    Args:
+        anchors: Anchors of one loaded scene.
+        path: Its file.
+
+    Raises:
+        R5dgsError: The file cannot be read or is of another scene, or an anchor cannot be written.
+    """
+    for anchor in anchors:
+        if motion_curves.place(anchor).strip is not None:
+            raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
+    scene = scene_file.read(path)
+    for anchor in anchors:
+        motion_id = anchor.r5dgs.motion_id
+        pivot = np.float32(scene.groups[motion_id].pivot) if motion_id < len(scene.groups) else None
+        if pivot is None or (motion_id and (np.array(anchor.r5dgs.pivot, np.float32) != pivot).any()):
+            raise errors.SceneFileError(f"{path}: expected the scene of '{anchor.name}', found another; load it anew")
+    for anchor in anchors:
+        times = times_of(anchor)
+        motion_curves.make_own(anchor)
+        place = motion_curves.place(anchor)
+        clear(anchor, place)
+        anchor.location, anchor.rotation_quaternion = anchor.r5dgs.pivot, (1.0, 0.0, 0.0, 0.0)
+        allowed, _ = motion_physics.key_error(anchor)
+        exact = replace(times, t_max=float(scene.t_max))
+        keyframes.animate(anchor, scene, anchor.r5dgs.motion_id, exact, allowed / scene.extent)
+        motion_physics.show(anchor.r5dgs_motion, motion_physics.learned(anchor.r5dgs_motion))
+        motion_physics.sign(anchor, times)
+        motion_confidence.refresh(anchor, times)
+
+
+def clear(anchor: bpy.types.Object, place: motion_curves.Place) -> None:
+    """Remove an anchor's curves of location and rotation."""
+    curves = place.curves()
+    if not curves:
+        return
+    owned = compat.channels(place.action, place.slot)
+    for curve in curves.values():
+        owned.remove(curve)

@@ -1,0 +1,51 @@
+"""Bezier segments between two keys of a curve over time, as animation editors keep them: cut without changing them.
+
+A segment is four points (time, value): a key, its right handle, the next key's left handle, that key. [4, 2]
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+_HALVINGS = 80  # of the parameter's range: down to rounding
+
+
+def within(segment: np.ndarray) -> np.ndarray:
+    """The segment as it is evaluated: handles that reach past each other are shortened together. [4, 2] -> [4, 2]"""
+    segment = np.array(segment, np.float64)
+    length = segment[3, 0] - segment[0, 0]
+    reach = abs(segment[1, 0] - segment[0, 0]) + abs(segment[3, 0] - segment[2, 0])
+    if reach > length:
+        share = length / reach
+        segment[1] = segment[0] + share * (segment[1] - segment[0])
+        segment[2] = segment[3] + share * (segment[2] - segment[3])
+    return segment
+
+
+def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cut a segment at a time into two that are the same curve together (de Casteljau).
+
+    Args:
+        segment: Key, handle, handle, key, the keys in order of time. [4, 2]
+        time: Strictly between the keys.
+
+    Returns:
+        The part before that time and the part after it. [4, 2] each
+    """
+    points = within(segment)
+    if not points[0, 0] < time < points[3, 0]:
+        raise ValueError(f"time: expected between {points[0, 0]} and {points[3, 0]}, got {time}")
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _levels(points, middle)[-1][0, 0] < time else (low, middle)
+    levels = _levels(points, 0.5 * (low + high))
+    return np.stack([level[0] for level in levels]), np.stack([level[-1] for level in reversed(levels)])
+
+
+def _levels(points: np.ndarray, share: float) -> list[np.ndarray]:
+    """The points and their repeated means: [4, 2], [3, 2], [2, 2], [1, 2]."""
+    levels = [points]
+    while len(levels[-1]) > 1:
+        levels.append((1 - share) * levels[-1][:-1] + share * levels[-1][1:])
+    return levels

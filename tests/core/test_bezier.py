@@ -1,0 +1,53 @@
+"""Cutting a Bezier segment changes nothing of the curve."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r5dgs_core.motion import bezier
+
+values = st.floats(-5, 5)
+
+
+def on(segment, u):
+    weights = np.array([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u * u * (1 - u), u**3])
+    return weights @ segment
+
+
+def value_at(segment, time):
+    low, high = 0.0, 1.0
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if on(segment, middle)[0] < time else (low, middle)
+    return on(segment, 0.5 * (low + high))[1]
+
+
+@given(
+    ends=st.tuples(values, values),
+    handles=st.tuples(st.floats(0, 3), values, st.floats(0, 3), values),
+    cut=st.floats(0.05, 0.95),
+    at=st.floats(0.01, 0.99),
+)
+def test_the_parts_are_the_curve(ends, handles, cut, at):
+    a, va, b, vb = handles
+    segment = np.array([[0.0, ends[0]], [a, va], [2.0 - b, vb], [2.0, ends[1]]])
+    whole = bezier.within(segment)
+    before, after = bezier.split(segment, 2 * cut)
+    np.testing.assert_allclose(before[3], after[0])
+    np.testing.assert_allclose([before[0], after[3]], [whole[0], whole[3]])
+    np.testing.assert_allclose(before[3, 0], 2 * cut, atol=1e-12)
+    part, time = (before, 2 * cut * at) if at < 0.5 else (after, 2 * cut + (2 - 2 * cut) * at)
+    if np.diff(whole[:, 0]).min() > 1e-2:  # a curve that stands still in time has no one value there
+        assert value_at(part, time) == pytest.approx(value_at(whole, time), abs=1e-9)
+
+
+def test_handles_that_pass_each_other_are_shortened_to_meet():
+    crossed = np.array([[0.0, 0.0], [3.0, 3.0], [-1.0, 1.0], [2.0, 2.0]])
+    np.testing.assert_allclose(bezier.within(crossed), [[0, 0], [1, 1], [1, 1 + 2 / 3], [2, 2]])
+
+
+@pytest.mark.parametrize("time", [0.0, 2.0, -1.0, 3.0])
+def test_a_cut_outside_is_refused(time):
+    with pytest.raises(ValueError, match="between"):
+        bezier.split(np.array([[0.0, 0], [0.5, 0], [1.5, 0], [2.0, 0]]), time)
