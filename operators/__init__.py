@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture_dataset, check_worker, load_scene, preview, select_by_prompt, set_display
+from . import capture_dataset, check_worker, export_ply, load_scene, preview, select_by_prompt, set_display
 
-MODULES = (load_scene, set_display, select_by_prompt, preview, check_worker, capture_dataset)
+MODULES = (load_scene, set_display, select_by_prompt, preview, check_worker, export_ply, capture_dataset)
 
 
 def _menu_import(menu, context):
@@ -12,6 +12,7 @@ def _menu_import(menu, context):
 
 
 def _menu_export(menu, context):
+    menu.layout.operator(export_ply.R5DGS_OT_export_ply.bl_idname, text="R5DGS Gaussians (.ply)")
     menu.layout.operator(capture_dataset.R5DGS_OT_capture_dataset.bl_idname, text="R5DGS Training Data Set")
 
 

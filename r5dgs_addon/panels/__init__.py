@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, preview, prompt, scene
+from . import capture, export, preview, prompt, scene
 
-MODULES = (scene, prompt, preview, capture)
+MODULES = (scene, prompt, preview, export, capture)
 
 
 def register():

@@ -1,0 +1,75 @@
+"""Export PLY: what Blender shows of loaded scenes as 3D Gaussian Splatting files."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..r5dgs_addon import export_gaussians, export_running, objects
+
+
+class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
+    """Write Gaussians where they are now, edits included, as PLY files that other splat tools read"""
+
+    bl_idname = "r5dgs.export_ply"
+    bl_label = "Export Gaussians"
+    bl_options = {"REGISTER", "PRESET"}
+
+    filepath: StringProperty(name="File", description="The .ply file", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    check_existing: BoolProperty(default=True, options={"HIDDEN"})
+    which: EnumProperty(name="Objects", description="What is exported", items=export_gaussians.WHICH, default="VISIBLE")
+    frames: EnumProperty(
+        name="Frames",
+        description="When it is exported",
+        items=(
+            ("CURRENT", "This Frame", "One file"),
+            ("RANGE", "Frame Range", "A numbered file for each frame of the scene's range"),
+        ),
+    )
+    frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
+    axes: EnumProperty(name="Axes", description="World that the positions are in", items=export_gaussians.AXES)
+    plain: BoolProperty(
+        name="Plain",
+        description="Leave out object ids and identity encodings, for tools that refuse columns they do not know",
+        default=False,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if not objects.scene_collections():
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+    def suggest(self, context):
+        if not self.filepath:
+            stem = Path(bpy.data.filepath).stem or "gaussians"
+            self.filepath = str(Path(bpy.path.abspath("//")) / f"{stem}.ply") if bpy.data.filepath else f"{stem}.ply"
+        return False
+
+    def steps(self, context):
+        path = Path(bpy.path.abspath(self.filepath))
+        return export_gaussians.ply_steps(
+            context,
+            path if path.suffix.lower() == ".ply" else path.with_name(path.name + ".ply"),
+            self.which,
+            axes=self.axes,
+            plain=self.plain,
+            every=self.frames == "RANGE",
+            step=self.frame_step,
+        )
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(self, "which")
+        layout.prop(self, "frames")
+        if self.frames == "RANGE":
+            layout.prop(self, "frame_step")
+        layout.prop(self, "axes")
+        layout.prop(self, "plain")
+
+
+CLASSES = (R5DGS_OT_export_ply,)

@@ -1,0 +1,218 @@
+"""Exported PLY files hold what Blender shows: for the core's own picture of it, and for readers of others."""
+
+import dataclasses
+import importlib
+
+import numpy as np
+import pytest
+
+from r5dgs_core.model import spherical_harmonics
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import cameras, playback, ply, scene_file
+from tests import scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+from mathutils import Matrix, Quaternion  # noqa: E402  (bpy brings it)
+
+WORLD = cameras.WORLD_TO_BLENDER["colmap"]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    made = scenes.make_scene(n=300, objects=3, sh_degree=3, seed=4, world_convention="colmap")
+    return scene_file.read(scene_file.write(made, tmp_path / "scene.r5dgs"))
+
+
+@pytest.fixture
+def loaded(blender, scene, tmp_path):
+    blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "scene.r5dgs"))
+    return next(c for c in blender.data.collections if c.r5dgs.is_scene)
+
+
+@pytest.fixture
+def gaussians(blender):
+    return importlib.import_module("r5dgs.r5dgs_addon.export_gaussians")
+
+
+def export(bpy, path, **options):
+    assert bpy.ops.r5dgs.export_ply(filepath=str(path), **options) == {"FINISHED"}
+    return ply.read(path)
+
+
+def cloud(collection, name):
+    return next(o for o in collection.all_objects if o.name == name and o.r5dgs.role == "CLOUD")
+
+
+def edit(bpy, collection):
+    """Move, turn and scale one object, mirror another, hide a third. Its anchor moves the first all the same."""
+    mug, apple, car = (cloud(collection, name) for name in ("mug", "red apple", "toy car"))
+    turn = Quaternion((0.6, 0.3, -0.5, 0.4)).normalized().to_matrix().to_4x4()
+    mug.matrix_local = Matrix.Translation((0.3, -0.2, 0.4)) @ turn @ Matrix.Scale(1.6, 4)
+    apple.scale = (-1, 1, 1)
+    car.hide_set(True)
+    bpy.context.view_layer.update()
+    return mug, apple, car
+
+
+def render(splats, scene, camera, backend="reference"):
+    """The core's picture of the Gaussians of a file, over the scene's sky."""
+    posed = scene_render.PosedScene(
+        splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
+        np.zeros(len(splats.means), np.int32), np.eye(3)[None], np.zeros(len(splats.means), np.int64), None,
+    )  # fmt: skip
+    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
+    picture = scene_render.render_frame(scene, posed, camera, background=background, backend=backend)
+    return np.clip(picture.color.numpy(), 0, 1)
+
+
+def psnr(a, b):
+    return -10 * np.log10(((a - b) ** 2).mean())
+
+
+def shown(scene, collection, camera):
+    """The core's picture of what Blender shows, by maps of the bind state."""
+    instances = [
+        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64))
+        for o in collection.all_objects
+        if o.r5dgs.role == "CLOUD" and o.visible_get()
+    ]
+    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
+    pose = scene_render.pose_instances(scene, instances)
+    return np.clip(scene_render.render_frame(scene, pose, camera, background=background).color.numpy(), 0, 1)
+
+
+def in_blender(camera):
+    world = np.eye(4)
+    world[:3, :3] = WORLD
+    return dataclasses.replace(camera, T_cam_world=camera.T_cam_world @ np.linalg.inv(world))
+
+
+def test_what_was_moved_turned_scaled_and_mirrored_looks_as_in_blender(blender, scene, loaded, tmp_path):
+    blender.context.scene.frame_set(20)
+    edit(blender, loaded)
+    camera = in_blender(scene.cameras[0])
+    splats = export(blender, tmp_path / "a.ply")
+    assert splats.sh.shape[1] == 16
+    wanted = shown(scene, loaded, camera)
+    assert psnr(render(splats, scene, camera), wanted) > 50
+    blender.context.scene.frame_set(50)
+    assert psnr(render(splats, scene, camera), shown(scene, loaded, camera)) < 35  # the file is that of frame 20
+
+
+def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path):
+    blender.context.scene.frame_set(13, subframe=0.5)
+    splats = export(blender, tmp_path / "a.ply", axes="FILE")
+    frame = playback.frame(scene, 12.5 / 60)
+    np.testing.assert_allclose(np.sort(splats.means, axis=0), np.sort(frame.means, axis=0), atol=1e-5 * scene.extent)
+    wanted = np.clip(
+        scene_render.render_frame(
+            scene, frame, scene.cameras[0], background=spherical_harmonics.dc_to_rgb(scene.background_sh[0])
+        ).color.numpy(), 0, 1,
+    )  # fmt: skip
+    assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
+
+
+def test_a_tint_is_baked_into_the_colours(blender, loaded, tmp_path):
+    before = export(blender, tmp_path / "a.ply")
+    mug = cloud(loaded, "mug")
+    mug.r5dgs_look.tint = (0.5, 1.0, 0.25)
+    after = export(blender, tmp_path / "b.ply")
+    rows = after.object_ids == mug.r5dgs.object_id
+    colour = spherical_harmonics.dc_to_rgb
+    np.testing.assert_allclose(colour(after.sh[rows, 0]), colour(before.sh[rows, 0]) * (0.5, 1, 0.25), atol=1e-6)
+    np.testing.assert_array_equal(after.sh[~rows], before.sh[~rows])
+
+
+def test_selected_objects_come_alone_by_cloud_or_by_anchor(blender, scene, loaded, tmp_path):
+    blender.ops.object.select_all(action="DESELECT")
+    lemon = cloud(loaded, "mug")
+    for handle in (lemon, lemon.parent):
+        handle.select_set(True)
+        found = export(blender, tmp_path / "a.ply", which="SELECTED")
+        assert set(found.object_ids) == {lemon.r5dgs.object_id}
+        assert len(found.means) == scene.object(lemon.r5dgs.object_id).count
+        handle.select_set(False)
+    with pytest.raises(RuntimeError, match="select"):
+        blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "none.ply"), which="SELECTED")
+    assert not (tmp_path / "none.ply").exists()
+
+
+def test_a_range_is_a_numbered_file_for_each_frame_and_the_frame_stays(blender, scene, loaded, tmp_path):
+    view = blender.context.scene
+    view.frame_start, view.frame_end = 5, 9
+    view.frame_set(30, subframe=0.25)
+    assert blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply"), frames="RANGE", frame_step=2) == {"FINISHED"}
+    assert sorted(p.name for p in tmp_path.glob("*.ply")) == ["a_0005.ply", "a_0007.ply", "a_0009.ply"]
+    assert (view.frame_current, view.frame_subframe) == (30, 0.25)
+    wanted = playback.frame(scene, 6 / 60).means @ WORLD.T
+    found = ply.read(tmp_path / "a_0007.ply").means
+    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
+
+
+def test_stopping_keeps_the_files_that_were_finished(blender, loaded, gaussians, tmp_path):
+    view = blender.context.scene
+    view.frame_start, view.frame_end = 1, 5
+    steps = gaussians.ply_steps(blender.context, tmp_path / "a.ply", "VISIBLE", axes="BLENDER", plain=False, every=True)
+    for _ in range(3):
+        next(steps)
+    steps.close()
+    assert view.frame_current == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a_0001.ply", "a_0002.ply", "scene.r5dgs"]
+    assert len(ply.read(tmp_path / "a_0002.ply").means) == 300
+
+
+@pytest.mark.parametrize("axes", ["BLENDER", "FILE", "COLMAP", "OPENGL"])
+def test_axes_turn_the_whole_and_plain_files_have_no_ids(blender, scene, loaded, axes, tmp_path):
+    blender.context.scene.frame_set(46)  # t_max: the bind state
+    found = export(blender, tmp_path / "a.ply", axes=axes, plain=True)
+    assert found.object_ids is None and found.identities is None
+    turned = {"BLENDER": WORLD, "FILE": np.eye(3), "COLMAP": np.eye(3)}
+    turned["OPENGL"] = cameras.WORLD_TO_BLENDER["opengl"].T @ WORLD
+    wanted = scene.means @ turned[axes].T
+    np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5)
+
+
+def test_without_the_scene_file_the_points_in_blender_do(blender, loaded, tmp_path, capsys):
+    first = export(blender, tmp_path / "a.ply")
+    (tmp_path / "scene.r5dgs").unlink()
+    second = export(blender, tmp_path / "b.ply")
+    assert "Taken from the points in Blender" in capsys.readouterr().out
+    for name in ("means", "log_scales"):
+        np.testing.assert_allclose(getattr(second, name), getattr(first, name), atol=2e-6, err_msg=name)
+    np.testing.assert_array_equal(second.object_ids, first.object_ids)
+    assert second.identities is None
+
+
+def test_third_parties_read_the_columns(blender, loaded, tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'mesh'")
+    ours = export(blender, tmp_path / "a.ply")
+    theirs = trimesh.load(tmp_path / "a.ply")
+    np.testing.assert_array_equal(np.asarray(theirs.vertices, np.float32), ours.means)
+    raw = theirs.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(raw["opacity"].ravel(), ours.opacity_logits)
+    np.testing.assert_array_equal(raw["obj_id"].ravel(), ours.object_ids)
+    for c in range(3):
+        np.testing.assert_array_equal(raw[f"f_rest_{c * 15 + 4}"].ravel(), ours.sh[:, 5, c])
+    rest = np.stack([raw[f"rot_{i}"].ravel() for i in range(4)], -1)
+    np.testing.assert_allclose(rest, ours.quats, atol=1e-6)
+
+
+def test_what_cannot_be_exact_is_said(blender, loaded, tmp_path, capsys):
+    cloud(loaded, "mug").scale = (1, 2, 1)
+    cloud(loaded, "red apple").scale = (0, 0, 0)
+    blender.context.view_layer.update()
+    export(blender, tmp_path / "a.ply")
+    said = capsys.readouterr().out
+    assert "mug: scaled unevenly" in said
+    assert "red apple: left out" in said
+
+
+def test_a_folder_that_is_not_there_is_an_error_and_no_file(blender, loaded, tmp_path):
+    with pytest.raises(RuntimeError, match=r"a\.ply.*cannot be written"):
+        blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "none" / "a.ply"))
+    assert not (tmp_path / "none").exists()
+
+
+def test_without_a_scene_the_operator_says_what_to_do(blender):
+    assert not blender.ops.r5dgs.export_ply.poll()
