@@ -60,13 +60,14 @@ def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, s
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
-    for menu, operator in (("import", "r5dgs.load_scene"), ("export", "r5dgs.capture_dataset")):
+    exports = ["r5dgs.export_ply", "r5dgs.capture_dataset"]
+    for menu, operators in (("import", ["r5dgs.load_scene"]), ("export", exports)):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs
         ours = [function for function in functions if function.__module__.startswith("r5dgs.")]
         said = []
         for function in ours:
             function(SimpleNamespace(layout=layouts.Layout(blender, said)), blender.context)
-        assert said == [operator]
+        assert said == operators
     handler = blender.types.R5DGS_FH_scene
     assert (handler.bl_import_operator, handler.bl_file_extensions) == ("r5dgs.load_scene", ".r5dgs")
     extension.unregister()
