@@ -7,7 +7,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_preview(bpy.types.Operator):
-    """Render the loaded scene as the active camera sees it, in the worker, into the image 'R5DGS Preview'"""
+    """Render the loaded scenes as the active camera sees them, in the worker, into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"
     bl_label = "Preview"
@@ -30,7 +30,7 @@ class R5DGS_OT_preview(bpy.types.Operator):
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
-            self._job = picture.start(context, objects.active_collection(context))
+            self._job = picture.start(context)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -50,11 +50,11 @@ class R5DGS_OT_preview(bpy.types.Operator):
             return {"PASS_THROUGH"}
         self._leave(context)
         try:
-            image, milliseconds = picture.finish(*self._job.answer())
+            image, result = picture.finish(self._job.answer())
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return self._done(context, image, milliseconds)
+        return self._done(context, image, result)
 
     def cancel(self, context):
         """Stop the worker, which has no other way to leave a picture unfinished."""
@@ -64,13 +64,14 @@ class R5DGS_OT_preview(bpy.types.Operator):
 
     def execute(self, context):
         try:
-            image, milliseconds = picture.preview(context, objects.active_collection(context))
+            image, result = picture.preview(context)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return self._done(context, image, milliseconds)
+        return self._done(context, image, result)
 
-    def _done(self, context, image, milliseconds):
+    def _done(self, context, image, result):
+        milliseconds = result["ms_motion"] + result["ms_raster"]
         session = context.window_manager.r5dgs
         session.preview_ms = milliseconds
         session.preview_size = f"{image.size[0]} x {image.size[1]}"

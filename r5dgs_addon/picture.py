@@ -1,7 +1,8 @@
 """What Blender shows, as a request to the worker, and the worker's picture as a Blender image.
 
-The picture is display-referred sRGB, as trained. It is kept in an image of 8 bits per channel in the color space sRGB:
-Blender shows such images as they are, saves the same bytes, and linearises them where the compositor needs it.
+All loaded scenes of the active Blender scene are in one picture, in Blender's world. The picture is display-referred
+sRGB, as trained. It is kept in an image of 8 bits per channel in the color space sRGB: Blender shows such images as
+they are, saves the same bytes, and linearises them where the compositor needs it.
 """
 
 from dataclasses import dataclass
@@ -10,79 +11,104 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
-from . import objects, worker
+from . import views, visible, worker
 
 IMAGE = "R5DGS Preview"
+WANTED = ("depth", "alpha", "owners")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What Blender shows of a loaded scene.
+    """What Blender shows of its loaded scenes.
 
     Attributes:
-        camera: The active camera, in the scene's world (that of the file, not Blender's).
-        instances: One entry per visible point cloud: first row, rows, and the map of its bind state. [4, 4]
+        view: What looks, in Blender's world.
+        scenes: Collections of the loaded scenes that can be seen; instances number them.
+        worlds: Map of each scene's world to Blender's. [4, 4] each
+        instances: Visible clouds and instances of them.
     """
 
-    camera: cameras.Camera
-    instances: list[tuple[int, int, np.ndarray]]
+    view: views.View
+    scenes: tuple[bpy.types.Collection, ...]
+    worlds: tuple[np.ndarray, ...]
+    instances: tuple[visible.Instance, ...]
+
+    @property
+    def camera(self) -> cameras.Camera:
+        """The camera, in Blender's world, OpenCV axes."""
+        return self.view.camera
 
 
-def preview(context: bpy.types.Context, collection: bpy.types.Collection) -> tuple[bpy.types.Image, float]:
-    """Render what Blender shows into the image `R5DGS Preview`, and wait for it.
+def shown(
+    depsgraph: bpy.types.Depsgraph, view: views.View | None = None, space: bpy.types.SpaceView3D | None = None
+) -> Shown:
+    """What Blender shows of its loaded scenes at the evaluated frame, sub-frame included.
 
     Args:
-        context: Its scene has the camera, the resolution and the frame.
-        collection: A loaded scene.
+        depsgraph: Evaluated; one of a viewport hides what viewports hide, one of a render what renders hide.
+        view: What looks, of `views`; the active camera where None.
+        space: A 3D view whose local view hides the rest.
 
     Returns:
-        The image, and the milliseconds that the worker took to pose and rasterize.
+        View, scenes and instances.
+
+    Raises:
+        ConfigError: The camera cannot be expressed, or a cloud has lost its points.
     """
-    seen = shown(context, collection)
-    return finish(*render(collection, seen))
+    scenes, instances = visible.instances(depsgraph, space)
+    if view is None:
+        view = views.of_camera(depsgraph, visible.points(instances))
+    return Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
 
 
-def start(context: bpy.types.Context, collection: bpy.types.Collection) -> worker.Job:
-    """Begin a `preview` without waiting; give the job's answer to `finish`."""
-    return worker.start(_steps(collection, shown(context, collection), (), True))
+def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Have the worker render, and wait for it.
 
+    Args:
+        seen: What `shown` gave.
+        want: Any of ``depth alpha owners``.
+        sky: Whether the first scene's sky lies behind everything, or black.
 
-def finish(result: dict[str, Any], arrays: dict[str, np.ndarray]) -> tuple[bpy.types.Image, float]:
-    """Put the worker's answer into the image `R5DGS Preview`; returns what `preview` does."""
-    return write_image(IMAGE, arrays["color"]), result["ms_motion"] + result["ms_raster"]
+    Returns:
+        The result, with ``ms_motion``, ``ms_raster`` and ``gaussians``, and arrays, top row first: ``color``, display-
+        referred sRGB over the sky or, without one, multiplied by alpha [H, W, 3]; ``alpha`` [H, W]; ``depth``, expected
+        z in the camera frame divided by alpha, 0 where alpha is 0 [H, W]; ``owners``, which of ``seen.instances`` has
+        the largest share of the pixel, -1 where alpha is below a half [H, W] int32.
 
-
-def render(
-    collection: bpy.types.Collection, seen: Shown, want: tuple[str, ...] = (), background: bool = True
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Have the worker render: its result and the arrays ``color`` [H, W, 3] and those wanted (alpha, depth, ids)."""
+    Raises:
+        R5dgsError: What the worker reports.
+    """
     answer: tuple[dict[str, Any], dict[str, np.ndarray]] = {}, {}
-    for _, command, arguments in _steps(collection, seen, want, background):
+    for _, command, arguments in steps(seen, want, sky):
         answer = worker.request(command, **arguments)
-    return answer
+    return finished(seen, answer)
 
 
-def _steps(
-    collection: bpy.types.Collection, seen: Shown, want: tuple[str, ...], background: bool
-) -> list[tuple[str, str, dict[str, Any]]]:
-    """The worker's requests for a picture; the last one's answer is the picture."""
-    camera = seen.camera
-    view = {
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "intrinsics": camera.intrinsics.tolist(),
-            "T_cam_world": camera.T_cam_world.tolist(),
-        },
-        "instances": [{"start": s, "count": n, "matrix": m.tolist()} for s, n, m in seen.instances],
-        "background": background,
+def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
+    """The worker's requests for a picture, as `worker.start` takes them; give the last one's answer to `finished`."""
+    picture = {
+        "camera": seen.view.request(),
+        "instances": [instance.request() for instance in seen.instances],
+        "sky": {"scene": 0, "matrix": seen.worlds[0].tolist()} if sky and seen.scenes else None,
+        "near": seen.view.near,
         "want": list(want),
     }
-    return [("loading the scene", "load", {"path": str(scene_path(collection))}), ("rendering", "render", view)]
+    paths = [str(scene_path(collection)) for collection in seen.scenes]
+    return [("loading the scenes", "load", {"paths": paths}), ("rendering", "render", picture)]
+
+
+def finished(
+    seen: Shown, answer: tuple[dict[str, Any], dict[str, np.ndarray]]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The worker's answer to `steps` as `render` returns it."""
+    result, arrays = answer
+    if "depth" in arrays and seen.view.distance:
+        depth = arrays["depth"].astype(np.float64) - seen.view.distance
+        arrays = {**arrays, "depth": np.where(arrays["depth"] > 0, depth, 0).astype(np.float32)}
+    return result, arrays
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:
@@ -102,89 +128,28 @@ def scene_path(collection: bpy.types.Collection) -> Path:
     )
 
 
-def shown(context: bpy.types.Context, collection: bpy.types.Collection) -> Shown:
-    """What Blender shows of a loaded scene at the current frame, sub-frame included.
+def preview(context: bpy.types.Context) -> tuple[bpy.types.Image, dict[str, Any]]:
+    """Render what Blender shows into the image `R5DGS Preview`, and wait for it.
 
     Args:
-        context: Its scene has the camera and the frame; what its view layer hides is left out.
-        collection: A loaded scene.
+        context: Its scene has the camera, the resolution and the frame; what its view layer hides is left out.
 
     Returns:
-        The camera and the visible clouds, in the coordinates of the scene's file.
-
-    Raises:
-        ConfigError: The camera or the root cannot be expressed.
+        The image, and the worker's result: ``ms_motion``, ``ms_raster``, ``gaussians``.
     """
-    depsgraph = context.evaluated_depsgraph_get()
-    root = collection.r5dgs.root
-    world = np.eye(4) if root is None else np.array(root.evaluated_get(depsgraph).matrix_world, np.float64)
-    _check_root(collection, world)
-    scene_world = np.linalg.inv(world)
-    instances = []
-    for cloud in objects.members(collection, "CLOUD"):
-        if not cloud.visible_get(view_layer=context.view_layer):
-            continue
-        matrix = scene_world @ np.array(cloud.evaluated_get(depsgraph).matrix_world, np.float64)
-        if np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) == 3:  # scaled to nothing: nothing to see
-            instances.append((cloud.r5dgs.start, cloud.r5dgs.count, matrix))
-    return Shown(_camera(context, depsgraph, scene_world), instances)
+    result, arrays = render(shown(context.evaluated_depsgraph_get()))
+    return write_image(IMAGE, arrays["color"]), result
 
 
-def _check_root(collection: bpy.types.Collection, world: np.ndarray) -> None:
-    scales = np.linalg.svd(world[:3, :3], compute_uv=False)
-    if scales[-1] <= 1e-9 or scales[0] - scales[-1] > 1e-4 * scales[0] or np.linalg.det(world[:3, :3]) < 0:
-        raise errors.ConfigError(
-            f"{collection.name}: expected the root empty to have one scale > 0 on all axes, found "
-            f"{', '.join(f'{s:.4g}' for s in scales)}; scale the objects' anchors instead"
-        )
+def start(context: bpy.types.Context) -> worker.Job:
+    """Begin a `preview` without waiting; give the job's answer to `finish`."""
+    return worker.start(steps(shown(context.evaluated_depsgraph_get())))
 
 
-def _camera(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, scene_world: np.ndarray) -> cameras.Camera:
-    scene, camera = context.scene, context.scene.camera
-    if camera is None or camera.type != "CAMERA":
-        raise errors.ConfigError(f"{scene.name}: expected an active camera, found none; add one to the scene")
-    if camera.data.type != "PERSP":
-        raise errors.ConfigError(
-            f"{camera.name}: expected a perspective camera, found {camera.data.type.lower()}; set its lens type to "
-            "Perspective"
-        )
-    render_settings = scene.render
-    # Whole numbers, as Blender does it: 100 * (29 / 100) is less than 29 in floating point.
-    width = max(render_settings.resolution_x * render_settings.resolution_percentage // 100, 1)
-    height = max(render_settings.resolution_y * render_settings.resolution_percentage // 100, 1)
-    evaluated = camera.evaluated_get(depsgraph)
-    projection = evaluated.calc_matrix_camera(
-        depsgraph,
-        x=width,
-        y=height,
-        scale_x=render_settings.pixel_aspect_x,
-        scale_y=render_settings.pixel_aspect_y,
-    )
-    matrix = scene_world @ np.array(evaluated.matrix_world, np.float64)
-    return cameras.Camera(
-        width, height, intrinsics_of(projection, width, height), cameras.opengl_to_cam_world(matrix), camera.name
-    )
-
-
-def intrinsics_of(projection: Matrix, width: int, height: int) -> np.ndarray:
-    """Camera matrix in pixels, OpenCV axes, of an OpenGL perspective projection; sensor fit and shift are in it.
-
-    Args:
-        projection: Camera space to clip space. [4, 4]
-        width: Image width in pixels.
-        height: Image height in pixels.
-
-    Returns:
-        The matrix. [3, 3]
-    """
-    p = np.array(projection, np.float64)
-    return np.array(
-        [
-            [0.5 * width * p[0, 0], 0.0, 0.5 * width * (1 - p[0, 2])],
-            [0.0, 0.5 * height * p[1, 1], 0.5 * height * (1 + p[1, 2])],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.types.Image, dict[str, Any]]:
+    """Put the worker's answer into the image `R5DGS Preview`; returns what `preview` does."""
+    result, arrays = answer
+    return write_image(IMAGE, arrays["color"]), result
 
 
 def write_image(name: str, color: np.ndarray) -> bpy.types.Image:

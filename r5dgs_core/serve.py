@@ -7,9 +7,10 @@ arrays that the line announces, in order:
     <- {"id": 1, "ok": true, "result": {...}, "arrays": [{"name": "color", "dtype": "<f4", "shape": [H, W, 3]}]} + bytes
     <- {"id": 1, "ok": false, "error": {"kind": "SceneFileError", "message": "..."}}
 
-One scene stays loaded. The worker ends when its input ends. Torch and the rasterizer are imported after the first
-answer, so that ``hello`` can say what is missing; the rasterizer is then made ready beside the requests, and who wants
-a picture sooner waits for it. Where it has to be compiled for that, lines of no request say so, between answers:
+The scenes of the last ``load`` stay loaded. The worker ends when its input ends. Torch and the rasterizer are imported
+after the first answer, so that ``hello`` can say what is missing; the rasterizer is then made ready beside the
+requests, and who wants a picture sooner waits for it. Where it has to be compiled for that, lines of no request say so,
+between answers:
 
     <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
     <- {"event": "ready", "seconds": 7.9, "arrays": []}
@@ -38,7 +39,7 @@ from .scene import lookup, playback, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
 
-PROTOCOL = 2
+PROTOCOL = 3
 NEEDED = ("torch", "numba")
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -88,7 +89,7 @@ class Warming:
 
 
 class Server:
-    """Answers requests; holds the scene that was loaded last.
+    """Answers requests; holds the scenes that were loaded last.
 
     Args:
         warming: What is waited for before the first picture.
@@ -96,10 +97,9 @@ class Server:
 
     def __init__(self, warming: Warming | None = None) -> None:
         self._warming = warming
-        self._scene: Scene | None = None
-        self._stamp: tuple[str, int, int] | None = None
-        self._stage = None  # of the scene, from the first picture on
-        self._player: playback.Player | None = None  # of the scene, from the first time that is asked for
+        self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
+        self._stage = None  # of the scenes, from the first picture on
+        self._players: dict[int, playback.Player] = {}  # of each scene, from the first time that is asked for
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
@@ -130,58 +130,86 @@ class Server:
         return {"protocol": PROTOCOL, "python": platform.python_version(), "missing": missing, "pid": os.getpid()}, {}
 
     def _load(self, request: dict[str, Any]) -> Answer:
-        """``path``: read a scene file, unless this very file is loaded already."""
-        path = Path(_need(request, "path", str))
-        try:
-            status = path.stat()
-        except OSError as error:
-            raise errors.SceneFileError(
-                f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
-                "'Scene File' in the R5DGS tab"
-            ) from error
-        stamp = (str(path), status.st_mtime_ns, status.st_size)
-        if self._scene is None or stamp != self._stamp:
-            self._scene, self._stamp, self._stage, self._player = None, None, None, None
-            self._scene, self._stamp = scene_file.read(path), stamp
-        return {"name": self._scene.name, "gaussians": len(self._scene.means)}, {}
+        """``paths``: read scene files, in this order; what is loaded already is kept, what is not named is let go."""
+        paths = _need(request, "paths", list)
+        stamps = list(dict.fromkeys(_stamp(path) for path in paths))
+        if stamps != list(self._scenes):
+            known, self._scenes, self._stage, self._players = self._scenes, {}, None, {}
+            known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # before others need room
+            found = {stamp: known.get(stamp) or scene_file.read(Path(stamp[0])) for stamp in stamps}
+            self._scenes = found
+        places = list(self._scenes)
+        return {
+            "scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in self._scenes.values()],
+            "numbers": [places.index(_stamp(path)) for path in paths],
+        }, {}
 
     def _render(self, request: dict[str, Any]) -> Answer:
-        """Rasterize the loaded scene.
+        """Rasterize the loaded scenes.
 
-        ``camera``: ``width height intrinsics T_cam_world`` in the scene's world. Either ``t`` (playback) or
-        ``instances``: a list of ``start count matrix``, each a range of Gaussians and the [4, 4] map of its bind state
-        into the scene's world. ``background`` (default true): the scene's sky. ``want``: any of ``depth alpha ids``.
+        ``camera``: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture. What is seen is
+        either ``instances``, a list of ``scene start count matrix world tint``: a range of a scene's Gaussians, the
+        [4, 4] map of its bind state into that world, that of the scene's own world (with which its light turns; the
+        same where left out), and factors on its colours; or ``t``, playback of ``scene`` in its own world. ``sky``:
+        null for black, or ``scene matrix``; with ``t``, that scene's where left out. ``near``: nearest depth that is
+        drawn, the scenes' own where left out. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for
+        ``owners``: the instance, or object, with the largest share of each pixel, -1 for none.
         """
-        scene = self._loaded()
+        scenes = self._loaded()
         camera = _camera(_need(request, "camera", dict))
-        want = request.get("want", [])
-        unknown = set(want) - {"depth", "alpha", "ids"}
+        moved = "instances" in request
+        known, want = ("alpha", "depth", "owners" if moved else "ids"), request.get("want", [])
+        unknown = set(want) - set(known)
         if unknown:
-            raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are alpha, depth, ids")
-        scene_render, sky = self._rasterizer(), request.get("background", True)
+            raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are {', '.join(known)}")
+        near = request.get("near")
+        if near is not None and not (isinstance(near, int | float) and near > 0):
+            raise errors.ConfigError(f"worker: 'near' has to be a depth > 0, found {near!r}")
+        scene_render = self._rasterizer()
         started = time.perf_counter()
-        if "instances" in request:
-            instances = [_instance(entry) for entry in request["instances"]]
-            if self._stage is None:
-                from .raster import stage
-
-                self._stage = stage.Stage(scene)
-            output = self._stage.render(instances, camera, sky=bool(sky))
-            ms_motion, count = self._stage.ms_motion, sum(instance.count for instance in instances)
+        if moved:
+            output, ms_motion, count = self._instances(request, scenes, camera, near)
         else:
-            t = float(_need(request, "t", (int, float)))
-            if self._player is None:
-                self._player = playback.Player(scene)
-            pose = scene_render.pose_frame(scene, self._player.frame(t, camera.center))
-            ms_motion, count = 1e3 * (time.perf_counter() - started), len(pose.means)
-            output = scene_render.render_frame(scene, pose, camera, background="scene" if sky else None)
+            output, ms_motion, count = self._playback(request, scenes, camera, near)
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
         for name in want:
-            value = getattr(output, name)
-            if value is not None:
-                arrays[name] = scene_render.to_numpy(value, np.int32 if name == "ids" else np.float32)
+            value = output.ids if name in ("ids", "owners") else getattr(output, name)
+            arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
         return {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count}, arrays
+
+    def _instances(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
+        from .raster import stage
+
+        instances = [_instance(entry, len(scenes)) for entry in request["instances"]]
+        sky = request.get("sky")
+        if sky is not None:
+            if not isinstance(sky, dict):
+                raise errors.ConfigError(f"worker: 'sky' has to be null or scene and matrix, found {sky!r}")
+            sky = stage.Sky(_number(sky, len(scenes)), _matrix(sky.get("matrix"), 4, "the matrix of the sky"))
+        if self._stage is None:
+            self._stage = stage.Stage(scenes)
+        output = self._stage.render(instances, camera, sky=sky, near=near)
+        return output, self._stage.ms_motion, sum(instance.count for instance in instances)
+
+    def _playback(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
+        from .raster import RasterSettings, scene_render
+
+        started = time.perf_counter()
+        number, t = _number(request, len(scenes)), float(_need(request, "t", (int, float)))
+        scene = scenes[number]
+        if number not in self._players:
+            self._players[number] = playback.Player(scene)
+        pose = scene_render.pose_frame(scene, self._players[number].frame(t, camera.center))
+        ms_motion = 1e3 * (time.perf_counter() - started)
+        output = scene_render.render_frame(
+            scene,
+            pose,
+            camera,
+            background="scene" if request.get("sky", {}) is not None else None,
+            settings=RasterSettings(near_plane=scene.near_plane if near is None else near),
+        )
+        return output, ms_motion, len(pose.means)
 
     def _warm_up(self, _: dict[str, Any]) -> Answer:
         """Make the rasterizer ready; how many kernels this process had to ``compile`` for that."""
@@ -193,14 +221,15 @@ class Server:
         return {"compiled": compilation.compiled()}, {}
 
     def _query(self, request: dict[str, Any]) -> Answer:
-        """``text``: ranked objects of the loaded scene."""
-        found = lookup.search(self._loaded(), _need(request, "text", str))
+        """``text``: ranked objects of a loaded ``scene``, the first one where left out."""
+        scenes = self._loaded()
+        found = lookup.search(scenes[_number(request, len(scenes))], _need(request, "text", str))
         return {"matches": [{"object_id": m.object_id, "score": m.score, "why": m.why} for m in found]}, {}
 
-    def _loaded(self) -> Scene:
-        if self._scene is None:
+    def _loaded(self) -> list[Scene]:
+        if not self._scenes:
             raise errors.ConfigError("worker: no scene is loaded; send 'load' first")
-        return self._scene
+        return list(self._scenes.values())
 
     def _rasterizer(self):
         """`raster.scene_render`, once it is warm."""
@@ -227,6 +256,28 @@ def _need(request: dict[str, Any], key: str, kind: type | tuple[type, ...]) -> A
     return value
 
 
+def _stamp(path: Any) -> tuple[str, int, int]:
+    """What tells a scene file from another, and from itself after a change."""
+    if not isinstance(path, str):
+        raise errors.ConfigError(f"worker: 'load' needs paths, found {path!r}")
+    try:
+        status = Path(path).stat()
+    except OSError as error:
+        raise errors.SceneFileError(
+            f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
+            "'Scene File' in the R5DGS tab"
+        ) from error
+    return path, status.st_mtime_ns, status.st_size
+
+
+def _number(value: dict[str, Any], count: int) -> int:
+    """Which of the loaded scenes is meant; the first one where nothing is said."""
+    number = value.get("scene", 0)
+    if not isinstance(number, int) or not 0 <= number < count:
+        raise errors.ConfigError(f"worker: 'scene' has to be a number below {count}, found {number!r}")
+    return number
+
+
 def _matrix(value: Any, size: int, what: str) -> np.ndarray:
     try:
         matrix = np.asarray(value, np.float64).reshape(size, size)
@@ -245,12 +296,18 @@ def _camera(value: dict[str, Any]) -> Camera:
     return Camera(width, height, intrinsics, _matrix(value.get("T_cam_world"), 4, "the camera's T_cam_world"))
 
 
-def _instance(value: dict[str, Any]):
+def _instance(value: dict[str, Any], scenes: int):
     try:
         start, count = int(value["start"]), int(value["count"])
     except (KeyError, TypeError, ValueError):
         raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {value!r}") from None
-    return _rasterizer().Instance(start, count, _matrix(value.get("matrix"), 4, f"the matrix of rows {start}"))
+    world, tint = value.get("world"), value.get("tint")
+    if world is not None:
+        world = _matrix(world, 4, f"the world of rows {start}")
+    if tint is not None and not (isinstance(tint, list) and len(tint) == 3):
+        raise errors.ConfigError(f"worker: a tint has to hold three factors, found {tint!r}")
+    matrix = _matrix(value.get("matrix"), 4, f"the matrix of rows {start}")
+    return _rasterizer().Instance(start, count, matrix, _number(value, scenes), world, tint)
 
 
 def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:

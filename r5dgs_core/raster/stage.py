@@ -1,4 +1,4 @@
-"""A scene drawn frame after frame by one camera: what has not moved since the last frame is not drawn again.
+"""Scenes drawn together frame after frame by one camera: what has not moved since the last frame is not drawn again.
 
 Which instances move is learned from the frames themselves. Under a new camera, or after another change of what is
 shown or behind it, everything is drawn; from the next frame on, the instances that have kept their place are a
@@ -11,80 +11,129 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from ..scene.cameras import Camera
-from ..scene.scene import Scene
-from . import scene_render, splatting
+from ..scene.scene import NEAR_PLANE, Scene
+from . import rasterize, scene_render, splatting
 from .scene_render import Instance
 from .settings import RasterSettings, RenderOutput
 
 WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; with more, keeping the rest costs what it saves
 
 
+@dataclass(frozen=True)
+class Sky:
+    """Whose sky lies behind everything.
+
+    Attributes:
+        scene: Which of the scenes.
+        matrix: Map from that scene's world to the world of the picture; what it shifts has no effect. [4, 4]
+    """
+
+    scene: int = 0
+    matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
 class Stage:
-    """Draws one scene again and again, on the CPU in float32.
+    """Draws one scene, or several in one world, again and again, on the CPU in float32.
+
+    Args:
+        scenes: What instances are of.
 
     Attributes:
         ms_motion: What bringing Gaussians to their places took in the last frame, milliseconds.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scenes: Scene | Sequence[Scene]):
         self.ms_motion = 0.0
         self._lock = threading.Lock()
-        self._scene = scene
-        self._shown: tuple | None = None  # camera, background and ranges of the last frame
+        self._scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+        self._gathered = scene_render.gather(self._scenes)
+        self._shown: tuple | None = None  # camera, background, ranges and looks of the last frame
         self._places: list[np.ndarray] = []  # of all instances, where they stood first
         self._moving: set[int] = set()
         self._backdrop = None
 
-    def render(self, instances: Sequence[Instance], camera: Camera, *, sky: bool = True) -> RenderOutput:
-        """Render ranges of the scene's Gaussians, each moved by a matrix of its own.
+    def render(
+        self,
+        instances: Sequence[Instance],
+        camera: Camera,
+        *,
+        sky: Sky | None = Sky(),
+        near: float | None = None,
+    ) -> RenderOutput:
+        """Render ranges of the scenes' Gaussians, each moved by a matrix of its own.
 
         Args:
             instances: As for `scene_render.pose_instances`; compared with those of the last frame one by one.
-            camera: The camera, in the scene's world.
-            sky: Whether the scene's sky is behind everything, or black.
+            camera: The camera, in the world of the picture.
+            sky: The sky behind everything; None for black.
+            near: Gaussians whose centre lies nearer than this depth are not drawn; where None, the scenes' own near
+                plane, of those that have an instance the smallest one in this world.
 
         Returns:
-            Colour (not clamped at 1), alpha, depth and object ids, tensors without gradient.
+            Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance that has the largest share of each
+            pixel, -1 where there is too little of all; tensors without gradient.
 
         Raises:
             ValueError: As `scene_render.pose_instances`.
         """
         with self._lock:
             try:
-                return self._render(instances, camera, sky)
+                return self._render(instances, camera, sky, near)
             except ValueError:
                 self._shown = None
-                scene_render.pose_instances(self._scene, instances)  # numbers the bad instance as the caller does
+                scene_render.pose_instances(self._gathered, instances)  # numbers the bad one as the caller does
                 raise
 
-    def _render(self, instances: Sequence[Instance], camera: Camera, sky: bool) -> RenderOutput:
+    def _render(
+        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None
+    ) -> RenderOutput:
         self.ms_motion = 0.0
-        view = (camera.width, camera.height, camera.intrinsics.tobytes(), camera.T_cam_world.tobytes())
-        shown = (view, sky, tuple((instance.start, instance.count) for instance in instances))
+        settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
+        view = (camera.width, camera.height, camera.intrinsics.tobytes(), camera.T_cam_world.tobytes(), settings)
+        behind = None if sky is None else (sky.scene, np.asarray(sky.matrix, np.float64).tobytes())
+        shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
         if shown != self._shown:
             self._shown, self._backdrop, self._moving = shown, None, set()
-            self._places = [np.array(instance.matrix, np.float64) for instance in instances]
-            return self._render_all(instances, camera, sky)
-        left = {i for i, one in enumerate(instances) if not np.array_equal(one.matrix, self._places[i])}
+            self._places = [_place(instance) for instance in instances]
+            return self._render_all(instances, camera, sky, settings)
+        left = {i for i, one in enumerate(instances) if not np.array_equal(_place(one), self._places[i])}
         if not left <= self._moving:
             self._moving |= left
             self._backdrop = None
         moving = [i for i in range(len(instances)) if i in self._moving]
         still = [i for i in range(len(instances)) if i not in self._moving]
         if not self._has_backdrop(instances, still, moving):
-            return self._render_all(instances, camera, sky)
+            return self._render_all(instances, camera, sky, settings)
         if self._backdrop is None:
-            self._backdrop = self._make_backdrop(instances, still, camera, sky)
+            self._backdrop = self._make_backdrop(instances, still, camera, sky, settings)
         means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera)
         picture = self._backdrop.draw(
             means, quats, scales, opacities, colors, labels=labels, ranks=_ranks(instances, moving)
         )
         return RenderOutput(picture.image, picture.alpha, picture.depth, None, picture.ids)
+
+    def _near(self, instances: Sequence[Instance]) -> float:
+        """The near plane of the scenes that have an instance, in the world of the picture."""
+        planes = {
+            self._scenes[one.scene].near_plane * _scale(one)
+            for one in instances
+            if 0 <= one.scene < len(self._scenes)  # who asks for another is refused later
+        }
+        return min((plane for plane in planes if plane > 0), default=NEAR_PLANE)
+
+    def _sky(self, sky: Sky | None, camera: Camera) -> torch.Tensor | None:
+        if sky is None:
+            return None
+        if not 0 <= sky.scene < len(self._scenes):
+            raise ValueError(f"sky: scene {sky.scene} of {len(self._scenes)} is not there")
+        scene, turned = self._scenes[sky.scene], scene_render.in_world_of(camera, sky.matrix)
+        return scene_render.tensor(scene_render.behind(scene, turned))
 
     def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
         if not splatting.numba_is_there():
@@ -92,34 +141,67 @@ class Stage:
         moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
         return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)
 
-    def _make_backdrop(self, instances: Sequence[Instance], still: list[int], camera: Camera, sky: bool):
+    def _make_backdrop(
+        self, instances: Sequence[Instance], still: list[int], camera: Camera, sky: Sky | None, settings: RasterSettings
+    ):
         from .backdrop import Backdrop
 
-        background = scene_render.tensor(scene_render.behind(self._scene, camera)) if sky else None
         means, quats, scales, opacities, colors, labels = self._splats(instances, still, camera)
-        settings = RasterSettings(near_plane=self._scene.near_plane)
         return Backdrop(
-            means, quats, scales, opacities, colors, camera, background,
+            means, quats, scales, opacities, colors, camera, self._sky(sky, camera),
             labels=labels, ranks=_ranks(instances, still), settings=settings,
         )  # fmt: skip
 
     def _splats(self, instances: Sequence[Instance], part: list[int], camera: Camera) -> tuple[torch.Tensor, ...]:
-        """Means, quats, scales, opacities, colours and object ids of some instances."""
+        """Means, quats, scales, opacities, colours and owners of some instances."""
         posed = self._pose([instances[i] for i in part])
         gaussians = scene_render.PosedGaussians(posed)
         colors = scene_render.tensor(scene_render.colors(posed, camera))
-        return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.object_ids
+        labels = torch.from_numpy(_owners(instances, part))
+        return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, labels
 
-    def _render_all(self, instances: Sequence[Instance], camera: Camera, sky: bool) -> RenderOutput:
-        return scene_render.render_frame(
-            self._scene, self._pose(instances), camera, background="scene" if sky else None
-        )
+    def _render_all(
+        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, settings: RasterSettings
+    ) -> RenderOutput:
+        posed = self._pose(instances)
+        gaussians = scene_render.PosedGaussians(posed)
+        gaussians.object_ids = torch.from_numpy(_owners(instances, range(len(instances))))
+        with torch.no_grad():
+            return rasterize(
+                gaussians,
+                camera,
+                background=self._sky(sky, camera),
+                colors=scene_render.tensor(scene_render.colors(posed, camera)),
+                settings=settings,
+            )
 
     def _pose(self, instances: Sequence[Instance]) -> scene_render.PosedScene:
         start = time.perf_counter()
-        posed = scene_render.pose_instances(self._scene, instances)
+        posed = scene_render.pose_instances(self._gathered, instances)
         self.ms_motion += 1e3 * (time.perf_counter() - start)
         return posed
+
+
+def _place(instance: Instance) -> np.ndarray:
+    """What of an instance changes as it moves: its matrix and that of its world. [8, 4]"""
+    world = np.eye(4) if instance.world is None else instance.world
+    return np.concatenate([np.asarray(instance.matrix, np.float64), np.asarray(world, np.float64)])
+
+
+def _look(instance: Instance) -> tuple | None:
+    return None if instance.tint is None else tuple(instance.tint)
+
+
+def _scale(instance: Instance) -> float:
+    """How many units of the picture's world one of the scene's own is, over all directions; NaN where that is none."""
+    if instance.world is None:
+        return 1.0
+    return float(abs(np.linalg.det(np.asarray(instance.world, np.float64)[:3, :3])) ** (1 / 3))
+
+
+def _owners(instances: Sequence[Instance], part: Sequence[int]) -> np.ndarray:
+    """Which instance each Gaussian of some instances belongs to. [n] int32"""
+    return np.repeat(np.asarray(part, np.int32), [instances[i].count for i in part])
 
 
 def _ranks(instances: Sequence[Instance], part: list[int]) -> np.ndarray:

@@ -6,11 +6,13 @@ centres lie at +0.5. Blender and the D-NeRF files use OpenGL axes (y up, looking
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+FAR = 1e4  # what parallel projections take for infinity, in half depths of what they show
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,60 @@ def cam_world_to_opengl(T_cam_world: np.ndarray) -> np.ndarray:
     """Inverse of `opengl_to_cam_world`: camera to world with OpenGL camera axes. [4, 4] -> [4, 4]"""
     T_world_cam = np.linalg.inv(np.asarray(T_cam_world, np.float64))
     return T_world_cam @ OPENGL_TO_OPENCV
+
+
+def from_projection(
+    projection: np.ndarray,  # [4, 4]
+    matrix_world: np.ndarray,  # [4, 4]
+    width: int,
+    height: int,
+    depths: tuple[float, float] = (0.0, 1.0),
+    name: str = "",
+) -> tuple[Camera, float]:
+    """The camera of an OpenGL projection.
+
+    A parallel projection has no centre: it becomes that of a camera `FAR` half depths away, whose picture differs by a
+    small part of a pixel.
+
+    Args:
+        projection: Camera space to clip space, perspective or parallel; sensor fit and shift are in it.
+        matrix_world: Camera to world, OpenGL camera axes.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        depths: Nearest and farthest depth before ``matrix_world`` that matter; read for parallel projections alone.
+        name: Name of the camera.
+
+    Returns:
+        The camera, and the distance by which it stands behind ``matrix_world``: 0 for perspective ones.
+    """
+    p = np.asarray(projection, np.float64)
+    T_cam_world = opengl_to_cam_world(matrix_world)
+    intrinsics = np.eye(3)
+    if abs(p[3, 3]) < 0.5:  # perspective: clip w is -z, not 1
+        intrinsics[0] = 0.5 * width * p[0, 0], 0.0, 0.5 * width * (1 - p[0, 2])
+        intrinsics[1] = 0.0, 0.5 * height * p[1, 1], 0.5 * height * (1 + p[1, 2])
+        return Camera(width, height, intrinsics, T_cam_world, name), 0.0
+    middle, half = 0.5 * (depths[0] + depths[1]), 0.5 * (depths[1] - depths[0])
+    away = FAR * max(half, 1e-3 * abs(middle), 1e-6)  # from the depth where the scale is exact
+    intrinsics[0] = 0.5 * width * p[0, 0] * away, 0.0, 0.5 * width * (1 + p[0, 3])
+    intrinsics[1] = 0.0, 0.5 * height * p[1, 1] * away, 0.5 * height * (1 - p[1, 3])
+    T_cam_world[2, 3] += away - middle
+    return Camera(width, height, intrinsics, T_cam_world, name), away - middle
+
+
+def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
+    """The camera of a part of the picture, in pixels from its upper left corner; what lies outside is seen, too."""
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[:2, 2] -= left, top
+    return dataclasses.replace(camera, width=width, height=height, intrinsics=intrinsics)
+
+
+def resize(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the same picture with another number of pixels."""
+    intrinsics = camera.intrinsics.copy()
+    intrinsics[0] *= width / camera.width
+    intrinsics[1] *= height / camera.height
+    return dataclasses.replace(camera, width=width, height=height, intrinsics=intrinsics)
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

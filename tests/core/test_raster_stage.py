@@ -8,10 +8,10 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba", reason="a stage keeps what stands still where the cpu backend draws")
 
-from r5dgs_core.raster import backdrop, scene_render, stage  # noqa: E402
+from r5dgs_core.raster import RasterSettings, backdrop, rasterize_splats, scene_render, stage  # noqa: E402
 from r5dgs_core.raster.scene_render import Instance  # noqa: E402
 from tests import scenes  # noqa: E402
-from tests.core.test_scene_render import group_instances  # noqa: E402
+from tests.core.test_scene_render import group_instances, matrix  # noqa: E402
 
 CAMERA, OTHER = scenes.orbit_camera(0.7, 80, 72), scenes.orbit_camera(1.1, 80, 72)
 
@@ -36,8 +36,10 @@ def made(monkeypatch):
 
 
 def assert_shows(theatre, scene, instances, camera, sky=True):
-    found = theatre.render(instances, camera, sky=sky)
+    found = theatre.render(instances, camera, sky=stage.Sky() if sky else None)
     posed = scene_render.pose_instances(scene, instances)
+    owners = np.repeat(np.arange(len(instances), dtype=np.int32), [instance.count for instance in instances])
+    posed = dataclasses.replace(posed, object_ids=owners)
     expected = scene_render.render_frame(scene, posed, camera, background="scene" if sky else None)
     for name in ("color", "alpha", "depth", "ids"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
@@ -110,3 +112,120 @@ def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
         with pytest.raises(ValueError, match=f"instance {last}: "):
             theatre.render(bad, CAMERA)
     assert_shows(theatre, scene, instances, CAMERA)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two scenes of other degrees, one with shading and a light, one without; and where the second one's world lies."""
+    lit = scenes.make_scene(n=500, sh_degree=1, seed=3)
+    plain = dataclasses.replace(scenes.make_scene(n=400, sh_degree=0, seed=8), shading=None, light_direction=None)
+    assert lit.shading is not None and lit.light_direction is not None
+    return lit, plain, matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 0.7)
+
+
+def together(pair, t, tint=None):
+    """Instances of both scenes, each in its own world."""
+    lit, plain, world = pair
+    first = group_instances(lit, t)
+    second = [Instance(one.start, one.count, world @ one.matrix, 1, world, tint) for one in group_instances(plain, t)]
+    return [*second[:2], *first, *second[2:]]
+
+
+def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
+    lit, plain, world = pair
+    theatre = stage.Stage([lit, plain])
+    for t in (0.2, 0.5, 0.8):
+        shown = together(pair, t)
+        found = theatre.render(shown, CAMERA, sky=stage.Sky(1, world))
+        parts = [
+            scene_render.pose_instances(scene, [dataclasses.replace(one, scene=0) for one in shown if one.scene == k])
+            for k, scene in enumerate((lit, plain))
+        ]
+        gaussians = [scene_render.PosedGaussians(posed) for posed in parts]
+        inputs = [torch.cat([getattr(one, name) for one in gaussians]) for name in ("means", "quats", "scales")]
+        opacities = torch.cat([one.opacities for one in gaussians])
+        colors = torch.cat([scene_render.tensor(scene_render.colors(posed, CAMERA)) for posed in parts])
+        eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ world)
+        behind = scene_render.tensor(scene_render.sky(plain, eye))
+        settings = RasterSettings(near_plane=0.7 * lit.near_plane)
+        expected = rasterize_splats(*inputs, opacities, colors, CAMERA, behind, settings=settings)
+        # Other orders of rows, and of the operations behind a padded degree.
+        np.testing.assert_allclose(found.color.numpy(), expected.image.numpy(), atol=1e-4)
+        np.testing.assert_allclose(found.alpha.numpy(), expected.alpha.numpy(), atol=1e-5)
+
+
+def test_a_light_turns_with_its_world_and_not_with_what_moves_in_it(pair):
+    lit, _, world = pair
+    still = scene_render.pose_instances(lit, group_instances(lit, 0.3))
+    turned = [Instance(one.start, one.count, world @ one.matrix, 0, world) for one in group_instances(lit, 0.3)]
+    found = scene_render.pose_instances(lit, turned)
+    np.testing.assert_allclose(found.shading_factor, still.shading_factor, atol=1e-6)
+    assert np.abs(still.shading_factor - 1).max() > 1e-2
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_tint_is_that_of_the_harmonics(degree):
+    scene = scenes.make_scene(n=300, sh_degree=degree, seed=5)
+    tint, c0 = np.array([0.3, 1.5, 0.0]), 0.28209479177387814
+    sh = tint * scene.sh.astype(np.float64)
+    sh[:, 0] = (tint * (0.5 + c0 * scene.sh[:, 0]) - 0.5) / c0
+    painted = dataclasses.replace(scene, sh=sh.astype(np.float32))
+    n = len(scene.means)
+    one = stage.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
+    other = stage.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
+    np.testing.assert_allclose(one.color.numpy(), other.color.numpy(), atol=1e-5)
+
+
+def test_owners_are_the_instances_in_front_whichever_of_them_move(pair, made):
+    theatre = stage.Stage(pair[:2])
+    shown = [*together(pair, 0.4), *together(pair, 0.4, (1.0, 0.2, 0.2))[:2]]
+    for t in (0.4, 0.5, 0.6):
+        moved = together(pair, t)
+        shown = [*moved[:3], *shown[3:]]
+        found = theatre.render(shown, CAMERA)
+        anew = stage.Stage(pair[:2]).render(shown, CAMERA)
+        assert torch.equal(found.ids, anew.ids) and torch.equal(found.color, anew.color)
+    assert len(made) >= 1 and found.ids.max() > 2 and found.ids.min() == -1
+
+
+def test_another_tint_or_near_limit_is_another_picture(pair):
+    lit = pair[0]
+    whole, red = Instance(0, 500, np.eye(4)), Instance(0, 500, np.eye(4), tint=(1.0, 0.0, 0.0))
+    theatre = stage.Stage(lit)
+    for _ in range(2):
+        plain = theatre.render([whole], CAMERA)
+    tinted = theatre.render([red], CAMERA, sky=None)
+    assert tinted.color[..., 1:].max() == 0 and tinted.color[..., 0].max() > 0.1
+    near = theatre.render([whole], CAMERA, near=1e3)
+    assert near.alpha.max() == 0 and plain.alpha.max() > 0.5
+
+
+def test_a_sky_turns_with_its_world(pair):
+    lit, _, world = pair
+    sky = np.random.default_rng(0).normal(scale=0.3, size=(9, 3)).astype(np.float32)
+    scene = dataclasses.replace(lit, background_sh=sky)
+    rigid = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 1.0)
+    eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ rigid)
+    found = stage.Stage(scene).render([], CAMERA, sky=stage.Sky(0, rigid))
+    np.testing.assert_allclose(found.color.numpy(), scene_render.sky(scene, eye), atol=1e-5)
+    scaled = stage.Stage(scene).render([], CAMERA, sky=stage.Sky(0, world))
+    np.testing.assert_allclose(scaled.color.numpy(), found.color.numpy(), atol=1e-5)
+
+
+def test_no_scene_at_all_leaves_black():
+    found = stage.Stage([]).render([], CAMERA, sky=None)
+    assert found.color.abs().max() == 0 and found.ids.max() == -1
+
+
+@pytest.mark.parametrize(
+    ("instance", "message"),
+    [
+        (Instance(0, 5, np.eye(4), scene=2), "scene 2 of 2"),
+        (Instance(450, 5, np.eye(4), scene=1), "leave the scene's 400"),
+        (Instance(0, 5, np.eye(4), tint=(1.0, -1.0, 1.0)), "tint"),
+        (Instance(0, 5, np.eye(4), world=np.zeros((4, 4))), "flattens"),
+    ],
+)
+def test_impossible_instances_of_several_scenes_are_refused(pair, instance, message):
+    with pytest.raises(ValueError, match=f"instance 0: .*{message}"):
+        stage.Stage(pair[:2]).render([instance], CAMERA)

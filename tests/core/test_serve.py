@@ -12,9 +12,10 @@ pytest.importorskip("torch")
 
 from r5dgs_core import serve  # noqa: E402
 from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import scene_render, warming  # noqa: E402
+from r5dgs_core.raster import scene_render, stage, warming  # noqa: E402
 from r5dgs_core.scene import playback, scene_file  # noqa: E402
 from tests import scenes  # noqa: E402
+from tests.core.test_scene_render import matrix  # noqa: E402
 
 CAMERA = scenes.orbit_camera(0.2, 32, 24)
 CAMERA_JSON = {
@@ -23,6 +24,7 @@ CAMERA_JSON = {
     "intrinsics": CAMERA.intrinsics.tolist(),
     "T_cam_world": CAMERA.T_cam_world.tolist(),
 }
+ROWS = {"start": 0, "count": 1, "matrix": np.eye(4).tolist()}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def parse(data):
 
 
 def load(path):
-    return {"command": "load", "path": str(path)}
+    return {"command": "load", "paths": [str(path)]}
 
 
 def test_hello_says_what_is_missing_and_which_protocol():
@@ -80,10 +82,43 @@ def test_instances_are_moved_and_the_rest_is_not_seen(path):
     posed = scene_render.pose_instances(scene, [scene_render.Instance(body.start, body.count, matrix)])
     expected = scene_render.render_frame(scene, posed, CAMERA, background=None)
     instances = [{"start": body.start, "count": body.count, "matrix": matrix.tolist()}]
-    request = {"command": "render", "camera": CAMERA_JSON, "instances": instances, "background": False}
+    request = {"command": "render", "camera": CAMERA_JSON, "instances": instances}
     _, (header, arrays) = talk(load(path), request)
     assert header["ok"]
     np.testing.assert_array_equal(arrays["color"], expected.color.numpy())
+
+
+def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
+    other = scene_file.write(scenes.make_scene(n=150, sh_degree=2, seed=9), tmp_path / "other.r5dgs")
+    world = matrix((0.8, 0.1, 0.3, -0.2), (0.3, -0.2, 0.1), 0.8)
+    rows = {"start": 20, "count": 60, "matrix": world.tolist(), "world": world.tolist(), "tint": [0.5, 1.0, 2.0]}
+    entries = [{**rows, "scene": 1}, {**ROWS, "count": 200}]
+    request = {"command": "render", "camera": CAMERA_JSON, "instances": entries, "want": ["depth", "alpha", "owners"]}
+    request["sky"] = {"scene": 1, "matrix": world.tolist()}
+    both = [scene_file.read(path), scene_file.read(other)]
+    expected = stage.Stage(both).render(
+        [scene_render.Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), scene_render.Instance(0, 200, np.eye(4))],
+        CAMERA,
+        sky=stage.Sky(1, world),
+    )
+    (loaded, _), (header, arrays) = talk({"command": "load", "paths": [str(path), str(other)]}, request)
+    assert [entry["gaussians"] for entry in loaded["result"]["scenes"]] == [200, 150]
+    assert header["ok"] and header["result"]["gaussians"] == 260
+    for name, found in (("color", "color"), ("depth", "depth"), ("alpha", "alpha"), ("owners", "ids")):
+        np.testing.assert_array_equal(arrays[name], getattr(expected, found).numpy())
+    assert {0, 1} <= set(arrays["owners"].ravel().tolist())
+
+
+def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, monkeypatch):
+    copy = tmp_path / "copy.r5dgs"
+    copy.write_bytes(path.read_bytes())
+    read, original = [], scene_file.read
+    monkeypatch.setattr(scene_file, "read", lambda place: read.append(place.name) or original(place))
+    server = serve.Server()
+    for paths in ([path], [path, copy], [copy, path, copy], [copy], [path]):
+        result, _ = server.answer({"command": "load", "paths": [str(p) for p in paths]})
+        assert [result["scenes"][number]["gaussians"] for number in result["numbers"]] == [200] * len(paths)
+    assert read == ["scene.r5dgs", "copy.r5dgs", "scene.r5dgs"]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +131,14 @@ def test_instances_are_moved_and_the_rest_is_not_seen(path):
         ({"command": "render", "camera": {**CAMERA_JSON, "intrinsics": [1, 2]}, "t": 0.1}, "ConfigError", "3 x 3"),
         ({"command": "render", "camera": CAMERA_JSON, "t": 0.1, "want": ["smell"]}, "ConfigError", "smell"),
         ({"command": "render", "camera": CAMERA_JSON, "instances": [{"start": 0}]}, "ConfigError", "instance"),
-        ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "SceneFileError", "at all.r5dgs"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [ROWS | {"scene": 1}]}, "ConfigError", "'scene'"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [ROWS | {"tint": 2}]}, "ConfigError", "tint"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [], "sky": {"scene": 3}}, "ConfigError", "'scene'"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [], "sky": True}, "ConfigError", "'sky'"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [], "near": 0}, "ConfigError", "'near'"),
+        ({"command": "load", "paths": ["/nowhere/at all.r5dgs"]}, "SceneFileError", "at all.r5dgs"),
+        ({"command": "load", "paths": [3]}, "ConfigError", "paths"),
+        ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "'paths'"),
     ],
 )
 def test_impossible_requests_are_answered_by_name_and_the_worker_goes_on(path, request_, kind, message):
@@ -125,9 +167,9 @@ def test_a_changed_file_is_read_again(path, tmp_path):
     copy = tmp_path / "scene.r5dgs"
     copy.write_bytes(path.read_bytes())
     server = serve.Server()
-    assert server.answer(load(copy))[0]["gaussians"] == 200
+    assert server.answer(load(copy))[0]["scenes"][0]["gaussians"] == 200
     scene_file.write(scenes.make_scene(n=120), copy)
-    assert server.answer(load(copy))[0]["gaussians"] == 120
+    assert server.answer(load(copy))[0]["scenes"][0]["gaussians"] == 120
 
 
 def test_the_rasterizer_is_made_ready_on_request():

@@ -1,0 +1,131 @@
+"""What looks at the scenes: Blender's camera or a 3D view, as a camera of the core in Blender's world."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core import errors
+from ..r5dgs_core.scene import cameras
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera of the core, and what it takes to be one.
+
+    Attributes:
+        camera: OpenCV axes, in Blender's world.
+        distance: By how much it stands behind Blender's camera: 0, but for parallel projections, which are seen from
+            very far; depths are larger by that.
+        near: Nearest depth that is drawn; None for the scenes' own near plane.
+    """
+
+    camera: cameras.Camera
+    distance: float = 0.0
+    near: float | None = None
+
+    def request(self) -> dict[str, Any]:
+        """The camera as the worker reads it."""
+        return {
+            "width": self.camera.width,
+            "height": self.camera.height,
+            "intrinsics": self.camera.intrinsics.tolist(),
+            "T_cam_world": self.camera.T_cam_world.tolist(),
+        }
+
+
+def of_camera(
+    depsgraph: bpy.types.Depsgraph,
+    points: np.ndarray,  # [P, 3]
+    camera: bpy.types.Object | None = None,
+    border: bool = True,
+) -> View:
+    """The picture that Blender would render.
+
+    Args:
+        depsgraph: Its scene has the resolution, its percentage, the pixel aspect and the border.
+        points: Points around what is seen, Blender's world; read for orthographic cameras alone.
+        camera: The camera; the scene's active one where None.
+        border: Whether a render border cuts the picture; else it is whole.
+
+    Returns:
+        The view.
+
+    Raises:
+        ConfigError: There is no camera, or it is panoramic.
+    """
+    scene = depsgraph.scene
+    camera = scene.camera if camera is None else camera
+    if camera is None or camera.type != "CAMERA":
+        raise errors.ConfigError(f"{scene.name}: expected an active camera, found none; add one to the scene")
+    if camera.data.type not in ("PERSP", "ORTHO"):
+        raise errors.ConfigError(
+            f"{camera.name}: expected a perspective or orthographic camera, found {camera.data.type.lower()}; set its "
+            "lens type to Perspective"
+        )
+    width, height = size_of(scene)
+    render = scene.render
+    evaluated = camera.evaluated_get(depsgraph)
+    projection = evaluated.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    view = _view(projection, evaluated.matrix_world, width, height, points, camera.name, behind=False)
+    if border and render.use_border:
+        left, top, cut_width, cut_height = border_of(scene)
+        return View(cameras.crop(view.camera, left, top, cut_width, cut_height), view.distance, view.near)
+    return view
+
+
+def of_region(
+    region: bpy.types.Region,
+    region_3d: bpy.types.RegionView3D,
+    points: np.ndarray,  # [P, 3]
+    width: int = 0,
+    height: int = 0,
+) -> View:
+    """What a 3D view shows.
+
+    Args:
+        region: Its window region.
+        region_3d: How it looks.
+        points: Points around what is seen, Blender's world; read for orthographic views alone.
+        width: Width of the picture in pixels; the region's where 0.
+        height: Its height; the region's where 0.
+
+    Returns:
+        The view.
+    """
+    world = region_3d.view_matrix.inverted()
+    size = (width or max(region.width, 1), height or max(region.height, 1))
+    return _view(region_3d.window_matrix, world, *size, points, "", behind=not region_3d.is_perspective)
+
+
+def size_of(scene: bpy.types.Scene) -> tuple[int, int]:
+    """Width and height of the whole picture that Blender would render, in pixels."""
+    render = scene.render
+    # Whole numbers, as Blender does it: 100 * (29 / 100) is less than 29 in floating point.
+    return (
+        max(render.resolution_x * render.resolution_percentage // 100, 1),
+        max(render.resolution_y * render.resolution_percentage // 100, 1),
+    )
+
+
+def border_of(scene: bpy.types.Scene) -> tuple[int, int, int, int]:
+    """The render border in pixels of the whole picture: left, top, width, height."""
+    width, height = size_of(scene)
+    render = scene.render
+    left, right = int(render.border_min_x * width), int(render.border_max_x * width)
+    bottom, top = int(render.border_min_y * height), int(render.border_max_y * height)
+    return left, height - top, max(right - left, 1), max(top - bottom, 1)
+
+
+def _view(projection, matrix_world, width: int, height: int, points: np.ndarray, name: str, behind: bool) -> View:
+    world = np.array(matrix_world, np.float64)
+    forward = -world[:3, 2] / np.linalg.norm(world[:3, 2])
+    depths = (points - world[:3, 3]) @ forward if len(points) else np.array([0.0, 1.0])
+    span = (float(depths.min()), float(depths.max()))
+    camera, distance = cameras.from_projection(np.array(projection), world, width, height, span, name)
+    # Behind an orthographic camera nothing is drawn, before or behind an orthographic view everything is.
+    near = distance if distance and not behind else None
+    return View(camera, distance, near)

@@ -1,0 +1,175 @@
+"""Which clouds Blender shows, where, and of which loaded scene; the depsgraph decides.
+
+A cloud of a scene is shown at A x for a point x of its bind state, A being its matrix in Blender's world. The scene's
+own world, in which its light stands, is turned with its root; an instance of a collection turns both.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core import errors
+from . import clouds, objects
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A visible cloud, or an instance of one.
+
+    Attributes:
+        scene: Number of its collection among the scenes.
+        start: First row in the scene file.
+        count: Number of rows.
+        matrix: Bind state to Blender's world. [4, 4]
+        world: The scene's world to Blender's. [4, 4]
+        tint: Factors on red, green and blue.
+        object: The cloud; of an instance, the one that is instanced.
+        collection: The loaded scene.
+        parent: The object that makes the instance, or None.
+    """
+
+    scene: int
+    start: int
+    count: int
+    matrix: np.ndarray
+    world: np.ndarray
+    tint: tuple[float, float, float]
+    object: bpy.types.Object
+    collection: bpy.types.Collection
+    parent: bpy.types.Object | None = None
+
+    def request(self) -> dict[str, Any]:
+        """What the worker reads."""
+        entry = {
+            "scene": self.scene,
+            "start": self.start,
+            "count": self.count,
+            "matrix": self.matrix.tolist(),
+            "world": self.world.tolist(),
+        }
+        return entry if self.tint == (1.0, 1.0, 1.0) else {**entry, "tint": list(self.tint)}
+
+
+def instances(
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
+) -> tuple[tuple[bpy.types.Collection, ...], tuple[Instance, ...]]:
+    """The loaded scenes of a Blender scene that are not excluded, and their visible clouds.
+
+    Args:
+        depsgraph: Evaluated.
+        space: A 3D view whose local view hides the rest.
+
+    Returns:
+        Collections, the scenes of the outermost instances included; and the clouds, of the same collections.
+
+    Raises:
+        ConfigError: A cloud has lost points, and nothing tells which.
+    """
+    homes, scenes, found = _homes(), _scenes(depsgraph), []
+    for obj, matrix, parent in _clouds(depsgraph, space):
+        collection = homes.get(obj) or _by_root(obj)
+        if collection is None or np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) < 3:  # scaled to nothing
+            continue
+        if collection not in scenes:
+            scenes.append(collection)
+        world = world_of(collection, depsgraph)
+        if parent is not None:  # what the instancer does to the cloud, it does to its world
+            own = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
+            world = matrix @ np.linalg.solve(own, world)
+        tint = tuple(obj.r5dgs_look.tint)
+        for start, count in rows_of(obj):
+            found.append(Instance(scenes.index(collection), start, count, matrix, world, tint, obj, collection, parent))
+    return tuple(scenes), tuple(found)
+
+
+def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
+    """Map of a loaded scene's world to Blender's; that of the file where its root is gone. [4, 4] float64"""
+    root = collection.r5dgs.root
+    if root is None:
+        return np.eye(4)
+    evaluated = root if depsgraph is None else root.evaluated_get(depsgraph)
+    matrix = np.array(evaluated.matrix_world, np.float64)
+    return matrix if np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) == 3 else np.eye(4)
+
+
+def rows_of(obj: bpy.types.Object) -> list[tuple[int, int]]:
+    """Rows of the scene file that a cloud's points are, as stretches of first row and number.
+
+    Raises:
+        ConfigError: Points were deleted or added, and they do not say which rows they are.
+    """
+    start, count, points = obj.r5dgs.start, obj.r5dgs.count, len(obj.data.points)
+    if points == count:
+        return [(start, count)]
+    attribute = obj.data.attributes.get(clouds.ROW)
+    if attribute is None or attribute.domain != "POINT" or attribute.data_type != "INT":
+        raise errors.ConfigError(
+            f"{obj.name}: expected its {count} points, found {points}, which do not say which Gaussians they are; undo "
+            "that change, or load the scene again"
+        )
+    rows = np.empty(points, np.int32)
+    attribute.data.foreach_get("value", rows)
+    rows = np.unique(rows)
+    rows = rows[(rows >= start) & (rows < start + count)]
+    cuts = np.flatnonzero(np.diff(rows) != 1) + 1
+    return [(int(part[0]), len(part)) for part in np.split(rows, cuts) if len(part)]
+
+
+def points(found: tuple[Instance, ...]) -> np.ndarray:
+    """Corners of the boxes around visible clouds, Blender's world. [P, 3] float64"""
+    corners = [np.zeros((0, 3))]
+    for one in found:
+        box = np.array(one.object.bound_box, np.float64)
+        corners.append(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
+    return np.concatenate(corners)
+
+
+def _clouds(depsgraph, space):
+    """Visible clouds: object, matrix in Blender's world, and what makes an instance of it, or None."""
+    instancing = False
+    for obj in depsgraph.objects:
+        instancing |= obj.instance_type == "COLLECTION" and obj.instance_collection is not None
+        original = obj.original
+        if original.r5dgs.role == "CLOUD" and obj.type == "POINTCLOUD" and _in_local_view(original, space):
+            yield original, np.array(obj.matrix_world, np.float64), None
+    if not instancing:  # going through instances is slow where ellipsoids stand for Gaussians
+        return
+    for instance in depsgraph.object_instances:
+        if not instance.is_instance or instance.object.type != "POINTCLOUD":
+            continue
+        original, parent = instance.object.original, instance.parent.original
+        if original.r5dgs.role == "CLOUD" and original != parent and _in_local_view(parent, space):
+            yield original, np.array(instance.matrix_world, np.float64), parent
+
+
+def _in_local_view(obj: bpy.types.Object, space: bpy.types.SpaceView3D | None) -> bool:
+    return space is None or space.local_view is None or obj.local_view_get(space)
+
+
+def _homes() -> dict[bpy.types.Object, bpy.types.Collection]:
+    """The loaded scene that each object lies in."""
+    return {obj: collection for collection in objects.scene_collections() for obj in collection.all_objects}
+
+
+def _by_root(obj: bpy.types.Object) -> bpy.types.Collection | None:
+    """The loaded scene whose root a cloud hangs from, for one that was moved to another collection."""
+    while obj.parent is not None:
+        obj = obj.parent
+        if obj.r5dgs.role == "ROOT":
+            return next((c for c in objects.scene_collections() if c.r5dgs.root == obj), None)
+    return None
+
+
+def _scenes(depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Collection]:
+    """Loaded scenes in the depsgraph's view layer that are not excluded there."""
+    found, waiting = [], [depsgraph.view_layer.layer_collection]
+    while waiting:
+        layer = waiting.pop(0)
+        if layer.exclude:
+            continue
+        if layer.collection.r5dgs.is_scene and layer.collection not in found:
+            found.append(layer.collection)
+        waiting.extend(layer.children)
+    return found
