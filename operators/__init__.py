@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture_dataset, check_worker, export_ply, load_scene, preview, select_by_prompt, set_display
+from . import capture_dataset, check_worker, export_ply, load_scene, preview, select_by_prompt, set_display, use_engine
 
-MODULES = (load_scene, set_display, select_by_prompt, preview, check_worker, export_ply, capture_dataset)
+MODULES = (load_scene, set_display, select_by_prompt, preview, use_engine, check_worker, export_ply, capture_dataset)
 
 
 def _menu_import(menu, context):

@@ -162,3 +162,18 @@ def _forget_properties() -> None:
         for cls in base.__subclasses__():
             if cls.__module__.startswith(package + "."):
                 cls.__annotations__ = {}
+
+
+# The pass of object indices has its long name from 5.0 on, when scenes lost their own node tree.
+OBJECT_INDEX = "IndexOB" if "node_tree" in bpy.types.Scene.bl_rna.properties else "Object Index"
+
+
+def working_space() -> str:
+    """Name of the .blend's scene-linear color space; before 5.0 there is but one."""
+    spaces = getattr(bpy.data, "colorspace", None)
+    return spaces.working_space if spaces is not None else "Linear Rec.709"
+
+
+def panels_of_all_engines() -> list[type]:
+    """Blender's own panels that are for every engine. It knows them by an engine that it no longer has."""
+    return [p for p in bpy.types.Panel.__subclasses__() if "BLENDER_RENDER" in getattr(p, "COMPAT_ENGINES", ())]

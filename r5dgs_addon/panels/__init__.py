@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, export, preview, prompt, scene
+from . import capture, export, preview, prompt, render, scene
 
-MODULES = (scene, prompt, preview, export, capture)
+MODULES = (scene, prompt, preview, export, capture, render)
 
 
 def register():

@@ -1,0 +1,125 @@
+"""The render engine R5DGS: F12, animations and Rendered viewports with the worker's rasterizer.
+
+A picture is what the depsgraph shows, see `picture`; so a frame of an animation is the frame that F12 renders.
+"""
+
+import time
+
+import bpy
+
+from ..r5dgs_core import errors
+from . import compat, engine_color, engine_passes, engine_settings, picture, viewport, worker
+
+ENGINE = "R5DGS"
+LOOK_S = 0.005  # between two looks at the worker, and at whether the user wants to stop
+GRACE_S = 0.2  # a picture that is stopped may take this long, before the worker is
+
+
+class R5DGS_RenderEngine(bpy.types.RenderEngine):
+    """Renders loaded R5DGS scenes as they were trained."""
+
+    bl_idname = ENGINE
+    bl_label = "R5DGS"
+    bl_use_preview = False
+    bl_use_eevee_viewport = True  # for Material Preview
+
+    _port = None  # what this engine draws in its viewport
+    _said = ""
+
+    def update_render_passes(self, scene=None, renderlayer=None):
+        """Tell the compositor which passes there are."""
+        for one in engine_passes.of_layer(renderlayer):
+            self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
+
+    def render(self, depsgraph):
+        """Render a view layer; called for every frame, in a thread of its own where there is a window."""
+        try:
+            self._render(depsgraph)
+        except errors.R5dgsError as error:
+            self.error_set(f"R5DGS: {error}")
+
+    def view_update(self, context, depsgraph):
+        """Nothing to do: `view_draw`, which follows, sees by itself what has changed."""
+
+    def view_draw(self, context, depsgraph):
+        """Draw the last picture of the viewport, and ask for another where it is not of what the viewport shows."""
+        if self._port is None:
+            self._port = viewport.Port()
+        self._port.draw(self, context, depsgraph)
+
+    def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
+        scene, layer = depsgraph.scene, depsgraph.view_layer
+        objections = engine_color.objections(scene)
+        if objections:
+            self.report(
+                {"WARNING"},
+                f"R5DGS: colors do not come out as trained with {', '.join(objections)}; press 'Show Colors as "
+                "Trained' in the render properties",
+            )
+        passes, transparent = engine_passes.of_layer(layer), scene.render.film_transparent
+        seen = picture.shown(depsgraph)
+        want = engine_passes.wanted(passes, transparent)
+        sky = engine_settings.of(scene).sky and not transparent
+        answer = self._ask(picture.steps(seen, want, sky))
+        if answer is None:
+            return
+        result, arrays = picture.finished(seen, answer)
+        for one in passes[1:]:
+            self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
+        rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name)
+        filled = {one.name: engine_passes.pixels(one, arrays, seen, transparent) for one in passes}
+        engine_passes.fill(rendered.layers[0], filled)
+        self.end_result(rendered)
+        milliseconds = result["ms_motion"] + result["ms_raster"]
+        self._say(f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms")
+        self.update_progress(1.0)
+
+    def _ask(self, steps):
+        """The worker's answer, or None where the user stops the render."""
+        while worker.busy():  # with a picture of the viewport or the preview
+            if self._stopped("waiting for another picture"):
+                return None
+        job = worker.start(steps)
+        while not job.done:
+            if self._stopped(job.doing):
+                _leave(job)
+                return None
+        return job.answer()
+
+    def _stopped(self, doing: str) -> bool:
+        """Say what is waited for, wait a moment, and see whether the user wants to stop."""
+        self._say(doing.capitalize())
+        time.sleep(LOOK_S)
+        return self.test_break()
+
+    def _say(self, text: str) -> None:
+        """Show a few words over the picture and in the console, once."""
+        if text != self._said:
+            self._said = text
+            self.update_stats("", text)
+
+
+def _leave(job: worker.Job) -> None:
+    """Give up on a job: the worker, which has no other way to leave a picture unfinished, is stopped."""
+    end = time.monotonic() + GRACE_S
+    while not job.done and time.monotonic() < end:
+        time.sleep(LOOK_S)
+    if not job.done:
+        worker.stop()
+
+
+def register():
+    """Register the settings and the engine, and let Blender's panels that are for all engines show for it."""
+    engine_settings.register()
+    bpy.utils.register_class(R5DGS_RenderEngine)
+    for panel in compat.panels_of_all_engines():
+        panel.COMPAT_ENGINES.add(ENGINE)
+
+
+def unregister():
+    """Undo `register`."""
+    viewport.forget()
+    for panel in compat.panels_of_all_engines():
+        panel.COMPAT_ENGINES.discard(ENGINE)
+    bpy.utils.unregister_class(R5DGS_RenderEngine)
+    engine_settings.unregister()

@@ -1,0 +1,83 @@
+"""Colours of the worker as Blender's scene-linear ones, such that the view transform gives back what was trained.
+
+A picture of the core is display-referred sRGB. Blender's view transform *Standard* is sRGB's transfer function, so its
+inverse is what a render result has to hold; under others (AgX, Filmic), or with a look, an exposure or curves, a scene
+cannot come out as it was trained, and `objections` says so.
+"""
+
+import bpy
+import numpy as np
+
+from . import compat
+
+STANDARD = "Standard"
+
+# Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).
+_WORKING_SPACES = {
+    "Linear Rec.2020": (
+        (0.6274039, 0.3292830, 0.0433131),
+        (0.0690973, 0.9195404, 0.0113623),
+        (0.0163914, 0.0880133, 0.8955953),
+    ),
+    "ACEScg": (
+        (0.6130974, 0.3395231, 0.0473795),
+        (0.0701937, 0.9163539, 0.0134524),
+        (0.0206156, 0.1095698, 0.8698146),
+    ),
+}
+
+
+def scene_linear(
+    color: np.ndarray,  # [H, W, 3]
+    alpha: np.ndarray | None = None,  # [H, W]
+) -> np.ndarray:  # [H, W, 4]
+    """A picture as Blender's *Combined* pass, alpha premultiplied.
+
+    Colours over 1 stay over 1. The picture was blended as it is displayed; so the colour that is made linear is that
+    of the pixel without its alpha, which then saves as straight alpha with the picture's own bytes.
+
+    Args:
+        color: Display-referred sRGB, >= 0; multiplied by alpha where there is one. [H, W, 3]
+        alpha: Coverage, or None for an opaque picture. [H, W]
+
+    Returns:
+        Scene-linear RGBA, float32, rows as they came. [H, W, 4]
+    """
+    result = np.ones((*color.shape[:2], 4), np.float32)
+    straight = np.maximum(np.asarray(color, np.float32), 0)
+    if alpha is not None:
+        result[..., 3] = np.clip(alpha, 0, 1)
+        straight = straight / np.maximum(result[..., 3:], 1e-6)
+    linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+    matrix = _WORKING_SPACES.get(compat.working_space())
+    if matrix is not None:
+        linear = linear @ np.array(matrix, np.float32).T
+    result[..., :3] = linear if alpha is None else linear * result[..., 3:]
+    return result
+
+
+def objections(scene: bpy.types.Scene) -> list[str]:
+    """Why colours do not come out as trained under a scene's colour management, in a few words each; else empty."""
+    view, found = scene.view_settings, []
+    if view.view_transform != STANDARD:
+        found.append(f"view transform {view.view_transform}")
+    if view.look != "None":
+        found.append(f"look {view.look}")
+    if view.exposure != 0:
+        found.append(f"exposure {view.exposure:.3g}")
+    if view.gamma != 1:
+        found.append(f"gamma {view.gamma:.3g}")
+    if view.use_curve_mapping:
+        found.append("curves")
+    if getattr(view, "use_white_balance", False):
+        found.append("white balance")
+    return found
+
+
+def show_as_trained(scene: bpy.types.Scene) -> None:
+    """Set a scene's colour management such that it has no `objections`."""
+    view = scene.view_settings
+    view.view_transform, view.exposure, view.gamma, view.use_curve_mapping = STANDARD, 0.0, 1.0, False
+    view.look = "None"  # after the view transform, which decides what looks there are
+    if hasattr(view, "use_white_balance"):
+        view.use_white_balance = False

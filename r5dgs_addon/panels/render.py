@@ -1,0 +1,63 @@
+"""Panels of the engine R5DGS in the render and view layer properties."""
+
+import bpy
+
+from .. import engine, engine_color, worker
+
+
+class _OfEngine:
+    """A panel of the properties editor, shown for the engine R5DGS."""
+
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    COMPAT_ENGINES = {engine.ENGINE}
+
+    @classmethod
+    def poll(cls, context):
+        return context.engine in cls.COMPAT_ENGINES
+
+
+class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
+    """What the engine renders, and whether colours come out as trained."""
+
+    bl_idname = "R5DGS_PT_render"
+    bl_label = "R5DGS"
+    bl_context = "render"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        scene = context.scene
+        objections = engine_color.objections(scene)
+        if objections:
+            box = layout.box().column(align=True)
+            box.label(text="Colors do not come out as trained:", icon="ERROR")
+            box.label(text=", ".join(objections))
+            box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
+        settings = scene.r5dgs_render
+        column = layout.column()
+        column.prop(settings, "sky")
+        column.prop(scene.render, "film_transparent", text="Transparent")
+        column.prop(settings, "moving")
+        if worker.notice():
+            layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
+
+
+class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):
+    """The passes that the engine has."""
+
+    bl_idname = "R5DGS_PT_passes"
+    bl_label = "Passes"
+    bl_context = "view_layer"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        column = layout.column(heading="Data")
+        column.prop(context.view_layer, "use_pass_z", text="Depth")
+        column.prop(context.view_layer, "use_pass_object_index", text="Object Index")
+
+
+CLASSES = (R5DGS_PT_render, R5DGS_PT_passes)
