@@ -14,10 +14,10 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
-from . import views, visible, worker
+from . import handlers, views, visible, worker
 
 IMAGE = "R5DGS Preview"
-WANTED = ("depth", "alpha", "owners")
+PREVIEW = "preview"  # what `worker.busy` knows previews by
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,7 @@ def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[d
     Raises:
         R5dgsError: What the worker reports.
     """
-    answer: tuple[dict[str, Any], dict[str, np.ndarray]] = {}, {}
-    for _, command, arguments in steps(seen, want, sky):
-        answer = worker.request(command, **arguments)
-    return finished(seen, answer)
+    return finished(seen, worker.run(steps(seen, want, sky)))
 
 
 def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
@@ -112,19 +109,18 @@ def finished(
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:
-    """The file that a loaded scene came from; where it moved together with the .blend, the one beside that.
+    """The file that a loaded scene came from, the first that exists of `handlers.places`.
 
     Raises:
         SceneFileError: It is not there.
     """
-    stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=collection.library))
-    beside = Path(bpy.path.abspath("//")) / stored.name if bpy.data.filepath else stored
-    for candidate in (stored, beside):
-        if candidate.is_file():
-            return candidate
+    places = handlers.places(collection)
+    for place in places:
+        if place.is_file():
+            return place
     raise errors.SceneFileError(
-        f"{stored}: expected the scene that '{collection.name}' was loaded from, found no file; choose its new place "
-        "under 'Scene File' in the R5DGS tab"
+        f"{places[0]}: expected the scene that '{collection.name}' was loaded from, found no file; choose its new "
+        "place under 'Scene File' in the R5DGS tab"
     )
 
 
@@ -143,7 +139,7 @@ def preview(context: bpy.types.Context) -> tuple[bpy.types.Image, dict[str, Any]
 
 def start(context: bpy.types.Context) -> worker.Job:
     """Begin a `preview` without waiting; give the job's answer to `finish`."""
-    return worker.start(steps(shown(context.evaluated_depsgraph_get())))
+    return worker.submit(PREVIEW, steps(shown(context.evaluated_depsgraph_get())))
 
 
 def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.types.Image, dict[str, Any]]:

@@ -133,14 +133,13 @@ def read_meanings(path: str | Path) -> lookup.Meanings | None:
 
 
 def _open(path: Path) -> zipfile.ZipFile:
-    if not path.is_file():
-        raise errors.SceneFileError(
-            f"{path}: expected a .r5dgs file, found {'a folder' if path.is_dir() else 'nothing'}"
-        )
     try:
+        if not path.is_file():
+            found = "a folder; 'r5dgs train' makes a scene from a folder of images" if path.is_dir() else "nothing"
+            raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found {found}")
         return zipfile.ZipFile(path)
     except PermissionError as error:
-        raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
+        raise errors.SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error
     except (*_BROKEN, struct.error) as error:
         raise errors.SceneFileError(
             f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "

@@ -1,0 +1,395 @@
+"""The life of a session: files that move, scenes that are appended, linked, loaded twice, or loaded in odd places."""
+
+import importlib
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.scene import cameras, playback, scene_file
+from tests import layouts, scenes
+
+KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups", "scenes")
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    folder = tmp_path / "captured"
+    folder.mkdir()
+    return scene_file.write(scenes.make_scene(n=300, objects=3, seed=1), folder / "synthetic.r5dgs")
+
+
+def addon(name):
+    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+
+
+def load(bpy, path, **options):
+    before = set(bpy.data.collections)
+    assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
+    return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
+
+
+def loaded(bpy):
+    (collection,) = (
+        c for c in bpy.data.collections if c.r5dgs.is_scene and c in bpy.context.scene.collection.children[:]
+    )
+    return collection
+
+
+def plays(bpy, collection, path, times=(0.0, 0.333, scenes.T_MAX, 0.9)):
+    """Whether every point of a loaded scene stands where the core has it, to 1e-5 of the scene's size."""
+    scene = scene_file.read(path)
+    world = cameras.WORLD_TO_BLENDER[scene.world_convention]
+    worst = 0.0
+    for t in times:
+        frame = collection.r5dgs.frame_zero + t * collection.r5dgs.frames_per_unit
+        bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        expected = playback.frame(scene, t).means.astype(np.float64) @ world.T
+        seen = 0
+        for obj in collection.all_objects:
+            if obj.r5dgs.role != "CLOUD":
+                continue
+            evaluated = obj.evaluated_get(depsgraph)
+            points = np.empty(3 * len(evaluated.data.points), np.float32)
+            evaluated.data.attributes["position"].data.foreach_get("vector", points)
+            matrix = np.array(evaluated.matrix_world, np.float64)
+            placed = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+            rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
+            worst = max(worst, float(np.linalg.norm(placed - expected[rows], axis=-1).max()))
+            seen += len(placed)
+        assert seen == len(expected)
+    return worst <= 1e-5 * scene.extent
+
+
+def draw_panels(bpy):
+    panels = addon("panels")
+    return layouts.draw(bpy, *(panel for module in panels.MODULES for panel in module.CLASSES))
+
+
+def contents(bpy):
+    return {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in KINDS}
+
+
+@pytest.fixture
+def library(blender, scene_path, tmp_path):
+    """A .blend in a folder of its own that holds the loaded scene; an empty file is open."""
+    blend = tmp_path / "library" / "library.blend"
+    blend.parent.mkdir()
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    load(blender, scene_path)
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    return blend
+
+
+def bring(bpy, blend, *, link):
+    with bpy.data.libraries.load(str(blend), link=link) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    (collection,) = target.collections
+    bpy.context.scene.collection.children.link(collection)
+    return collection
+
+
+# --- files that move ---
+
+
+def test_a_blend_and_its_scene_can_move_together(blender, scene_path, tmp_path):
+    load(blender, scene_path)
+    blender.ops.wm.save_as_mainfile(filepath=str(scene_path.parent / "work.blend"))
+    moved = tmp_path / "elsewhere" / "far"
+    moved.parent.mkdir()
+    blender.ops.wm.read_homefile(app_template="")
+    shutil.move(scene_path.parent, moved)
+    blender.ops.wm.open_mainfile(filepath=str(moved / "work.blend"))
+    assert addon("picture").scene_path(loaded(blender)).resolve() == (moved / "synthetic.r5dgs").resolve()
+    assert plays(blender, loaded(blender), moved / "synthetic.r5dgs")
+
+
+def test_a_lost_scene_is_asked_for_by_name_and_found_where_the_user_says(blender, scene_path, tmp_path):
+    collection = load(blender, scene_path)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    hidden = tmp_path / "hidden" / "renamed.r5dgs"
+    hidden.parent.mkdir()
+    scene_path.rename(hidden)
+    with pytest.raises(errors.SceneFileError, match="synthetic.r5dgs.*'Scene File'"):
+        addon("picture").scene_path(collection)
+    assert plays(blender, collection, hidden)  # which needs no file
+    blender.ops.wm.save_mainfile()  # the lost path is kept as it was
+    assert collection.r5dgs.filepath == "//captured/synthetic.r5dgs"
+    collection.r5dgs.filepath = "//hidden/renamed.r5dgs"
+    assert addon("picture").scene_path(collection).resolve() == hidden.resolve()
+
+
+# --- append, link, override ---
+
+
+def test_an_appended_scene_plays_and_finds_its_file_from_another_folder(blender, library, scene_path, tmp_path):
+    blend = tmp_path / "a" / "b" / "new.blend"
+    blend.parent.mkdir(parents=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    collection = bring(blender, library, link=False)
+    assert collection.library is None and collection.r5dgs.root in collection.objects[:]
+    assert plays(blender, collection, scene_path)
+    assert addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    blender.ops.wm.save_mainfile()  # from here on by the new .blend's own relative path
+    assert collection.r5dgs.filepath == "//../../captured/synthetic.r5dgs"
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
+
+
+def test_a_linked_scene_plays_and_nothing_is_written_to_it(blender, library, scene_path, tmp_path):
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "linking.blend"))
+    collection = bring(blender, library, link=True)
+    before = library.read_bytes(), collection.r5dgs.filepath, collection.r5dgs.seen_at
+    assert collection.library is not None and plays(blender, collection, scene_path)
+    assert addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
+    with pytest.raises(RuntimeError, match="linked from another file"):
+        blender.ops.r5dgs.set_display(display="ELLIPSOIDS")
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    blender.ops.wm.save_mainfile()
+    assert (library.read_bytes(), collection.r5dgs.filepath, collection.r5dgs.seen_at) == before
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "linking.blend"))
+    assert plays(blender, loaded(blender), scene_path)
+
+
+def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, library, scene_path, tmp_path):
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "overriding.blend"))
+    linked = bring(blender, library, link=True)
+    override = linked.override_hierarchy_create(
+        blender.context.scene, blender.context.view_layer, do_fully_editable=True
+    )
+    if linked in blender.context.scene.collection.children[:]:
+        blender.context.scene.collection.children.unlink(linked)
+    assert override.r5dgs.is_scene and override.override_library is not None
+    assert plays(blender, override, scene_path)
+    assert addon("picture").scene_path(override).resolve() == scene_path.resolve()
+    assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
+    root = next(obj for obj in override.all_objects if obj.r5dgs.role == "ROOT")
+    assert root.library is None
+    root.location = (0, 0, 2)
+    blender.ops.wm.save_mainfile()
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "overriding.blend"))
+    again = loaded(blender)
+    assert not plays(blender, again, scene_path)  # it stands higher
+    next(obj for obj in again.all_objects if obj.r5dgs.role == "ROOT").location = (0, 0, 0)
+    assert plays(blender, again, scene_path)
+    assert addon("picture").scene_path(again).resolve() == scene_path.resolve()
+
+
+# --- several scenes, odd places ---
+
+
+def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene_path, tmp_path):
+    other = scene_file.write(scenes.make_scene(n=200, objects=2, seed=7), tmp_path / "other.r5dgs")
+    first = load(blender, scene_path)
+    second = load(blender, other, frame_zero=31.5)
+    third = load(blender, scene_path, display="ELLIPSOIDS")
+    names = [obj.name for collection in (first, second, third) for obj in collection.all_objects]
+    assert len(names) == len(set(names))
+    assert plays(blender, first, scene_path) and plays(blender, second, other)
+    objects = addon("objects")
+    for collection in (first, second, third):
+        blender.context.view_layer.objects.active = objects.members(collection, "CLOUD")[0]
+        assert objects.active_collection(blender.context) == collection
+    blender.ops.r5dgs.set_display(display="POINTS")
+    assert third.r5dgs.display == "POINTS" and plays(blender, third, scene_path)
+
+
+@pytest.mark.parametrize("fps", [24, 60, 120])
+def test_frames_say_the_time_whatever_the_frame_rate(blender, scene_path, fps):
+    blender.context.scene.render.fps = fps
+    assert plays(blender, load(blender, scene_path), scene_path)
+
+
+def test_in_edit_mode_loading_asks_for_object_mode_and_changes_nothing(blender, scene_path):
+    blender.context.view_layer.objects.active = blender.data.objects["Cube"]
+    blender.ops.object.mode_set(mode="EDIT")
+    before = contents(blender)
+    with pytest.raises(RuntimeError, match="Switch to Object Mode first"):
+        blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    assert contents(blender) == before and blender.context.mode == "EDIT_MESH"
+    blender.ops.object.mode_set(mode="OBJECT")
+
+
+def test_an_excluded_or_hidden_active_collection_does_not_swallow_the_scene(blender, scene_path):
+    hidden = blender.data.collections.new("hidden")
+    blender.context.scene.collection.children.link(hidden)
+    layer = blender.context.view_layer
+    layer.active_layer_collection = layer.layer_collection.children["hidden"]
+    layer.layer_collection.children["hidden"].exclude = True
+    collection = load(blender, scene_path)
+    assert all(obj.visible_get() for obj in collection.all_objects)
+    assert plays(blender, collection, scene_path)
+
+
+def test_it_loads_into_the_scene_of_the_context_and_no_other(blender, scene_path):
+    empty = blender.data.scenes.new("empty")
+    with blender.context.temp_override(scene=empty, view_layer=empty.view_layers[0]):
+        collection = load(blender, scene_path)
+    assert collection in empty.collection.children[:]
+    assert collection not in blender.context.window.scene.collection.children[:]
+
+
+def test_a_linked_scene_is_not_loaded_into(blender, scene_path, tmp_path):
+    blender.data.scenes.new("theirs")
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "theirs.blend"))
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    with blender.data.libraries.load(str(tmp_path / "theirs.blend"), link=True) as (_, target):
+        target.scenes = ["theirs"]
+    theirs, before = target.scenes[0], contents(blender)
+    with (
+        blender.context.temp_override(scene=theirs, view_layer=theirs.view_layers[0]),
+        pytest.raises(RuntimeError, match="linked from another file"),
+    ):
+        blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    assert contents(blender) == before
+
+
+# --- what stays after the extension ---
+
+
+def traces(bpy):
+    """What the extension has hung up in Blender: classes, properties, handlers, menus, keymaps."""
+    found = {name for name in dir(bpy.types) if "R5DGS" in name.upper()}
+    for owner in ("Object", "Collection", "Scene", "WindowManager", "Material", "Camera", "PointCloud"):
+        properties = getattr(bpy.types, owner).bl_rna.properties
+        found |= {f"{owner}.{p.identifier}" for p in properties if "r5dgs" in p.identifier.lower()}
+    for name in dir(bpy.app.handlers):
+        listening = getattr(bpy.app.handlers, name)
+        if isinstance(listening, list):
+            found |= {f"{name}: {f}" for f in listening if getattr(f, "__module__", "").startswith("r5dgs.")}
+    for name in dir(bpy.types):
+        drawn = getattr(getattr(getattr(bpy.types, name), "draw", None), "_draw_funcs", ())
+        found |= {f"{name}: {f}" for f in drawn if f.__module__.startswith("r5dgs.")}
+    configurations = bpy.context.window_manager.keyconfigs
+    for configuration in configurations:
+        for keymap in configuration.keymaps:
+            found |= {
+                f"{keymap.name}: {item.idname}" for item in keymap.keymap_items if item.idname.startswith("r5dgs.")
+            }
+    return found
+
+
+def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blender, extension, scene_path):
+    present = traces(blender)
+    assert {"R5DGS_OT_load_scene", "R5DGS_PT_scene", "R5DGS_FH_scene", "Object.r5dgs"} <= present
+    assert any(name.startswith("TOPBAR_MT_file_import") for name in present)
+    for _ in range(2):
+        extension.unregister()
+        try:
+            assert traces(blender) == set()
+        finally:
+            extension.register()
+        assert {name.split(" at 0x")[0] for name in traces(blender)} == {name.split(" at 0x")[0] for name in present}
+    assert plays(blender, load(blender, scene_path), scene_path)
+
+
+def test_what_was_loaded_lives_on_without_the_extension_and_is_known_again_after_it(blender, extension, scene_path):
+    load(blender, scene_path)
+    before = {obj.name for obj in blender.data.objects}
+    extension.unregister()
+    try:
+        blender.context.scene.frame_set(20)
+        first = np.array(blender.data.objects["mug anchor"].matrix_world)
+        blender.context.scene.frame_set(50)
+        assert not np.allclose(np.array(blender.data.objects["mug anchor"].matrix_world), first)
+    finally:
+        extension.register()
+    assert {obj.name for obj in blender.data.objects} == before
+    assert plays(blender, loaded(blender), scene_path)
+
+
+# --- bad input ---
+
+
+@pytest.fixture
+def bad(tmp_path, scene_path):
+    """Makes a bad input of a kind; returns its path."""
+
+    def make(kind):
+        path = tmp_path / f"{kind}.r5dgs"
+        if kind == "newer":
+            with_json(scene_path, path, lambda text: text.replace('"format_version": 1', '"format_version": 99'))
+        elif kind == "folder":
+            path.mkdir()
+            (path / "r_000.png").write_bytes(b"\x89PNG")
+        elif kind == "image":
+            path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(500))
+        elif kind == "no Gaussians":
+            scene_file.write(scenes.make_scene(n=0, objects=0, unassigned=0, shadows=False), path)
+        elif kind == "half copied":
+            path.write_bytes(scene_path.read_bytes()[:-300])
+        return path
+
+    return make
+
+
+def with_json(source, target, change):
+    import zipfile
+
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name == "scene.json":
+                changed = change(data.decode())
+                assert changed != data.decode()
+                data = changed.encode()
+            new.writestr(name, data)
+
+
+REMEDIES = {
+    "newer": "update R5DGS",
+    "folder": "expected a .r5dgs file, found a folder.*r5dgs train",
+    "image": "bake or copy it again",
+    "no Gaussians": "expected Gaussians, found none",
+    "half copied": "bake or copy it again",
+    "not there": "found nothing",
+}
+
+
+@pytest.mark.parametrize("kind", REMEDIES)
+def test_bad_input_says_what_to_do_and_changes_nothing(blender, bad, kind, tmp_path):
+    path = bad(kind)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
+    before, selected = contents(blender), list(blender.context.selected_objects)
+    range_before = blender.context.scene.frame_end
+    with pytest.raises(RuntimeError, match=f"(?s){path.name}.*{REMEDIES[kind]}") as caught:
+        blender.ops.r5dgs.load_scene(filepath=str(path))
+    assert "Traceback" not in str(caught.value)
+    assert contents(blender) == before and list(blender.context.selected_objects) == selected
+    assert blender.context.scene.frame_end == range_before and not blender.context.scene.timeline_markers
+
+
+def test_no_file_at_all_is_asked_for(blender):
+    with pytest.raises(RuntimeError, match="choose a .r5dgs file"):
+        blender.ops.r5dgs.load_scene()
+
+
+def test_a_scene_of_background_alone_loads_and_says_so(blender, tmp_path, capfd):
+    path = scene_file.write(scenes.make_scene(n=50, objects=0, unassigned=0), tmp_path / "still.r5dgs")
+    collection = load(blender, path)
+    assert "no objects" in capfd.readouterr().out
+    assert plays(blender, collection, path)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights to read are those of POSIX here")
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_without_the_right_to_read_it_says_so(blender, scene_path, what):
+    locked: Path = scene_path if what == "file" else scene_path.parent
+    locked.chmod(0)
+    is_root, before = os.geteuid() == 0, contents(blender)
+    if is_root:
+        os.seteuid(65534)  # who may read everything reads as nobody
+    try:
+        with pytest.raises(RuntimeError, match="cannot be read") as caught:
+            blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    finally:
+        if is_root:
+            os.seteuid(0)
+        locked.chmod(0o755)
+    assert "Traceback" not in str(caught.value) and contents(blender) == before
