@@ -2,9 +2,43 @@
 
 import bpy
 
-from . import capture_dataset, check_worker, export_ply, load_scene, preview, select_by_prompt, set_display, use_engine
+from . import (
+    capture_dataset,
+    check_worker,
+    delete_object,
+    duplicate_object,
+    exact_mode,
+    export_ply,
+    extrapolate_until,
+    load_scene,
+    preview,
+    re_extrapolate,
+    replace_motion,
+    reset_motion,
+    select_by_prompt,
+    set_display,
+    show_confidence,
+    use_engine,
+)
 
-MODULES = (load_scene, set_display, select_by_prompt, preview, use_engine, check_worker, export_ply, capture_dataset)
+MODULES = (
+    load_scene,
+    set_display,
+    select_by_prompt,
+    re_extrapolate,
+    reset_motion,
+    extrapolate_until,
+    replace_motion,
+    duplicate_object,
+    delete_object,
+    exact_mode,
+    show_confidence,
+    preview,
+    use_engine,
+    check_worker,
+    export_ply,
+    capture_dataset,
+)
 
 
 def _menu_import(menu, context):

@@ -1,8 +1,8 @@
 """Services of the add-on: objects, keyframes, properties, preferences, panels and the worker's client."""
 
-from . import engine, handlers, look, motion_physics, panels, preferences, properties, worker
+from . import engine, handlers, look, motion_exact, motion_physics, panels, preferences, properties, worker
 
-MODULES = (properties, look, motion_physics, preferences, engine, panels, handlers, worker)
+MODULES = (properties, look, motion_physics, motion_exact, preferences, engine, panels, handlers, worker)
 
 
 def register():

@@ -122,8 +122,13 @@ def play(obj: bpy.types.Object, action: bpy.types.Action, slot) -> None:
     """Give an object an action, and in it the slot that a slot of the same action or of one it was copied from is."""
     animation = obj.animation_data_create()
     animation.action = action
+    choose_slot(animation, slot)
+
+
+def choose_slot(user: bpy.types.AnimData | bpy.types.NlaStrip, slot) -> None:
+    """Let an object or a strip play the slot of its action that has the handle of a given one; None does nothing."""
     if slot is not None:
-        animation.action_slot = next(other for other in action.slots if other.handle == slot.handle)
+        user.action_slot = next(other for other in user.action.slots if other.handle == slot.handle)
 
 
 def keyframe_enum(property_name: str, item: str) -> int:

@@ -183,7 +183,7 @@ def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
         times_of(anchor)
         motion_curves.place(anchor)
     for anchor in anchors:
-        motion_physics.show(anchor.r5dgs_motion, motion_physics.learned(anchor.r5dgs_motion))
+        motion_physics.reset(anchor)
     return re_extrapolate(anchors)
 
 
@@ -217,7 +217,7 @@ def reload(anchors: list[bpy.types.Object], path: Path) -> None:
         allowed, _ = motion_physics.key_error(anchor)
         exact = replace(times, t_max=float(scene.t_max))
         keyframes.animate(anchor, scene, anchor.r5dgs.motion_id, exact, allowed / scene.extent)
-        motion_physics.show(anchor.r5dgs_motion, motion_physics.learned(anchor.r5dgs_motion))
+        motion_physics.reset(anchor)
         motion_physics.sign(anchor, times)
         motion_confidence.refresh(anchor, times)
 

@@ -130,6 +130,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         set=_write_swing,
         options=set(),
     )
+    learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
     tube: PointerProperty(
         name="Confidence", description="Helper that shows how sure the path is", type=bpy.types.Object, options=set()
     )
@@ -167,7 +168,8 @@ def remember(
                 "allowed": tolerance * extent,
             }
         )
-        state.frames_per_unit, state.leader = scene.frames_per_unit, leader
+        state.frames_per_unit = scene.frames_per_unit
+        state.leader = state.learned_leader = leader
         show(state, group.model)
         sign(anchor, times)
 
@@ -208,6 +210,22 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     for name in RATES:
         setattr(state, f"stored_{name}", getattr(model, name))
     state.stored_frequency = model.frequency
+
+
+def copy(source: bpy.types.Object, target: bpy.types.Object) -> None:
+    """Give an anchor the motion of another that follows nobody; what it learned itself stays remembered."""
+    giver, taker = source.r5dgs_motion, target.r5dgs_motion
+    taker.kind = giver.kind
+    for name in (*RATES, "frequency"):
+        setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
+    taker.leader = None
+
+
+def reset(anchor: bpy.types.Object) -> None:
+    """Bring the fields of an anchor back to the learned motion."""
+    state = anchor.r5dgs_motion
+    show(state, learned(state))
+    state.leader = state.learned_leader
 
 
 def learned(state: bpy.types.PropertyGroup) -> MotionModel:

@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, export, preview, prompt, render, scene
+from . import capture, export, motion, preview, prompt, render, scene
 
-MODULES = (scene, prompt, preview, export, capture, render)
+MODULES = (scene, prompt, motion, preview, export, capture, render)
 
 
 def register():

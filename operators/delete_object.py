@@ -1,0 +1,33 @@
+"""Delete Object: an object of the scene with everything that belongs to it."""
+
+import bpy
+from bpy.props import BoolProperty
+
+from ..r5dgs_addon import motion_objects
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_delete_object(bpy.types.Operator):
+    """Delete the selected objects: anchors, points, keys and collections that are empty then"""
+
+    bl_idname = "r5dgs.delete_object"
+    bl_label = "Delete Object"
+    bl_options = {"REGISTER", "UNDO"}
+
+    shadows: BoolProperty(name="Shadows", description="Delete the shadows of the objects, too", default=True)
+
+    @classmethod
+    def poll(cls, context):
+        return motion_objects.poll_chosen(cls, context)
+
+    def execute(self, context):
+        try:
+            _, names = motion_objects.delete(context, motion_objects.chosen(context), self.shadows)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Deleted {', '.join(names)}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_delete_object,)

@@ -1,0 +1,44 @@
+"""Duplicate Object: a copy that moves the same way, as an object of its own."""
+
+import bpy
+from bpy.props import BoolProperty, FloatVectorProperty
+
+from ..r5dgs_addon import motion_objects, motion_physics
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_duplicate_object(bpy.types.Operator):
+    """Copy the selected objects with their motion: anchor, points and keys"""
+
+    bl_idname = "r5dgs.duplicate_object"
+    bl_label = "Duplicate With Motion"
+    bl_options = {"REGISTER", "UNDO"}
+
+    offset: FloatVectorProperty(
+        name="Offset",
+        description="How far the copies stand off, along the scene's axes; unless set, beside the originals",
+        subtype="TRANSLATION",
+        unit="LENGTH",
+        options={"SKIP_SAVE"},
+    )
+    shadows: BoolProperty(name="Shadows", description="Copy the shadows of the objects, too", default=True)
+
+    @classmethod
+    def poll(cls, context):
+        return motion_objects.poll_chosen(cls, context)
+
+    def execute(self, context):
+        anchors = motion_objects.chosen(context)
+        if not self.properties.is_property_set("offset"):
+            reach = max(motion_physics.key_error(anchor)[1] for anchor in anchors)
+            self.offset = (2.2 * reach, 0.0, 0.0)
+        try:
+            copies = motion_objects.duplicate(context, anchors, tuple(self.offset), self.shadows)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Made {', '.join(copy.name for copy in copies)}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_duplicate_object,)

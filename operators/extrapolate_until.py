@@ -1,0 +1,50 @@
+"""Extrapolate Until: extend or shorten the future of a loaded scene."""
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty
+
+from ..r5dgs_addon import motion_extrapolate, objects
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_extrapolate_until(bpy.types.Operator):
+    """Extend or shorten the future of the whole scene; edited physics are obeyed, keys edited by hand stay"""
+
+    bl_idname = "r5dgs.extrapolate_until"
+    bl_label = "Extrapolate Until"
+    bl_options = {"REGISTER", "UNDO"}
+
+    t_end: FloatProperty(name="Scene Time", description="Scene time of the last keys", precision=3, step=10)
+    fit_timeline: BoolProperty(
+        name="Fit Timeline", description="Set the last frame of the timeline to the last keys", default=True
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+    def invoke(self, context, event):
+        self.t_end = objects.active_collection(context).r5dgs.t_end
+        return context.window_manager.invoke_props_dialog(self)
+
+    def execute(self, context):
+        collection = objects.active_collection(context)
+        t_end = self.t_end if self.properties.is_property_set("t_end") else collection.r5dgs.t_end
+        if t_end < collection.r5dgs.t_max:
+            self.report({"WARNING"}, f"Before the last observed time, {collection.r5dgs.t_max:g}: nothing extrapolated")
+        try:
+            written, kept = motion_extrapolate.extrapolate_until(context, collection, t_end, self.fit_timeline)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        if kept:
+            names = ", ".join(anchor.name for anchor in kept)
+            self.report({"WARNING"}, f"Their later keys were edited by hand and stay: {names}; Re-Extrapolate them")
+        self.report({"INFO"}, f"{len(written)} objects move until {collection.r5dgs.t_end:g}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_extrapolate_until,)

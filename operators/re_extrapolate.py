@@ -1,0 +1,30 @@
+"""Re-Extrapolate: write the keys after the last observed time anew, from the physics of the selected objects."""
+
+import bpy
+
+from ..r5dgs_addon import motion_extrapolate, motion_objects
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_re_extrapolate(bpy.types.Operator):
+    """Write the keys after the last observed time anew from the physics of the selected objects; earlier keys stay"""
+
+    bl_idname = "r5dgs.re_extrapolate"
+    bl_label = "Re-Extrapolate"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return motion_objects.poll_chosen(cls, context)
+
+    def execute(self, context):
+        try:
+            written = motion_extrapolate.re_extrapolate(motion_objects.chosen(context))
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Extrapolated {', '.join(anchor.name for anchor in written)}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_re_extrapolate,)

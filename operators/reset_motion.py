@@ -1,0 +1,41 @@
+"""Reset to Learned: bring the motion of the selected objects back to what the scene file says."""
+
+import bpy
+from bpy.props import BoolProperty
+
+from ..r5dgs_addon import motion_extrapolate, motion_objects, picture
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_reset_motion(bpy.types.Operator):
+    """Bring the physics of the selected objects, and the keys after the last observed time, back to the learned ones"""
+
+    bl_idname = "r5dgs.reset_motion"
+    bl_label = "Reset to Learned"
+    bl_options = {"REGISTER", "UNDO"}
+
+    observed: BoolProperty(
+        name="Observed Keys Too",
+        description="Read the keys up to the last observed time from the scene file again, in place of yours",
+        default=False,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        return motion_objects.poll_chosen(cls, context)
+
+    def execute(self, context):
+        anchors = motion_objects.chosen(context)
+        try:
+            if self.observed:
+                for collection, members in motion_objects.by_scene(anchors).items():
+                    motion_extrapolate.reload(members, picture.scene_path(collection))
+            motion_extrapolate.reset(anchors)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Learned motion: {', '.join(anchor.name for anchor in anchors)}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_reset_motion,)

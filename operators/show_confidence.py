@@ -1,0 +1,56 @@
+"""Show Confidence: how sure the extrapolated paths are, as tubes in the viewport."""
+
+import bpy
+from bpy.props import EnumProperty
+
+from ..r5dgs_addon import motion_confidence, motion_extrapolate, motion_objects, motion_physics, objects
+from ..r5dgs_core import errors
+
+ACTIONS = (
+    ("TOGGLE", "Toggle", "Remove the tubes where there are some, else make them"),
+    ("SHOW", "Show", "Make or renew the tubes"),
+    ("HIDE", "Hide", "Remove the tubes"),
+)
+
+
+class R5DGS_OT_show_confidence(bpy.types.Operator):
+    """Show the paths of the selected objects, or of all, as tubes as thick as one standard deviation"""
+
+    bl_idname = "r5dgs.show_confidence"
+    bl_label = "Show Confidence"
+    bl_options = {"REGISTER", "UNDO"}
+
+    action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
+
+    @classmethod
+    def poll(cls, context):
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+    def execute(self, context):
+        collection = objects.active_collection(context)
+        everyone = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
+        anchors = motion_objects.chosen(context) if context.selected_objects else []
+        anchors = anchors or everyone
+        shown = [anchor for anchor in anchors if motion_confidence.helper_of(anchor) is not None]
+        if self.action == "HIDE" or (self.action == "TOGGLE" and shown):
+            count = sum(motion_confidence.hide(anchor) for anchor in anchors)
+            self.report({"INFO"}, f"Removed {count} tubes")
+            return {"FINISHED"}
+        try:
+            tubes = [motion_confidence.show(anchor, motion_extrapolate.times_of(anchor)) for anchor in anchors]
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        count = sum(tube is not None for tube in tubes)
+        if count == 0:
+            self.report({"WARNING"}, "Nothing moves after the last observed time")
+            return {"CANCELLED"}
+        context.view_layer.update()
+        self.report({"INFO"}, f"{count} tubes, as thick as one standard deviation")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_show_confidence,)

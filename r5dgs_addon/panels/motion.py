@@ -1,0 +1,65 @@
+"""Panel *Motion*: how the active object moves on after the last observed time."""
+
+import bpy
+
+from .. import motion_confidence, motion_objects, motion_physics, objects
+from . import sidebar
+
+
+class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
+    """Edit how the active object moves on."""
+
+    bl_idname = "R5DGS_PT_motion"
+    bl_label = "Motion"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        anchor = motion_objects.active_anchor(context)
+        if anchor is None:
+            layout.label(text="Select an object to see its motion", icon="INFO")
+        else:
+            _physics(layout, anchor)
+            column = layout.column(align=True)
+            column.operator("r5dgs.re_extrapolate", icon="TRACKING_FORWARDS")
+            column.operator("r5dgs.reset_motion", icon="LOOP_BACK")
+            column = layout.column(align=True)
+            column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
+            column.operator("r5dgs.duplicate_object", icon="DUPLICATE")
+            column.operator("r5dgs.delete_object", icon="TRASH")
+        _scene(layout, objects.active_collection(context))
+
+
+def _physics(layout, anchor) -> None:
+    """The fields of the motion."""
+    state = anchor.r5dgs_motion
+    layout.label(text=anchor.name, icon="EMPTY_ARROWS")
+    layout.prop(state, "leader")
+    if motion_physics.follow_matrix(state) is not None:
+        layout.label(text="Moves with what it follows", icon="LINKED")
+        return
+    layout.prop(state, "kind")
+    for name in motion_physics.FIELDS[state.kind]:
+        layout.prop(state, name)
+    changed = motion_physics.edited(state)
+    if changed:
+        layout.label(text="Edited; Re-Extrapolate writes the keys", icon="GREASEPENCIL")
+    else:
+        layout.label(text="As learned", icon="CHECKMARK")
+
+
+def _scene(layout, collection) -> None:
+    """What concerns all objects."""
+    column = layout.column(align=True)
+    column.operator("r5dgs.extrapolate_until", icon="PREVIEW_RANGE")
+    shown = any(motion_confidence.helper_of(anchor) for anchor in objects.members(collection, "ANCHOR"))
+    column.operator("r5dgs.show_confidence", text="Hide Confidence" if shown else "Show Confidence", icon="CURVE_PATH")
+    exact = collection.r5dgs_exact
+    text = "Exact Mode Is On" if exact.enabled else "Exact Mode"
+    column.operator("r5dgs.exact_mode", text=text, icon="MOD_SIMPLEDEFORM", depress=exact.enabled)
+    if exact.problem:
+        layout.label(text=exact.problem, icon="ERROR")
+
+
+CLASSES = (R5DGS_PT_motion,)
