@@ -14,7 +14,7 @@ class R5DGS_OT_preview(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if worker.busy():
+        if worker.busy(picture.PREVIEW):
             cls.poll_message_set("A preview is being rendered; Esc stops it")
             return False
         if objects.active_collection(context) is None:
@@ -57,9 +57,8 @@ class R5DGS_OT_preview(bpy.types.Operator):
         return self._done(context, image, result)
 
     def cancel(self, context):
-        """Stop the worker, which has no other way to leave a picture unfinished."""
-        if not self._job.done:
-            worker.stop()
+        """Leave the picture unfinished."""
+        self._job.cancel()
         self._leave(context)
 
     def execute(self, context):

@@ -1,344 +1,212 @@
 """The add-on's side of the worker: a Python with torch, started when it is first needed, kept until the add-on ends.
 
-The protocol is that of `r5dgs_core.serve`: a JSON line each way, and after an answer's line the raw bytes that it
-announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that dies,
-hangs or talks nonsense is dropped with a clear error; the next request starts another.
+There is one worker, and it does one thing after the other: whoever asks has it for all steps of what is asked, so that
+nobody's scenes are exchanged between loading and rendering. `run` waits for the answer; `submit` returns a job that a
+timer looks at, and what waits under the same key is dropped for what comes later. After a worker's death the next
+request starts another. No thread touches Blender's data.
 """
 
 import atexit
-import collections
-import contextlib
-import json
-import logging
-import os
-import queue
-import subprocess
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..r5dgs_core import errors
 from . import preferences
+from .worker_process import Worker
 
-ROOT = Path(__file__).resolve().parent.parent
-START_TIMEOUT_S = 120.0
-STDERR_LINES = 12
-COMPILING = "preparing the rasterizer (first use, about 10 s)"
-
-log = logging.getLogger(__name__)
-
-
-class Worker:
-    """One running worker process; `greet` it before the first request.
-
-    Args:
-        python: Path of the Python to run it with.
-
-    Raises:
-        BackendError: It cannot be started.
-    """
-
-    def __init__(self, python: str):
-        self.python = python
-        self.hello: dict[str, Any] = {}
-        self.notice = ""  # what pictures wait for, where it is not their own making
-        self._number = 0
-        self._answers: queue.Queue = queue.Queue()
-        self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
-        environment = dict(os.environ)
-        known = environment.get("PYTHONPATH", "")
-        # The add-on's own copy of the core comes first, so that both sides are of one version.
-        environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
-        environment["PYTHONUNBUFFERED"] = "1"
-        environment.pop("PYTHONHOME", None)
-        try:
-            self._process = subprocess.Popen(
-                [python, "-m", "r5dgs_core.serve"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                env=environment,
-                cwd=str(ROOT),
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-            )
-        except OSError as error:
-            raise errors.BackendError(
-                f"worker: '{python}' cannot be started ({error.strerror or error}); set 'Worker Python' in the "
-                f"add-on's preferences, or {preferences.ENVIRONMENT}, to a Python with torch and numba"
-            ) from error
-        self._readers = [
-            threading.Thread(target=self._read_answers, name="r5dgs worker answers", daemon=True),
-            threading.Thread(target=self._read_stderr, name="r5dgs worker log", daemon=True),
-        ]
-        for reader in self._readers:
-            reader.start()
-
-    def greet(self) -> None:
-        """Wait until it answers, once.
-
-        Raises:
-            BackendError: It does not, or its Python lacks what rendering needs.
-        """
-        if self.hello:
-            return
-        try:
-            self.hello, _ = self.request("hello", timeout_s=START_TIMEOUT_S)
-            if self.hello.get("missing"):
-                raise errors.BackendError(
-                    f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
-                    "('pip install r5dgs') or choose another 'Worker Python' in the add-on's preferences"
-                )
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.poll() is None
-
-    @property
-    def pid(self) -> int:
-        """Its process id."""
-        return self._process.pid
-
-    def request(self, command: str, timeout_s: float, **arguments: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Ask for something and wait for the answer.
-
-        Args:
-            command: Name of the request.
-            timeout_s: Seconds to wait; the worker is stopped when they have passed.
-            **arguments: The request's arguments, JSON values.
-
-        Returns:
-            The result, and its arrays by name.
-
-        Raises:
-            R5dgsError: What the worker reports, by its own class.
-            BackendError: The worker died or did not answer in time.
-        """
-        self._number += 1
-        line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
-        try:
-            assert self._process.stdin is not None
-            self._process.stdin.write(line.encode())
-            self._process.stdin.flush()
-        except (OSError, ValueError):
-            raise self._death() from None
-        while True:
-            try:
-                answer = self._answers.get(timeout=timeout_s)
-            except queue.Empty:
-                self.close()
-                raise errors.BackendError(
-                    f"worker: no answer to '{command}' within {timeout_s:g} s, so it was stopped; try again, or raise "
-                    "'Timeout' in the add-on's preferences"
-                ) from None
-            if answer is None:
-                raise self._death()
-            header, arrays = answer
-            if header.get("id") == self._number:
-                break
-        if not header.get("ok"):
-            raise _error_of(header)
-        return header.get("result", {}), arrays
-
-    def close(self) -> None:
-        """Stop the process and wait until it is gone."""
-        process = self._process
-        if process.poll() is None:
-            process.terminate()  # before its input is closed: closing waits for a request that is being written
-            try:
-                process.wait(timeout=2.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        for reader in self._readers:
-            reader.join(timeout=2.0)
-        for pipe in (process.stdin, process.stdout, process.stderr):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
-
-    def _death(self) -> errors.BackendError:
-        self.close()
-        said = " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
-        return errors.BackendError(
-            f"worker: {self.python} ended unexpectedly (exit code {self._process.returncode})"
-            + (f": {said}" if said else "")
-            + "; the next request starts it again"
-        )
-
-    def _read_answers(self) -> None:
-        stream = self._process.stdout
-        assert stream is not None
-        try:
-            while line := stream.readline():
-                header = json.loads(line)
-                if "event" in header:
-                    self._hear(header)
-                    continue
-                arrays = {}
-                for entry in header.get("arrays", ()):
-                    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-                    size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-                    blob = stream.read(size)
-                    if len(blob) != size:
-                        return
-                    arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
-                self._answers.put((header, arrays))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            self._stderr.append(f"unreadable answer: {error}")
-        finally:
-            self._answers.put(None)
-
-    def _hear(self, event: dict[str, Any]) -> None:
-        notice = COMPILING if event["event"] == "compiling" else ""
-        if notice:
-            log.warning("R5DGS worker: %s", notice)
-        if event["event"] == "failed":
-            log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))
-        self.notice = notice  # last: who sees it finds it told already
-
-    def _read_stderr(self) -> None:
-        stream = self._process.stderr
-        assert stream is not None
-        with contextlib.suppress(OSError, ValueError):
-            for line in stream:
-                self._stderr.append(line.decode(errors="replace").rstrip())
-
-
-def _error_of(header: dict[str, Any]) -> errors.R5dgsError:
-    """The error that an answer reports: a class of `errors` where the worker names one."""
-    report = header.get("error", {})
-    kind = getattr(errors, str(report.get("kind")), None)
-    message = str(report.get("message", "no reason given"))
-    if isinstance(kind, type) and issubclass(kind, errors.R5dgsError):
-        return kind(message)
-    return errors.BackendError(f"worker: {report.get('kind', 'error')}: {message}")
+Steps = list[tuple[str, str, dict[str, Any]]]
+Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 class Job:
     """Requests that wait for their answers in a thread of their own, so that Blender's window stays free.
 
     Args:
-        running: The worker; nobody else may ask it until the job is done.
+        python: Python of the worker that is started where none runs.
         timeout_s: Seconds to wait for each answer.
         steps: What the sidebar says while it waits, the command, and its arguments; one after the other.
+        key: What a later job takes the place of this one by; "" for nothing.
     """
 
-    def __init__(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]):
-        self._step = "starting the worker"
-        self._worker = running
+    def __init__(self, python: str, timeout_s: float, steps: Steps, key: str = ""):
+        self.key = key
+        self.dropped = False  # whether it ended before it began
+        self._step = "waiting for the worker"
         self._started = time.monotonic()
-        self._answer: tuple[dict[str, Any], dict[str, np.ndarray]] | None = None
+        self._answer: Answer | None = None
         self._error: BaseException | None = None
+        self._begun = False
+        self._guard = threading.Lock()
         self._thread = threading.Thread(
-            target=self._run, args=(running, timeout_s, steps), name="r5dgs worker job", daemon=True
+            target=self._run, args=(python, timeout_s, steps), name="r5dgs worker job", daemon=True
         )
         self._thread.start()
 
     @property
     def doing(self) -> str:
         """What it waits for, in a few words."""
-        return self._worker.notice or self._step
+        return (notice() if self._begun else "") or self._step
 
     @property
     def done(self) -> bool:
         """Whether `answer` returns at once."""
-        return not self._thread.is_alive()
+        return self.dropped or not self._thread.is_alive()
 
     @property
     def seconds(self) -> float:
-        """Seconds since it started."""
+        """Seconds since it was asked for."""
         return time.monotonic() - self._started
 
     def join(self) -> None:
         """Wait until it has ended, whatever came of it."""
-        self._thread.join()
+        if not self.dropped:
+            self._thread.join()
 
-    def answer(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Wait for the last step's result and arrays. Raises what a step raised."""
-        self._thread.join()
+    def drop(self) -> bool:
+        """Have it not begin. Returns whether that was in time."""
+        with self._guard:
+            self.dropped = self.dropped or not self._begun
+            return self.dropped
+
+    def cancel(self) -> None:
+        """Have it not begin, or end it by stopping the worker, which has no other way to leave a picture unfinished."""
+        if not self.drop():
+            self._end()
+
+    def answer(self) -> Answer:
+        """Wait for the last step's result and arrays. Raises what a step raised, BackendError where it was dropped."""
+        self.join()
+        if self.dropped:
+            raise errors.BackendError("worker: what was asked for was taken back before its turn")
         if self._error is not None:
             raise self._error
         assert self._answer is not None
         return self._answer
 
-    def _run(self, running: Worker, timeout_s: float, steps: list[tuple[str, str, dict[str, Any]]]) -> None:
-        try:
-            running.greet()
-            for self._step, command, arguments in steps:
-                self._answer = running.request(command, timeout_s, **arguments)
-        except BaseException as error:  # raised again where the answer is asked for
-            self._error = error
+    def _end(self) -> None:
+        """Stop the worker until the job has ended; it may be starting one just now."""
+        while not self.done:
+            _kill()
+            self._thread.join(0.05)
+
+    def _run(self, python: str, timeout_s: float, steps: Steps) -> None:
+        with _turn:
+            with self._guard:
+                if self.dropped:
+                    return
+                self._begun = True
+            try:
+                self._step = "starting the worker"
+                running = _running(python)
+                running.greet()
+                for self._step, command, arguments in steps:
+                    self._answer = running.request(command, timeout_s, **arguments)
+            except BaseException as error:  # raised again where the answer is asked for
+                self._error = error
 
 
+_turn = threading.Lock()  # held by who asks the worker
+_state = threading.Lock()  # held while the names below change
 _worker: Worker | None = None
-_job: Job | None = None
+_jobs: list[Job] = []
+
+
+def submit(key: str, steps: Steps) -> Job:
+    """Begin a `Job`; what waits under the same key and has not begun is dropped: the latest request wins.
+
+    Call it from Blender's main thread, and look at the job's ``done`` from a timer.
+
+    Args:
+        key: Who asks, "viewport" for example.
+        steps: As for `Job`.
+
+    Returns:
+        The job.
+    """
+    for job in _waiting(key):
+        job.drop()
+    job = Job(preferences.worker_python(), preferences.worker_timeout_s(), steps, key)
+    with _state:
+        _jobs[:] = [other for other in _jobs if not other.done] + [job]
+    return job
+
+
+def start(steps: Steps) -> Job:
+    """`submit` of something whose place nothing takes."""
+    return submit("", steps)
+
+
+def run(steps: Steps) -> Answer:
+    """Ask for steps one after the other and wait, for the turn, too; the last one's result and arrays.
+
+    Raises:
+        R5dgsError: What the worker reports, or why it cannot be asked.
+    """
+    return start(steps).answer()
+
+
+def request(command: str, **arguments: Any) -> Answer:
+    """`run` of one step."""
+    return run([("waiting for an answer", command, arguments)])
 
 
 def current(python: str | None = None) -> Worker:
-    """The running worker; it is started where none runs or another Python is wanted.
+    """The running worker, greeted; it is started where none runs or another Python is wanted.
 
     Raises:
-        BackendError: It cannot be started, or works on a job.
+        BackendError: It cannot be started.
     """
-    running = _running(python)
-    running.greet()
-    return running
-
-
-def _running(python: str | None = None) -> Worker:
-    global _worker
-    if busy():
-        raise errors.BackendError("worker: it still renders a preview; wait for it, or stop it with Esc")
     python = python or preferences.worker_python()
+    with _turn:
+        running = _running(python)
+        running.greet()
+        return running
+
+
+def notice() -> str:
+    """What pictures of the running worker wait for at present beside their own making; else empty."""
+    running = _worker
+    return running.notice if running is not None and running.alive else ""
+
+
+def busy(key: str | None = None) -> bool:
+    """Whether a job has not ended yet: one of a key, or any."""
+    return any(not job.done and (key is None or job.key == key) for job in list(_jobs))
+
+
+def stop() -> None:
+    """Stop the worker, if one runs; jobs that wait for it end with an error."""
+    jobs = list(_jobs)
+    for job in jobs:
+        job.drop()
+    for job in jobs:
+        job._end()
+    _kill()
+
+
+def _waiting(key: str) -> list[Job]:
+    return [job for job in list(_jobs) if key and job.key == key and not job.done]
+
+
+def _running(python: str) -> Worker:
+    """The worker of a Python, for who has the turn."""
+    global _worker
     if _worker is not None and (not _worker.alive or _worker.python != python):
-        stop()
+        _kill()
     if _worker is None:
         _worker = Worker(python)
     return _worker
 
 
-def request(command: str, **arguments: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """`Worker.request` on the current worker, with the timeout of the preferences."""
-    return current().request(command, preferences.worker_timeout_s(), **arguments)
-
-
-def start(steps: list[tuple[str, str, dict[str, Any]]]) -> Job:
-    """Begin a `Job` on the current worker, with the timeout of the preferences.
-
-    Raises:
-        BackendError: The worker cannot be started, or works on another job.
-    """
-    global _job
-    _job = Job(_running(), preferences.worker_timeout_s(), steps)
-    return _job
-
-
-def notice() -> str:
-    """What pictures of the running worker wait for at present beside their own making; else empty."""
-    return _worker.notice if _worker is not None and _worker.alive else ""
-
-
-def busy() -> bool:
-    """Whether a job has not ended yet."""
-    return _job is not None and not _job.done
-
-
-def stop() -> None:
-    """Stop the worker, if one runs; a job that waits for it ends with an error."""
-    global _worker, _job
-    if _worker is not None:
+def _kill() -> None:
+    global _worker
+    with _state:
         worker, _worker = _worker, None
+    if worker is not None:
         worker.close()
-    if _job is not None:
-        job, _job = _job, None
-        job.join()
 
 
 def register():

@@ -1,0 +1,219 @@
+"""The process that runs the worker, and what is said to it and by it.
+
+The protocol is that of `r5dgs_core.serve`: a JSON line each way, and after an answer's line the raw bytes that it
+announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that dies,
+hangs or talks nonsense is dropped with a clear error.
+"""
+
+import collections
+import contextlib
+import json
+import logging
+import os
+import queue
+import subprocess
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..r5dgs_core import errors
+from . import preferences, pythons
+
+ROOT = Path(__file__).resolve().parent.parent
+ENVIRONMENT = preferences.ENVIRONMENT
+START_TIMEOUT_S = 120.0
+STDERR_LINES = 12
+COMPILING = "preparing the rasterizer (first use, about 10 s)"
+
+log = logging.getLogger(__name__)
+
+
+class Worker:
+    """One running worker process; `greet` it before the first request.
+
+    Args:
+        python: Path of the Python to run it with.
+
+    Raises:
+        BackendError: It cannot be started.
+    """
+
+    def __init__(self, python: str):
+        self.python = python
+        self.hello: dict[str, Any] = {}
+        self.notice = ""  # what pictures wait for, where it is not their own making
+        self._number = 0
+        self._answers: queue.Queue = queue.Queue()
+        self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
+        environment = pythons.environment()
+        known = environment.get("PYTHONPATH", "")
+        # The add-on's own copy of the core comes first, so that both sides are of one version.
+        environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
+        environment["PYTHONUNBUFFERED"] = "1"
+        try:
+            self._process = subprocess.Popen(
+                [python, "-m", "r5dgs_core.serve"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=environment,
+                cwd=str(ROOT),
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            raise errors.BackendError(
+                f"worker: '{python}' cannot be started ({error.strerror or error}); set 'Worker Python' in the "
+                f"add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
+            ) from error
+        self._readers = [
+            threading.Thread(target=self._read_answers, name="r5dgs worker answers", daemon=True),
+            threading.Thread(target=self._read_stderr, name="r5dgs worker log", daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def greet(self) -> None:
+        """Wait until it answers, once.
+
+        Raises:
+            BackendError: It does not, or its Python lacks what rendering needs.
+        """
+        if self.hello:
+            return
+        try:
+            self.hello, _ = self.request("hello", timeout_s=START_TIMEOUT_S)
+            if self.hello.get("missing"):
+                raise errors.BackendError(
+                    f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
+                    "('pip install r5dgs') or choose another 'Worker Python' in the add-on's preferences"
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def request(self, command: str, timeout_s: float, **arguments: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Ask for something and wait for the answer.
+
+        Args:
+            command: Name of the request.
+            timeout_s: Seconds to wait; the worker is stopped when they have passed.
+            **arguments: The request's arguments, JSON values.
+
+        Returns:
+            The result, and its arrays by name.
+
+        Raises:
+            R5dgsError: What the worker reports, by its own class.
+            BackendError: The worker died or did not answer in time.
+        """
+        self._number += 1
+        line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
+        try:
+            assert self._process.stdin is not None
+            self._process.stdin.write(line.encode())
+            self._process.stdin.flush()
+        except (OSError, ValueError):
+            raise self._death() from None
+        while True:
+            try:
+                answer = self._answers.get(timeout=timeout_s)
+            except queue.Empty:
+                self.close()
+                raise errors.BackendError(
+                    f"worker: no answer to '{command}' within {timeout_s:g} s, so it was stopped; try again, or raise "
+                    "'Timeout' in the add-on's preferences"
+                ) from None
+            if answer is None:
+                raise self._death()
+            header, arrays = answer
+            if header.get("id") == self._number:
+                break
+        if not header.get("ok"):
+            raise _error_of(header)
+        return header.get("result", {}), arrays
+
+    def close(self) -> None:
+        """Stop the process and wait until it is gone."""
+        process = self._process
+        if process.poll() is None:
+            process.terminate()  # before its input is closed: closing waits for a request that is being written
+            try:
+                process.wait(timeout=2.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for reader in self._readers:
+            reader.join(timeout=2.0)
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+    def _death(self) -> errors.BackendError:
+        self.close()
+        said = " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
+        return errors.BackendError(
+            f"worker: {self.python} ended unexpectedly (exit code {self._process.returncode})"
+            + (f": {said}" if said else "")
+            + "; the next request starts it again"
+        )
+
+    def _read_answers(self) -> None:
+        stream = self._process.stdout
+        assert stream is not None
+        try:
+            while line := stream.readline():
+                header = json.loads(line)
+                if "event" in header:
+                    self._hear(header)
+                    continue
+                arrays = {}
+                for entry in header.get("arrays", ()):
+                    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+                    size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+                    blob = stream.read(size)
+                    if len(blob) != size:
+                        return
+                    arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
+                self._answers.put((header, arrays))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            self._stderr.append(f"unreadable answer: {error}")
+        finally:
+            self._answers.put(None)
+
+    def _hear(self, event: dict[str, Any]) -> None:
+        notice = COMPILING if event["event"] == "compiling" else ""
+        if notice:
+            log.warning("R5DGS worker: %s", notice)
+        if event["event"] == "failed":
+            log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))
+        self.notice = notice  # last: who sees it finds it told already
+
+    def _read_stderr(self) -> None:
+        stream = self._process.stderr
+        assert stream is not None
+        with contextlib.suppress(OSError, ValueError):
+            for line in stream:
+                self._stderr.append(line.decode(errors="replace").rstrip())
+
+
+def _error_of(header: dict[str, Any]) -> errors.R5dgsError:
+    """The error that an answer reports: a class of `errors` where the worker names one."""
+    report = header.get("error", {})
+    kind = getattr(errors, str(report.get("kind")), None)
+    message = str(report.get("message", "no reason given"))
+    if isinstance(kind, type) and issubclass(kind, errors.R5dgsError):
+        return kind(message)
+    return errors.BackendError(f"worker: {report.get('kind', 'error')}: {message}")
