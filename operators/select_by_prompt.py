@@ -1,10 +1,9 @@
-"""Select by Prompt: words to objects, by the names and aliases that the .blend file remembers."""
+"""Select by Prompt: words to objects, by names, aliases and the meanings that the scene file stores."""
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
+from bpy.props import EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import objects, prompt
-from ..r5dgs_core.scene import lookup
+from ..r5dgs_addon import prompt, selection
 
 MODES = (
     ("SET", "Set", "Select these objects only", "SELECT_SET", 0),
@@ -22,36 +21,43 @@ class R5DGS_OT_select_by_prompt(bpy.types.Operator):
 
     text: StringProperty(name="Prompt", description="Words for the objects, such as 'red mug'", options={"SKIP_SAVE"})
     mode: EnumProperty(name="Mode", description="What to do with the selection", items=MODES, default="SET")
+    threshold: FloatProperty(
+        name="Threshold",
+        description="Least score of a match; the sidebar's where it is not given",
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        options={"SKIP_SAVE"},
+    )
 
     @classmethod
     def poll(cls, context):
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Switch to Object Mode first")
-            return False
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
+        obstacle = selection.obstacle(context)
+        if obstacle:
+            cls.poll_message_set(obstacle)
+        return not obstacle
 
     def execute(self, context):
-        session = context.window_manager.r5dgs
+        settings, session = context.scene.r5dgs_words, context.window_manager.r5dgs_words
         text = (self.text if self.properties.is_property_set("text") else session.prompt).strip()
         if not text:
             self.report({"WARNING"}, "Type the name of an object first")
             return {"CANCELLED"}
-        collection = objects.active_collection(context)
-        matches = prompt.search(collection, text)
-        prompt.show(session, text, matches)
-        if not matches:
-            said = lookup.explain_nothing(prompt.remembered(collection), text)
-            self.report({"WARNING"}, said[0].upper() + said[1:])
+        self.text = text  # for the redo panel, as the threshold below
+        if self.properties.is_property_set("threshold"):
+            settings.threshold = self.threshold
+        else:
+            self.threshold = settings.threshold
+        answer = prompt.ask(context, text)
+        if not answer.matches:
+            self.report({"WARNING"}, prompt.explain_nothing(prompt.scope(context), text, answer))
             return {"CANCELLED"}
-        missed = prompt.select(context, collection, [match.object_id for match in matches], self.mode)
-        said = ", ".join(f"{match.name} ({match.score:.2f})" for match in matches)
+        missed = selection.select(context, answer.objects, self.mode)
+        said = ", ".join(f"{match.name} ({match.score:.2f})" for match in answer.matches)
         if missed:
             self.report({"WARNING"}, f"{said}; hidden and therefore not selected: {', '.join(missed)}")
         else:
-            self.report({"INFO"}, said)
+            self.report({"INFO"}, ". ".join([said, *answer.notes]))
         return {"FINISHED"}
 
 

@@ -1,8 +1,34 @@
 """Services of the add-on: objects, keyframes, properties, preferences, panels and the worker's client."""
 
-from . import engine, handlers, look, motion_exact, motion_physics, panels, preferences, properties, worker
+from . import (
+    click,
+    engine,
+    handlers,
+    look,
+    motion_exact,
+    motion_physics,
+    panels,
+    preferences,
+    properties,
+    table,
+    words,
+    worker,
+)
 
-MODULES = (properties, look, motion_physics, motion_exact, preferences, engine, panels, handlers, worker)
+MODULES = (
+    properties,
+    look,
+    table,
+    words,
+    motion_physics,
+    motion_exact,
+    preferences,
+    engine,
+    panels,
+    handlers,
+    click,
+    worker,
+)
 
 
 def register():

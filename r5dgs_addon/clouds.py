@@ -21,6 +21,12 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] to display-referred sRGB. Any shape."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.04045 / 12.92, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
 def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, sh_degree: int) -> None:
     """Write Gaussians to a point cloud of as many points.
 

@@ -17,9 +17,7 @@ from mathutils import Matrix, Vector
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
-from . import clouds, compat, displays, handlers, keyframes, motion_physics, timeline
-
-NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
+from . import clouds, compat, displays, handlers, keyframes, motion_physics, table, timeline
 
 
 @dataclass(frozen=True)
@@ -105,16 +103,16 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         )
     with nothing_left_after_error():
         times = timeline.Times.of(scene, options.frame_zero, options.t_end)
-        collection = bpy.data.collections.new(_name(f"R5DGS {scene.name}"))
+        collection = bpy.data.collections.new(table.fit(f"R5DGS {scene.name}"))
         context.scene.collection.children.link(collection)
         extent = scene.extent
         root = _root(collection, scene, options.world_convention or scene.world_convention)
         _describe(collection, scene, path, root, times)
-        material = clouds.material(_name(f"R5DGS {scene.name}"))
+        material = clouds.material(table.fit(f"R5DGS {scene.name}"))
         parts = ranges(scene)
         children = {}
         for object_id in sorted({part.object_id for part in parts}):
-            children[object_id] = bpy.data.collections.new(_name(object_name(scene, object_id)))
+            children[object_id] = bpy.data.collections.new(table.fit(object_name(scene, object_id)))
             collection.children.link(children[object_id])
         anchors = {}
         for part in homes(scene, parts):
@@ -127,6 +125,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         for (_, motion_id), anchor in anchors.items():
             keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
         motion_physics.remember(anchors, scene, times, options.key_tolerance)
+        table.remember(collection, meanings=scene.vocabulary_embeddings is not None)
         if options.fit_timeline:
             timeline.fit(context.scene, times)
         context.view_layer.update()
@@ -185,12 +184,8 @@ def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Obj
     return [obj for obj in collection.all_objects if obj.r5dgs.role in roles]
 
 
-def _name(text: str) -> str:
-    return text.encode()[:NAME_BYTES].decode(errors="ignore")
-
-
 def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bpy.types.Object:
-    root = bpy.data.objects.new(_name(f"{scene.name} root"), None)
+    root = bpy.data.objects.new(table.fit(f"{scene.name} root"), None)
     root.r5dgs.role = "ROOT"
     root.empty_display_type = "PLAIN_AXES"
     root.empty_display_size = 0.1 * scene.extent
@@ -234,7 +229,7 @@ def _anchor(
     parts: list[Range],
     extent: float,
 ) -> bpy.types.Object:
-    anchor = bpy.data.objects.new(_name(f"{_part_name(scene, part, parts)} anchor"), None)
+    anchor = bpy.data.objects.new(table.fit(f"{_part_name(scene, part, parts)} anchor"), None)
     pivot = _pivot(scene, part)
     anchor.empty_display_type = "ARROWS"
     anchor.empty_display_size = 0.03 * extent
@@ -255,7 +250,7 @@ def _cloud(
     parts: list[Range],
     data: bpy.types.PointCloud,
 ) -> bpy.types.Object:
-    data.name = name = _name(_part_name(scene, part, parts))
+    data.name = name = table.fit(_part_name(scene, part, parts))
     cloud = bpy.data.objects.new(name, data)
     collection.objects.link(cloud)
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))

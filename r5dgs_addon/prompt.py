@@ -1,75 +1,149 @@
-"""Words to objects, from the table that the .blend file keeps: neither the scene file nor torch is needed."""
+"""Words to objects, by the table that the .blend keeps and by the embeddings that the scene file stores.
+
+Names and aliases need neither the scene file nor torch. Embeddings of words are read from the file when it is first
+asked, and kept until it changes. An encoder, which knows words that the file does not, belongs in the worker: its
+answers would join the others in `search`.
+"""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import bpy
 
-from ..r5dgs_core.scene import lookup
-from . import objects
+from ..r5dgs_core import errors
+from ..r5dgs_core.scene import lookup, scene_file
+from . import picture, selection, table
+
+HISTORY = 12  # prompts kept
+_meanings: dict[Path, tuple[tuple[int, int], lookup.Meanings | None]] = {}  # by file, with its time and size
 
 
 @dataclass(frozen=True)
 class Match:
-    """One answer: an object, how well it matches (at most 1), and what matched."""
+    """One answer: an object of a loaded scene, how well it matches (at most 1), and what matched."""
 
+    scene: bpy.types.Collection
     object_id: int
     name: str
     score: float
     why: str
 
 
-def search(collection: bpy.types.Collection, text: str) -> list[Match]:
-    """Objects of a loaded scene that words name, best first; empty where nothing matches."""
-    labels = remembered(collection)
-    names = {label.object_id: label.name for label in labels}
-    found = lookup.search_labels(labels, text)
-    return [Match(match.object_id, names[match.object_id], match.score, match.why) for match in found]
+@dataclass(frozen=True)
+class Answer:
+    """What there is to say to a prompt.
+
+    Attributes:
+        matches: Best first.
+        meant: Names that may have been meant where nothing matches.
+        notes: Sentences: matches that were deleted, files that were not found.
+    """
+
+    matches: list[Match]
+    meant: list[str]
+    notes: list[str]
+
+    @property
+    def objects(self) -> list[selection.Wanted]:
+        """The objects that match, best first."""
+        return [(match.scene, match.object_id) for match in self.matches]
 
 
-def remembered(collection: bpy.types.Collection) -> list[lookup.Label]:
-    """What the objects of a loaded scene answer to; the unassigned Gaussians answer to nothing."""
-    return [
-        lookup.Label(entry.object_id, entry.name, tuple(alias.name for alias in entry.aliases))
-        for entry in collection.r5dgs.table
-        if entry.object_id >= 0
-    ]
-
-
-def show(session: bpy.types.PropertyGroup, text: str, matches: list[Match]) -> None:
-    """Put the answers where the sidebar shows them."""
-    session.prompt, session.asked = text, text
-    session.matches.clear()
-    for match in matches:
-        item = session.matches.add()
-        item.name, item.object_id, item.score, item.why = match.name, match.object_id, match.score, match.why
-
-
-def select(context: bpy.types.Context, collection: bpy.types.Collection, object_ids: list[int], mode: str) -> list[str]:
-    """Change the selection by the clouds and anchors of some objects; the best one's anchor becomes active.
+def search(loaded: list[bpy.types.Collection], text: str, threshold: float = lookup.THRESHOLD) -> Answer:
+    """Objects of loaded scenes that words name.
 
     Args:
-        context: Its view layer's selection is changed.
-        collection: A loaded scene.
-        object_ids: Objects, best first.
-        mode: "SET", "ADD" or "SUBTRACT".
+        loaded: The scenes to search.
+        text: One or several names: "red mug", "mugs and lemon".
+        threshold: Least score of a match.
 
     Returns:
-        Names of what is hidden and therefore cannot be selected.
+        The answer; equal scores are in the order of ``loaded``.
     """
-    if mode == "SET":
-        for selected in context.selected_objects:
-            selected.select_set(False)
-    missed, active = [], None
-    for obj in objects.members(collection, "CLOUD", "ANCHOR"):
-        if obj.r5dgs.object_id not in object_ids:
-            continue
-        if not obj.visible_get(view_layer=context.view_layer):
-            missed.append(obj.name)
-            continue
-        obj.select_set(mode != "SUBTRACT")
-        rank = (object_ids.index(obj.r5dgs.object_id), obj.r5dgs.role != "ANCHOR")
-        if active is None or rank < active[0]:
-            active = (rank, obj)
-    if active is not None and mode != "SUBTRACT":
-        context.view_layer.objects.active = active[1]
-    return missed
+    matches, deleted, notes, known = [], [], [], []
+    for collection in loaded:
+        labels = table.labels(collection)
+        there = table.present(collection)
+        names = {label.object_id: label.name for label in labels}
+        known += [label for label in labels if label.object_id in there]
+        meanings, note = _stored_meanings(collection)
+        notes += [note] if note else []
+        for found in lookup.search_labels(labels, text, threshold, meanings):
+            if found.object_id in there:
+                matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
+            else:
+                deleted.append(names[found.object_id])
+    if deleted:
+        notes.insert(0, f"Deleted: {', '.join(deleted)}")
+    matches.sort(key=lambda match: -round(match.score, 6))
+    meant = [] if matches or not text.strip() else list(dict.fromkeys(lookup.suggest(known, text)))
+    return Answer(matches, meant, notes)
+
+
+def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:
+    """A sentence for the user when nothing matched."""
+    labels = [label for each in loaded for label in table.labels(each) if label.object_id in table.present(each)]
+    said = lookup.explain_nothing(labels, text)
+    return ". ".join([said[0].upper() + said[1:], *answer.notes])
+
+
+def ask(context: bpy.types.Context, text: str) -> Answer:
+    """Search as the sidebar's settings say, show the answer there, and remember a prompt that found something."""
+    text = text.strip()
+    settings = context.scene.r5dgs_words
+    answer = search(scope(context), text, settings.threshold) if text else Answer([], [], [])
+    _show(context.window_manager.r5dgs_words, text, answer)
+    if answer.matches:
+        _keep(settings.history, text)
+    return answer
+
+
+def scope(context: bpy.types.Context) -> list[bpy.types.Collection]:
+    """The scenes to search: the active one, or all where the user wants that."""
+    loaded = selection.scenes(context)
+    return loaded if context.scene.r5dgs_words.all_scenes else loaded[:1]
+
+
+def forget() -> None:
+    """Drop what was read from scene files."""
+    _meanings.clear()
+
+
+def _stored_meanings(collection: bpy.types.Collection) -> tuple[lookup.Meanings | None, str]:
+    """The embeddings of a scene's file, or none and why the user should know."""
+    if not collection.r5dgs_named.meanings:
+        return None, ""
+    try:
+        path = picture.scene_path(collection)
+        status = path.stat()
+        stamp = (status.st_mtime_ns, status.st_size)
+        if _meanings.get(path, (None,))[0] != stamp:
+            _meanings[path] = (stamp, scene_file.read_meanings(path))
+        return _meanings[path][1], ""
+    except (errors.SceneFileError, OSError):
+        return None, f"{collection.name}: searched by names alone, as its scene file cannot be read"
+
+
+def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:
+    session.asked = text  # first: the field asks where it differs
+    session.prompt = text
+    session.matches.clear()
+    for match in answer.matches:
+        item = session.matches.add()
+        item.name, item.scene, item.object_id = match.name, match.scene.name, match.object_id
+        item.score, item.why = match.score, match.why
+    for items, texts in ((session.meant, answer.meant), (session.notes, answer.notes)):
+        items.clear()
+        for line in texts:
+            items.add().name = line
+
+
+def _keep(history: bpy.types.bpy_prop_collection, text: str) -> None:
+    """Put a prompt first, once."""
+    known = [item.name for item in history]
+    wanted = [text, *(item for item in known if item != text)][:HISTORY]
+    if wanted == known:
+        return
+    history.clear()
+    for item in wanted:
+        history.add().name = item

@@ -16,7 +16,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import compat, displays
+from . import compat, displays, rows
 
 ROLES = (
     ("NONE", "None", "Not part of an R5DGS scene"),
@@ -48,6 +48,45 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     aliases: CollectionProperty(name="Aliases", description="Other words that find it", type=R5DGS_PG_alias)
     caption: StringProperty(name="Caption", description="A sentence about it")
     count: IntProperty(name="Gaussians", description="Number of Gaussians")
+    label: StringProperty(
+        name="Name",
+        description="Name of the object; its collection, anchor and clouds are renamed with it",
+        get=rows.label,
+        set=rows.set_label,
+    )
+    color: FloatVectorProperty(
+        name="Colour",
+        description="Colour in viewports; choosing another one tints the object",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        max=1.0,
+        get=rows.color,
+        set=rows.set_color,
+    )
+    tint: FloatVectorProperty(
+        name="Tint",
+        description="Colour that the object's Gaussians are multiplied with; white leaves them as captured",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        soft_max=1.0,
+        max=8.0,
+        get=rows.tint,
+        set=rows.set_color,
+    )
+    hidden: BoolProperty(
+        name="Hide in Viewport",
+        description="Hide the object in the view layer, and thereby in previews",
+        get=rows.is_hidden,
+        set=rows.set_hidden,
+    )
+    hidden_in_renders: BoolProperty(
+        name="Hide in Renders",
+        description="Leave the object out of renders",
+        get=rows.is_hidden_in_renders,
+        set=rows.set_hidden_in_renders,
+    )
 
 
 class R5DGS_PG_scene(bpy.types.PropertyGroup):
@@ -75,27 +114,22 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
     frame_zero: FloatProperty(name="Frame of Time 0", description="Frame at which the scene time is 0", default=1.0)
     root: PointerProperty(name="Root", description="Empty that carries the world convention", type=bpy.types.Object)
     table: CollectionProperty(name="Objects", description="The scene's table of objects", type=R5DGS_PG_entry)
-
-
-class R5DGS_PG_match(bpy.types.PropertyGroup):
-    """One answer to the last prompt; `name` is the object's name."""
-
-    object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
-    score: FloatProperty(name="Score", description="How well it matches, at most 1")
-    why: StringProperty(name="Why", description="What matched")
+    row: IntProperty(
+        name="Active Object",
+        description="Row of the active object in the table",
+        get=rows.active_row,
+        set=rows.set_active_row,
+    )
 
 
 class R5DGS_PG_session(bpy.types.PropertyGroup):
     """What the sidebar shows; not saved."""
 
-    prompt: StringProperty(name="Prompt", description="Words for the objects to select, such as 'red mug'")
-    asked: StringProperty(name="Asked", description="The last prompt that was searched")
-    matches: CollectionProperty(name="Matches", description="Answers to the last prompt", type=R5DGS_PG_match)
     preview_ms: FloatProperty(name="Preview Time", description="Milliseconds of the last preview in the worker")
     preview_size: StringProperty(name="Preview Size", description="Size of the last preview")
 
 
-CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_match, R5DGS_PG_session)
+CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_session)
 
 
 def register():

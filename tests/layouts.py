@@ -48,7 +48,7 @@ class Layout:
     def operator(self, idname, text="", icon="NONE", **_):
         module, name = idname.split(".")
         properties = getattr(getattr(self.bpy.ops, module), name).get_rna_type().properties
-        self.said.append(idname)
+        self.said += [idname, text] if text else [idname]
         return _SetOnly({p.identifier for p in properties})
 
     def operator_menu_enum(self, idname, name, **_):

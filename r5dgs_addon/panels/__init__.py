@@ -2,9 +2,9 @@
 
 import bpy
 
-from . import capture, export, motion, preview, prompt, render, scene
+from . import capture, export, motion, objects, preview, prompt, render, scene
 
-MODULES = (scene, prompt, motion, preview, export, capture, render)
+MODULES = (scene, prompt, objects, motion, preview, export, capture, render)
 
 
 def register():

@@ -2,7 +2,21 @@
 
 import bpy
 
+from .. import isolation, objects, selection, table
 from . import sidebar
+
+
+class R5DGS_MT_prompts(bpy.types.Menu):
+    """Prompts that found something before"""
+
+    bl_idname = "R5DGS_MT_prompts"
+    bl_label = "Earlier Prompts"
+
+    def draw(self, context):
+        for item in context.scene.r5dgs_words.history:
+            self.layout.operator("r5dgs.select_by_prompt", text=item.name).text = item.name
+        if not context.scene.r5dgs_words.history:
+            self.layout.label(text="None yet")
 
 
 class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
@@ -13,23 +27,58 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 
     def draw(self, context):
         layout = self.layout
-        session = context.window_manager.r5dgs
-        layout.prop(session, "prompt", text="", icon="VIEWZOOM")
+        session, settings = context.window_manager.r5dgs_words, context.scene.r5dgs_words
+        row = layout.row(align=True)
+        row.prop(session, "prompt", text="", icon="VIEWZOOM")
+        row.menu("R5DGS_MT_prompts", text="", icon="TIME")
+        row = layout.row(align=True)
+        row.prop(settings, "threshold", slider=True)
+        if len(selection.scenes(context)) > 1:
+            row.prop(settings, "all_scenes", toggle=True)
         row = layout.row(align=True)
         for mode, text in (("SET", "Select"), ("ADD", "Add"), ("SUBTRACT", "Subtract")):
             action = row.operator("r5dgs.select_by_prompt", text=text)
             action.mode = mode
             action.text = session.prompt
-        if not session.asked:
-            return
-        box = layout.box().column(align=True)
-        if not session.matches:
-            box.label(text=f"Nothing matches '{session.asked}'", icon="INFO")
-        for match in session.matches:
-            line = box.row()
-            line.label(text=match.name, icon="OUTLINER_OB_POINTCLOUD")
-            line.label(text=match.why)
-            line.label(text=f"{match.score:.2f}")
+        row = layout.row(align=True)
+        row.operator("r5dgs.isolate", icon="HIDE_ON").text = session.prompt
+        if isolation.is_isolated(context.scene):
+            row.operator("r5dgs.unisolate", icon="HIDE_OFF")
+        if session.asked:
+            _draw_answers(layout.box().column(align=True), session, _current_names(session))
 
 
-CLASSES = (R5DGS_PT_prompt,)
+def _draw_answers(box, session, names):
+    if not session.matches:
+        box.label(text=f"Nothing matches '{session.asked}'", icon="INFO")
+    for match in session.matches:
+        line = box.row()
+        action = line.operator(
+            "r5dgs.select_object",
+            text=names.get((match.scene, match.object_id), match.name),
+            icon="OUTLINER_OB_POINTCLOUD",
+        )
+        action.scene, action.object_id = match.scene, match.object_id
+        line.label(text=match.why)
+        line.label(text=f"{match.score:.2f}")
+    if session.meant:
+        row = box.row()
+        row.label(text="Did you mean")
+        for item in session.meant:
+            row.operator("r5dgs.select_by_prompt", text=item.name).text = item.name
+    for note in session.notes:
+        box.label(text=note.name, icon="ERROR")
+
+
+def _current_names(session) -> dict[tuple[str, int], str]:
+    """What the objects that matched are called by now."""
+    wanted = {match.scene for match in session.matches}
+    return {
+        (collection.name, object_id): name
+        for collection in objects.scene_collections()
+        if collection.name in wanted
+        for object_id, name in table.names(collection).items()
+    }
+
+
+CLASSES = (R5DGS_MT_prompts, R5DGS_PT_prompt)

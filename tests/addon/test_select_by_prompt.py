@@ -46,14 +46,14 @@ def test_what_an_object_answers_to_is_kept_word_for_word(blender, tmp_path):
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "words.blend"))
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "words.blend"))
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
-    prompt = importlib.import_module("r5dgs.r5dgs_addon.prompt")
-    assert [label.aliases for label in prompt.remembered(collection) if label.object_id == 1] == [words]
+    table = importlib.import_module("r5dgs.r5dgs_addon.table")
+    assert [label.aliases for label in table.labels(collection) if label.object_id == 1] == [words]
 
 
 def test_several_wishes_select_several_objects_ranked_in_the_panel(blender, loaded):
     ask(blender, "mug and fruit")
     assert selected_ids(blender) == {1, 2, 4}
-    matches = blender.context.window_manager.r5dgs.matches
+    matches = blender.context.window_manager.r5dgs_words.matches
     assert matches[0].name == "mug" and matches[0].score == pytest.approx(1.0)
     scores = [match.score for match in matches]
     assert scores == sorted(scores, reverse=True) and all(match.why for match in matches)
@@ -72,7 +72,7 @@ def test_modes_set_add_and_subtract(blender, loaded):
 def test_nothing_matching_is_said_and_leaves_the_selection(blender, loaded):
     ask(blender, "mug")
     assert ask(blender, "submarine") == {"CANCELLED"}
-    session = blender.context.window_manager.r5dgs
+    session = blender.context.window_manager.r5dgs_words
     assert selected_ids(blender) == {1}
     assert session.asked == "submarine" and len(session.matches) == 0
 
@@ -90,10 +90,10 @@ def test_the_unassigned_answer_to_nothing_and_the_background_to_its_name(blender
 
 
 def test_the_sidebars_field_is_asked_where_no_text_is_given(blender, loaded):
-    blender.context.window_manager.r5dgs.prompt = "toy car"
+    blender.context.window_manager.r5dgs_words.prompt = "toy car"
     assert blender.ops.r5dgs.select_by_prompt() == {"FINISHED"}
     assert selected_ids(blender) == {3}
-    blender.context.window_manager.r5dgs.prompt = "  "
+    blender.context.window_manager.r5dgs_words.prompt = "  "
     assert blender.ops.r5dgs.select_by_prompt() == {"CANCELLED"}
 
 

@@ -1,0 +1,52 @@
+"""Add Alias: another word that finds the active object."""
+
+import bpy
+from bpy.props import IntProperty, StringProperty
+
+from ..r5dgs_addon import selection, table
+
+
+class R5DGS_OT_add_alias(bpy.types.Operator):
+    """Add another word that finds the active object"""
+
+    bl_idname = "r5dgs.add_alias"
+    bl_label = "Add Alias"
+    bl_options = {"REGISTER", "UNDO"}
+
+    word: StringProperty(name="Word", description="The other word, such as 'cup'", options={"SKIP_SAVE"})
+    scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
+    object_id: IntProperty(
+        name="Object Id", description="Another object than the active one", default=table.NOBODY, options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if not selection.scenes(context):
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+    def invoke(self, context, event):
+        return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        self.layout.prop(self, "word")
+
+    def execute(self, context):
+        found = selection.find(context, self.scene, self.object_id)
+        entry = None if found is None else table.entry_of(*found)
+        if entry is None or entry.id_data.library is not None:
+            self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")
+            return {"CANCELLED"}
+        word = self.word.strip()
+        if not word:
+            self.report({"WARNING"}, "Type a word first")
+            return {"CANCELLED"}
+        if word in [alias.name for alias in entry.aliases]:
+            self.report({"INFO"}, f"'{word}' finds {table.names(found[0])[found[1]]} already")
+            return {"CANCELLED"}
+        entry.aliases.add().name = word
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_add_alias,)

@@ -1,0 +1,53 @@
+"""Isolate: hide all objects of the loaded scenes but some."""
+
+import bpy
+from bpy.props import IntProperty, StringProperty
+
+from ..r5dgs_addon import isolation, prompt, selection, table
+
+
+class R5DGS_OT_isolate(bpy.types.Operator):
+    """Hide the other objects of all loaded scenes, in viewports and renders"""
+
+    bl_idname = "r5dgs.isolate"
+    bl_label = "Isolate"
+    bl_options = {"REGISTER", "UNDO"}
+
+    text: StringProperty(
+        name="Prompt", description="Words for the objects to show; empty for the selected ones", options={"SKIP_SAVE"}
+    )
+    scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
+    object_id: IntProperty(
+        name="Object Id", description="Object to show instead", default=table.NOBODY, options={"SKIP_SAVE"}
+    )
+
+    @classmethod
+    def poll(cls, context):
+        obstacle = selection.obstacle(context)
+        if obstacle:
+            cls.poll_message_set(obstacle)
+        return not obstacle
+
+    def execute(self, context):
+        if self.object_id != table.NOBODY:
+            found = selection.find(context, self.scene, self.object_id)
+            wanted = [] if found is None else [found]
+        elif self.text.strip():
+            answer = prompt.ask(context, self.text)
+            if not answer.matches:
+                self.report({"WARNING"}, prompt.explain_nothing(prompt.scope(context), self.text, answer))
+                return {"CANCELLED"}
+            wanted = answer.objects
+        else:
+            wanted = selection.selected(context)
+        wanted = [(collection, object_id) for collection, object_id in wanted if object_id in table.present(collection)]
+        if not wanted:
+            self.report({"WARNING"}, "Select an object of a loaded scene, or type its name first")
+            return {"CANCELLED"}
+        hidden = isolation.isolate(context, wanted)
+        shown = ", ".join(table.names(collection)[object_id] for collection, object_id in wanted)
+        self.report({"INFO"}, f"{shown}: {hidden} others hidden; Un-Isolate shows them again")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_isolate,)

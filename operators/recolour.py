@@ -1,0 +1,41 @@
+"""Recolour: tint the selected objects of loaded scenes; white takes the tint back."""
+
+import bpy
+from bpy.props import FloatVectorProperty
+
+from ..r5dgs_addon import look, selection, table
+
+
+class R5DGS_OT_recolour(bpy.types.Operator):
+    """Multiply the colours of the selected objects; previews, renders and exports obey it"""
+
+    bl_idname = "r5dgs.recolour"
+    bl_label = "Recolour"
+    bl_options = {"REGISTER", "UNDO"}
+
+    tint: FloatVectorProperty(
+        name="Tint",
+        description="Colour that the Gaussians are multiplied with; white leaves them as captured",
+        subtype="COLOR_GAMMA",
+        size=3,
+        default=look.NONE,
+        min=0.0,
+        soft_max=1.0,
+        max=8.0,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if not selection.selected(context):
+            cls.poll_message_set("Select an object of a loaded scene first")
+            return False
+        return True
+
+    def execute(self, context):
+        for collection, object_id in selection.selected(context):
+            for cloud in table.clouds(collection, object_id):
+                cloud.r5dgs_look.tint = self.tint
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_recolour,)

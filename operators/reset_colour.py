@@ -1,0 +1,29 @@
+"""Reset Colour: the selected objects of loaded scenes look as captured again."""
+
+import bpy
+
+from ..r5dgs_addon import look, selection, table
+
+
+class R5DGS_OT_reset_colour(bpy.types.Operator):
+    """Take the tint off the selected objects"""
+
+    bl_idname = "r5dgs.reset_colour"
+    bl_label = "Reset Colour"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if not any(look.is_tinted(cloud) for item in selection.selected(context) for cloud in table.clouds(*item)):
+            cls.poll_message_set("Select an object that is tinted first")
+            return False
+        return True
+
+    def execute(self, context):
+        for item in selection.selected(context):
+            for cloud in table.clouds(*item):
+                cloud.r5dgs_look.tint = look.NONE
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_reset_colour,)

@@ -1,0 +1,78 @@
+"""A click on Gaussians in a 3D view selects the anchor that moves them; the Outliner still selects clouds.
+
+Blender says when the active object changes. Where the last thing that the user did was a click in a 3D view and the
+new active object is a cloud, its anchor takes the cloud's place.
+"""
+
+import bpy
+from bpy.app.handlers import persistent
+
+CLICK = "VIEW3D_OT_select"
+_listener = object()  # owns the subscription
+
+
+def follow(context: bpy.types.Context, extend: bool) -> bpy.types.Object | None:
+    """Let the anchor of the active cloud take its place in the selection.
+
+    Args:
+        context: Its view layer's selection is changed.
+        extend: Whether others stay selected. An anchor that was selected with others already is then taken out.
+
+    Returns:
+        The anchor; None where the active object is no cloud with an anchor that can be selected.
+    """
+    layer = context.view_layer
+    cloud = layer.objects.active
+    if cloud is None or cloud.r5dgs.role != "CLOUD":
+        return None
+    anchor = cloud.parent
+    if anchor is None or anchor.r5dgs.role != "ANCHOR" or anchor.hide_select:
+        return None
+    if not anchor.visible_get(view_layer=layer):
+        return None
+    taken_out = extend and anchor.select_get(view_layer=layer)
+    if not extend:
+        for chosen in context.selected_objects:
+            chosen.select_set(False)
+    cloud.select_set(False)
+    anchor.select_set(not taken_out)
+    layer.objects.active = anchor
+    return anchor
+
+
+def listen() -> None:
+    """Be told when the active object changes; Blender forgets that when it opens a file."""
+    bpy.msgbus.clear_by_owner(_listener)
+    bpy.msgbus.subscribe_rna(
+        key=(bpy.types.LayerObjects, "active"), owner=_listener, args=(), notify=_when_active_changes
+    )
+
+
+def _when_active_changes() -> None:
+    context = bpy.context
+    if context.scene is None or context.mode != "OBJECT" or not context.scene.r5dgs_words.click_selects_anchor:
+        return
+    done = context.window_manager.operators
+    if not done or done[-1].bl_idname != CLICK:
+        return
+    click = done[-1].properties
+    if follow(context, click.extend or click.toggle) is not None:
+        bpy.ops.ed.undo_push(message="Select Anchor")
+
+
+@persistent
+def _after_load(*_) -> None:
+    listen()
+
+
+def register():
+    """Listen, and again in each file that is opened."""
+    bpy.app.handlers.load_post.append(_after_load)
+    listen()
+
+
+def unregister():
+    """Undo `register`."""
+    bpy.msgbus.clear_by_owner(_listener)
+    if _after_load in bpy.app.handlers.load_post:
+        bpy.app.handlers.load_post.remove(_after_load)

@@ -1,0 +1,106 @@
+"""Panel *Objects*: what the scene holds, in which colours, and what is shown of it."""
+
+import bpy
+
+from .. import isolation, look, objects, table
+from . import sidebar
+
+OTHERS = (("r5dgs.duplicate_object", "DUPLICATE"), ("r5dgs.delete_object", "TRASH"))  # where they are registered
+
+
+class R5DGS_UL_objects(bpy.types.UIList):
+    """Objects of a loaded scene."""
+
+    bl_idname = "R5DGS_UL_objects"
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
+        own = table.clouds(item.id_data, item.object_id)
+        row = layout.row(align=True)
+        swatch = row.row()
+        swatch.ui_units_x = 1.0
+        swatch.prop(item, "color", text="")
+        row.prop(item, "label", text="", emboss=False)
+        kind = _motion(own)
+        if kind:
+            row.label(text=kind)
+        if not own:
+            row.label(text="deleted")
+            return
+        count = row.row()
+        count.alignment = "RIGHT"
+        count.label(text=f"{sum(cloud.r5dgs.count for cloud in own):,}")
+        row.prop(item, "hidden", text="", icon="HIDE_ON" if item.hidden else "HIDE_OFF", emboss=False)
+        off = item.hidden_in_renders
+        icon = "RESTRICT_RENDER_ON" if off else "RESTRICT_RENDER_OFF"
+        row.prop(item, "hidden_in_renders", text="", icon=icon, emboss=False)
+
+    def filter_items(self, context, data, name):
+        entries, wanted = getattr(data, name), self.filter_name.casefold()
+        if not wanted:
+            return [], []
+        names = table.names(data)
+        shown = [wanted in names[entry.object_id].casefold() for entry in entries]
+        return [self.bitflag_filter_item if keep else 0 for keep in shown], []
+
+
+class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
+    """The objects of the scene."""
+
+    bl_idname = "R5DGS_PT_objects"
+    bl_label = "Objects"
+
+    def draw(self, context):
+        layout = self.layout
+        collection = objects.active_collection(context)
+        state = collection.r5dgs
+        layout.template_list("R5DGS_UL_objects", "", state, "table", state, "row", rows=5)
+        row = layout.row(align=True)
+        row.operator("r5dgs.isolate", icon="HIDE_ON")
+        if isolation.is_isolated(context.scene):
+            row.operator("r5dgs.unisolate", icon="HIDE_OFF")
+        others = [(idname, icon) for idname, icon in OTHERS if _is_registered(idname)]
+        if others:
+            row = layout.row(align=True)
+            for idname, icon in others:
+                row.operator(idname, icon=icon)
+        layout.prop(context.scene.r5dgs_words, "click_selects_anchor")
+        index = state.row
+        if 0 <= index < len(state.table):
+            _draw_active(layout.box(), collection, state.table[index])
+
+
+def _draw_active(box, collection, entry):
+    box.prop(entry, "label", text="Name")
+    row = box.row(align=True)
+    row.prop(entry, "tint")
+    row.operator("r5dgs.reset_colour", text="", icon="LOOP_BACK")
+    if any(look.is_tinted(cloud) for cloud in table.clouds(collection, entry.object_id)):
+        box.label(text="Tinted: previews, renders and exports obey it", icon="COLOR")
+    if entry.caption:
+        box.label(text=entry.caption)
+    row = box.row()
+    row.label(text="Also Found As")
+    row.operator("r5dgs.add_alias", text="", icon="ADD").object_id = entry.object_id
+    for alias in entry.aliases:
+        line = box.row(align=True)
+        line.label(text=alias.name or "(empty)", icon="SMALL_CAPS")
+        action = line.operator("r5dgs.remove_alias", text="", icon="X", emboss=False)
+        action.word, action.object_id = alias.name, entry.object_id
+
+
+def _motion(own) -> str:
+    """How an object moves, as its anchor's physics say; "" where that is not known."""
+    for cloud in own:
+        physics = getattr(cloud.parent, "r5dgs_motion", None)
+        if physics is not None and "kind" in physics.bl_rna.properties:
+            items = physics.bl_rna.properties["kind"].enum_items
+            return items[physics.kind].name if physics.kind in items else ""
+    return ""
+
+
+def _is_registered(idname: str) -> bool:
+    module, name = idname.split(".")
+    return hasattr(bpy.types, f"{module.upper()}_OT_{name}")
+
+
+CLASSES = (R5DGS_UL_objects, R5DGS_PT_objects)
