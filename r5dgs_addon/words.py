@@ -1,4 +1,4 @@
-"""State of prompts and isolation: settings, earlier prompts and what is hidden in the .blend, answers in the session."""
+"""State of prompts and isolation: settings, old prompts and what is hidden in the .blend, answers in the session."""
 
 import bpy
 from bpy.props import (
