@@ -18,7 +18,10 @@ hypothesis.settings.load_profile("r5dgs")
 def pytest_report_header(config: pytest.Config) -> str:
     """Say beside the platform whether Blender's tests can run, and if not, why."""
     if importlib.util.find_spec("bpy") is not None:
-        return f"blender: bpy {importlib.metadata.version('bpy')}"
+        try:
+            return f"blender: bpy {importlib.metadata.version('bpy')}"
+        except importlib.metadata.PackageNotFoundError:
+            return "blender: this is one"
     here = f"{sys.version_info.major}.{sys.version_info.minor}"
     if sys.version_info[:2] != BPY_PYTHON:
         wanted = ".".join(map(str, BPY_PYTHON))

@@ -10,7 +10,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.motion import models
 from r5dgs_core.scene import cameras, playback, scene_file
-from tests import datasets, scenes
+from tests import scenes
 
 POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
@@ -25,6 +25,12 @@ def load(bpy, path, **options):
     before = set(bpy.data.collections)
     assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
     return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
+
+
+def drawn_scenes():
+    """`tests.datasets`, which draws with torch; a Blender may lack that."""
+    pytest.importorskip("torch", reason="torch is not installed here")
+    return importlib.import_module("tests.datasets")
 
 
 def clouds(collection):
@@ -80,6 +86,7 @@ def test_points_stand_where_playback_has_them_at_any_time(blender, tmp_path, con
 
 
 def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
+    datasets = drawn_scenes()
     scene = datasets.make_truth()
     bending = datasets.breathing(scene, 0.3)
     for name, wanted in (("rigid", scene), ("bending", bending)):
@@ -191,7 +198,7 @@ def test_only_what_moves_has_curves(blender, scene_path):
 
 
 def test_what_only_slides_has_two_keys(blender, tmp_path):
-    truth = datasets.make_truth()
+    truth = drawn_scenes().make_truth()
     slide = models.MotionModel("translation", velocity=[0.9, 0.35, 0.0], radius=0.5)
     poses = truth.track_poses.copy()
     poses[:, :, :] = [1.0, 0, 0, 0, 0, 0, 0]
