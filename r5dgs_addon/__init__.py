@@ -4,6 +4,7 @@ from . import (
     click,
     engine,
     handlers,
+    live_preview,
     look,
     motion_exact,
     motion_physics,
@@ -28,6 +29,7 @@ MODULES = (
     handlers,
     click,
     worker,
+    live_preview,
 )
 
 

@@ -76,9 +76,6 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def _ask(self, steps):
         """The worker's answer, or None where the user stops the render."""
-        while worker.busy():  # with a picture of the viewport or the preview
-            if self._stopped("waiting for another picture"):
-                return None
         job = worker.start(steps)
         while not job.done:
             if self._stopped(job.doing):
@@ -100,12 +97,11 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
 
 def _leave(job: worker.Job) -> None:
-    """Give up on a job: the worker, which has no other way to leave a picture unfinished, is stopped."""
+    """Give up on a job; one that ends by itself in a moment spares the worker."""
     end = time.monotonic() + GRACE_S
-    while not job.done and time.monotonic() < end:
+    while not (job.done or job.drop()) and time.monotonic() < end:
         time.sleep(LOOK_S)
-    if not job.done:
-        worker.stop()
+    job.cancel()
 
 
 def register():

@@ -18,6 +18,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
 from . import engine_color, engine_settings, picture, views, visible, worker
 
+KEY = "viewport"  # what `worker.busy` knows their pictures by
 LOOK_S = 0.01  # between two looks at the worker
 REST_S = 0.15  # a view that has not moved for this long rests
 QUICK_MS = 40.0  # pictures of full size that take no longer come at once
@@ -168,7 +169,7 @@ def look() -> float | None:
         if smaller == FULL and wish.moving != FULL and not port.rests():
             continue
         try:
-            _asked = worker.start(wish.requests(smaller)), port, wish, smaller
+            _asked = worker.submit(KEY, wish.requests(smaller)), port, wish, smaller
         except errors.R5dgsError as error:
             port.fail(wish, error)
             _redraw()

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import worker
+from .. import live_preview, worker
 from . import sidebar
 
 
@@ -14,7 +14,11 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
 
     def draw(self, context):
         layout = self.layout
-        layout.operator("r5dgs.preview", icon="RENDER_STILL")
+        row = layout.row(align=True)
+        row.operator("r5dgs.preview", icon="RENDER_STILL")
+        row.operator("r5dgs.live_preview", text="Live", icon="PLAY", depress=live_preview.running())
+        if live_preview.message():
+            layout.label(text=live_preview.message(), icon="ERROR")
         if worker.notice():
             layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
         session = context.window_manager.r5dgs

@@ -1,0 +1,37 @@
+"""Live Preview: let the preview image follow what Blender shows, or stop that."""
+
+import bpy
+
+from ..r5dgs_addon import live_preview, objects
+
+
+class R5DGS_OT_live_preview(bpy.types.Operator):
+    """Keep the image 'R5DGS Preview' up to date with the frame, the camera and the objects; press again to stop"""
+
+    bl_idname = "r5dgs.live_preview"
+    bl_label = "Live Preview"
+
+    @classmethod
+    def poll(cls, context):
+        if live_preview.running():
+            return True
+        if bpy.app.background:
+            cls.poll_message_set("Live preview needs a window; render single previews instead")
+            return False
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        if context.scene.camera is None:
+            cls.poll_message_set("Add a camera to the scene first")
+            return False
+        return True
+
+    def execute(self, context):
+        if live_preview.running():
+            live_preview.stop()
+        else:
+            live_preview.start()
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_live_preview,)

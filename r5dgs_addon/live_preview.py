@@ -1,0 +1,110 @@
+"""Live preview: while it is on, the image `R5DGS Preview` follows the frame and whatever else Blender shows.
+
+A timer, in Blender's own thread, compares what the camera sees with what the image shows, and asks the worker for the
+next picture where they differ and it is free: no handler, no data touched from a thread, and the latest state wins.
+"""
+
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..r5dgs_core import errors
+from . import picture, worker
+
+KEY = "live preview"  # what `worker.busy` knows its pictures by
+LOOK_S = 0.05  # between two looks while a picture is made
+IDLE_S = 0.1  # between two looks at what Blender shows
+
+_job: worker.Job | None = None
+_asked: list[tuple[str, str, dict[str, Any]]] | None = None  # what the last picture was asked for with
+_message = ""
+
+
+def running() -> bool:
+    """Whether it is on."""
+    return bpy.app.timers.is_registered(look)
+
+
+def message() -> str:
+    """Why there is no picture; else empty."""
+    return _message
+
+
+def start() -> None:
+    """Switch it on."""
+    global _asked, _message
+    if not running():
+        _asked, _message = None, ""
+        bpy.app.timers.register(look, first_interval=0.0)
+
+
+def stop() -> None:
+    """Switch it off. A picture that is being made is not waited for."""
+    global _job, _asked, _message
+    _job, _asked, _message = None, None, ""
+    if running():
+        bpy.app.timers.unregister(look)
+
+
+def look() -> float:
+    """Take a picture that is ready, and ask for one of what Blender shows now. Returns seconds to the next look."""
+    global _job, _asked, _message
+    if _job is not None:
+        if not _job.done:
+            return LOOK_S
+        job, _job = _job, None
+        try:
+            _show(*picture.finish(job.answer()))
+            _message = ""
+        except errors.R5dgsError as error:
+            _message = str(error)
+        _redraw()
+    if worker.busy() or bpy.app.is_job_running("RENDER"):
+        return LOOK_S
+    windows = bpy.context.window_manager.windows
+    if not windows:
+        return IDLE_S
+    with bpy.context.temp_override(window=windows[0]):
+        try:
+            steps = picture.steps(picture.shown(bpy.context.evaluated_depsgraph_get()))
+            if steps == _asked:
+                return IDLE_S
+            _asked, _job = steps, worker.submit(KEY, steps)
+        except errors.R5dgsError as error:
+            if str(error) != _message:
+                _message = str(error)
+                _redraw()
+            return IDLE_S
+    return LOOK_S
+
+
+def _show(image: bpy.types.Image, result: dict[str, Any]) -> None:
+    session = bpy.context.window_manager.r5dgs
+    session.preview_ms = result["ms_motion"] + result["ms_raster"]
+    session.preview_size = f"{image.size[0]} x {image.size[1]}"
+
+
+def _redraw() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in ("VIEW_3D", "IMAGE_EDITOR"):
+                area.tag_redraw()
+
+
+@persistent
+def _stop_before_load(*_):
+    """Another file is about to be opened: nothing of this one may be touched any more."""
+    stop()
+
+
+def register():
+    """Listen to loading."""
+    bpy.app.handlers.load_pre.append(_stop_before_load)
+
+
+def unregister():
+    """Switch it off, and undo `register`."""
+    stop()
+    if _stop_before_load in bpy.app.handlers.load_pre:
+        bpy.app.handlers.load_pre.remove(_stop_before_load)
