@@ -64,9 +64,11 @@ class _SetOnly:
 
 
 def draw(bpy, *panels):
-    """What panels say that want to be drawn, one after the other."""
+    """What panels say that want to be drawn, one after the other; menus and lists are passed over."""
     said = []
     for panel in panels:
+        if hasattr(panel, "bl_rna") and not issubclass(panel, bpy.types.Panel):
+            continue
         if not hasattr(panel, "poll") or panel.poll(bpy.context):
             panel.draw(SimpleNamespace(layout=Layout(bpy, said)), bpy.context)
     return said

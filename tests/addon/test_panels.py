@@ -17,8 +17,7 @@ def sidebar(blender):
     panels = importlib.import_module("r5dgs.r5dgs_addon.panels")
 
     def draw():
-        classes = [cls for module in panels.MODULES for cls in module.CLASSES]
-        return layouts.draw(blender, *(cls for cls in classes if issubclass(cls, blender.types.Panel)))
+        return layouts.draw(blender, *(panel for module in panels.MODULES for panel in module.CLASSES))
 
     return draw
 
