@@ -38,7 +38,7 @@ class R5DGS_UL_objects(bpy.types.UIList):
         entries, wanted = getattr(data, name), self.filter_name.casefold()
         if not wanted:
             return [], []
-        names = table.names(data)
+        names = table.names(data.id_data)
         shown = [wanted in names[entry.object_id].casefold() for entry in entries]
         return [self.bitflag_filter_item if keep else 0 for keep in shown], []
 

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 
+import numpy as np
 import pytest
 
 from r5dgs_core.scene import scene_file
@@ -103,6 +104,151 @@ def test_words_survive_saving_and_reloading(blender, loaded, tmp_path):
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
     ask(blender, "citrus")
     assert selected_ids(blender) == {4}
+
+
+def session(bpy):
+    return bpy.context.window_manager.r5dgs_words
+
+
+def test_enter_in_the_field_lists_matches_and_leaves_the_selection(blender, loaded):
+    ask(blender, "globe")
+    session(blender).prompt = "mug and fruit"
+    assert [match.object_id for match in session(blender).matches] == [1, 2, 4]
+    assert selected_ids(blender) == {6}
+    session(blender).prompt = ""
+    assert len(session(blender).matches) == 0 and session(blender).asked == ""
+
+
+def test_the_threshold_decides_what_matches(blender, loaded):
+    session(blender).prompt = "coffee mug"
+    assert [match.object_id for match in session(blender).matches] == [1]
+    blender.context.scene.r5dgs_words.threshold = 0.95
+    assert len(session(blender).matches) == 0
+    assert ask(blender, "coffee mug") == {"CANCELLED"}
+    assert blender.ops.r5dgs.select_by_prompt(text="coffee mug", threshold=0.3) == {"FINISHED"}
+    assert blender.context.scene.r5dgs_words.threshold == pytest.approx(0.3)
+
+
+def test_what_was_meant_is_said_and_offered(blender, loaded, capfd):
+    assert ask(blender, "bug") == {"CANCELLED"}
+    assert "did you mean 'mug'" in capfd.readouterr().out
+    assert [item.name for item in session(blender).meant][0] == "mug"
+    ask(blender, "zzz")
+    assert "the scene has: background, mug" in capfd.readouterr().out
+    assert len(session(blender).meant) == 0
+
+
+def test_prompts_that_found_something_are_kept_with_the_file(blender, loaded, tmp_path):
+    def history():
+        return [item.name for item in blender.context.scene.r5dgs_words.history]
+
+    for text in ("mug", "zzz", "globe", " mug ", "car"):
+        ask(blender, text)
+    assert history() == ["car", "mug", "globe"]
+    for number in range(20):
+        ask(blender, "mug" + " " * number + "and car")
+        ask(blender, f"car and {number}")
+    assert len(history()) == 12 and history()[0] == "car and 19"
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    kept = history()
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
+    assert history() == kept
+
+
+def test_a_click_on_a_match_selects_that_one(blender, loaded):
+    ask(blender, "fruit")
+    assert blender.ops.r5dgs.select_object(scene=loaded.name, object_id=4) == {"FINISHED"}
+    assert selected_ids(blender) == {4}
+    blender.ops.r5dgs.select_object(object_id=1, mode="ADD")
+    assert selected_ids(blender) == {1, 4} and blender.context.view_layer.objects.active.name == "mug anchor"
+    blender.ops.r5dgs.select_object(object_id=4, mode="SUBTRACT")
+    assert selected_ids(blender) == {1}
+    assert blender.ops.r5dgs.select_object(object_id=99) == {"CANCELLED"}
+    assert blender.ops.r5dgs.select_object(scene="elsewhere", object_id=1) == {"CANCELLED"}
+
+
+def test_duplicates_are_selected_with_their_object(blender, loaded):
+    ask(blender, "mug")
+    blender.ops.object.duplicate()
+    ask(blender, "globe")
+    ask(blender, "mug")
+    assert {obj.name for obj in blender.context.selected_objects} == {"mug", "mug.001", "mug anchor", "mug anchor.001"}
+
+
+def test_what_was_deleted_is_no_match_but_said(blender, loaded, capfd):
+    ask(blender, "lemon")
+    blender.ops.object.delete()
+    assert ask(blender, "fruit") == {"FINISHED"}
+    assert selected_ids(blender) == {2}
+    assert [note.name for note in session(blender).notes] == ["Deleted: lemon"]
+    capfd.readouterr()
+    assert ask(blender, "citrus") == {"CANCELLED"}
+    said = capfd.readouterr().out
+    assert "Deleted: lemon" in said and "lemon," not in said
+    assert blender.ops.r5dgs.select_object(object_id=4) == {"CANCELLED"}
+    assert "lemon was deleted" in capfd.readouterr().out
+
+
+def test_of_two_scenes_the_active_one_is_searched_or_both(blender, loaded, tmp_path):
+    path = scene_file.write(scenes.make_scene(n=200, objects=2), tmp_path / "other.r5dgs")
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    other = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != loaded)
+    ask(blender, "mug")
+    assert all(other.all_objects.get(obj.name) == obj for obj in blender.context.selected_objects)
+    assert ask(blender, "globe") == {"CANCELLED"}
+    blender.context.scene.r5dgs_words.all_scenes = True
+    assert {match.scene for match in session(blender).matches} == {loaded.name}
+    ask(blender, "mug")
+    assert len(blender.context.selected_objects) == 4 and len(session(blender).matches) == 2
+    blender.ops.r5dgs.select_object(scene=loaded.name, object_id=6)
+    blender.context.scene.r5dgs_words.all_scenes = False
+    assert ask(blender, "globe") == {"FINISHED"}
+
+
+def test_selecting_can_be_undone_and_redone(blender, loaded):
+    ask(blender, "globe")
+    blender.ops.ed.undo_push(message="before")
+    ask(blender, "mug")
+    blender.ops.ed.undo_push(message="Select by Prompt")
+    blender.ops.ed.undo()
+    assert selected_ids(blender) == {6}
+    blender.ops.ed.redo()
+    assert selected_ids(blender) == {1} and blender.context.view_layer.objects.active.name == "mug anchor"
+
+
+@pytest.fixture
+def meaningful(blender, tmp_path):
+    """A loaded scene whose file knows what a "sour thing" is, and the file."""
+    bare = scenes.make_scene(n=200, objects=4)
+    axes = np.eye(len(bare.objects), 8, dtype=np.float32)
+    row = [item.id for item in bare.objects].index(4)
+    rich = dataclasses.replace(
+        bare, embeddings=axes, vocabulary=("sour thing",), vocabulary_embeddings=axes[row : row + 1]
+    )
+    path = scene_file.write(rich, tmp_path / "meaningful.r5dgs")
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    return path, rich
+
+
+def test_stored_meanings_find_what_no_name_says(blender, meaningful):
+    assert ask(blender, "sour things") == {"FINISHED"}
+    assert selected_ids(blender) == {4} and "meaning of 'sour thing'" in session(blender).matches[0].why
+
+
+def test_meanings_are_read_again_when_the_file_changes(blender, meaningful):
+    path, rich = meaningful
+    ask(blender, "sour things")
+    scene_file.write(dataclasses.replace(rich, vocabulary=("a bitter thing",)), path)
+    assert ask(blender, "sour things") == {"CANCELLED"}
+    assert ask(blender, "bitter thing") == {"CANCELLED"} and ask(blender, "lemon") == {"FINISHED"}
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"PK")])
+def test_when_the_scene_file_is_gone_names_are_searched_and_that_is_said(blender, meaningful, damage):
+    damage(meaningful[0])
+    assert ask(blender, "sour things") == {"CANCELLED"}
+    assert ask(blender, "lemon") == {"FINISHED"}
+    assert "by names alone" in session(blender).notes[0].name
 
 
 def test_without_a_scene_the_operators_cannot_be_called(blender):
