@@ -1,0 +1,345 @@
+"""What an edited motion group is in a scene file: its track to t_max, and the model that goes on after it.
+
+Notation: M(t) is the map from the file's bind state to the file's world that Blender shows, B = M(t_max) that of the
+new bind state, and P(t) = M(t) B^-1 the motion since then. A parent that moves all of a learned motion P0 by a
+similarity X makes it P = X P0 X^-1: what the file knows is then taken from there, sharper than Blender's numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..motion import drawn, models, rotations
+from ..motion.models import MotionModel
+from . import carried, playback
+from .scene import MotionGroup, Scene
+
+RIGID_TOLERANCE = 1e-3  # how far the linear part of a motion may be from a rotation
+_LENGTHS = ("velocity", "acceleration", "center_offset", "offset_displacement")
+_ANGLES = ("angular_velocity", "angular_acceleration", "offset_rotvec")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Gaussians of one object and one motion group as they were left.
+
+    Attributes:
+        name: For notes.
+        object_id: Object that they belong to.
+        motion_id: Motion group in the file that they came from.
+        start: First row in the file.
+        count: Number of rows.
+        mover: What they move with: pieces of one mover and one motion group stay together.
+        matrices: From the bind state of the file to its world, at the observed times and the later ones. [T, 4, 4]
+        pivot: Point that they turn about, at t_max; None for the group's, carried. [3]
+        parent: Linear part of what moves all of their learned motion. [3, 3]
+        model: Their motion past t_max before ``parent``, or None for the file's.
+        allowed: Difference of positions that counts as none, world units.
+        tint: Factor on their display-referred colour. [3]
+    """
+
+    name: str
+    object_id: int
+    motion_id: int
+    start: int
+    count: int
+    mover: str
+    matrices: np.ndarray
+    pivot: np.ndarray | None = None
+    parent: np.ndarray | None = None
+    model: MotionModel | None = None
+    allowed: float = 0.0
+    tint: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion at some times, since t_max.
+
+    Attributes:
+        quats: Unit wxyz. [T, 4]
+        linears: The linear parts, which are rotations where the motion is rigid. [T, 3, 3]
+        shifts: The translations. [T, 3]
+    """
+
+    quats: np.ndarray
+    linears: np.ndarray
+    shifts: np.ndarray
+
+    def moves(self, pivot: np.ndarray) -> np.ndarray:
+        """Displacements of a pivot at t_max. [3] -> [T, 3]"""
+        return self.linears @ pivot + self.shifts - pivot
+
+    @property
+    def bent(self) -> float:
+        """How far the linear parts are from rotations: 0 for a rigid motion."""
+        return float(np.abs(self.linears - rotations.quats_to_rotmats(self.quats)).max(initial=0.0))
+
+
+@dataclass
+class Cluster:
+    """Pieces that move alike: what becomes a motion group.
+
+    Attributes:
+        pieces: Its members; none for a group that had none before.
+        source: The group of the file that they come from.
+        motion: What Blender shows.
+        id: Of the new group.
+        pivot: At t_max. [3]
+        parent: Linear part of what moves all of the learned motion. [3, 3]
+        reach: Largest distance of a member from the pivot.
+        allowed: Difference of positions that counts as none.
+        same: Whether it moves as in the file.
+        group: The new group.
+        poses: Of the new group at the observed times. [S, 7]
+    """
+
+    pieces: list[Piece]
+    source: MotionGroup
+    motion: Motion
+    id: int = 0
+    pivot: np.ndarray = None  # type: ignore[assignment]
+    parent: np.ndarray = None  # type: ignore[assignment]
+    reach: float = 0.0
+    allowed: float = 0.0
+    same: bool = True
+    group: MotionGroup = None  # type: ignore[assignment]
+    poses: np.ndarray = None  # type: ignore[assignment]
+
+
+def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
+    """The motion P of maps M. [T, 4, 4] and the index of t_max"""
+    maps = matrices @ np.linalg.inv(matrices[bind])
+    u, _, vt = np.linalg.svd(maps[:, :3, :3])
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    quats = rotations.rotmats_to_quats(u @ vt)
+    quats[bind] = (1.0, 0, 0, 0)
+    maps[bind] = np.eye(4)
+    return Motion(quats, maps[:, :3, :3], maps[:, :3, 3])
+
+
+def _turned(quats: np.ndarray, moves: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses X P0 X^-1 of a motion under a parent that is a similarity. [T, 4], [T, 3] and X [3, 3]"""
+    if (parent == np.eye(3)).all():
+        return quats, moves
+    turn = rotations.rotmats_to_quats(carried.nearest_rotation(parent))
+    return rotations.multiply(rotations.multiply(turn, quats), rotations.conjugate(turn)), moves @ parent.T
+
+
+def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
+    """The model of `_turned`, its covariance included."""
+    if (parent == np.eye(3)).all():
+        return model
+    turn = carried.nearest_rotation(parent)
+    scale = float(abs(np.linalg.det(parent)) ** (1 / 3))
+    maps = {name: scale * turn for name in _LENGTHS} | {name: turn for name in _ANGLES}
+    values = {name: linear @ getattr(model, name) for name, linear in maps.items()}
+    if model.inertia is not None:
+        inertia = turn @ model.inertia @ turn.T
+        values["inertia"] = 0.5 * (inertia + inertia.T)
+    if model.covariance is not None:
+        change = _change(model.covariance_names, maps)
+        values["covariance"] = change @ model.covariance @ change.T
+    return replace(model, radius=scale * model.radius, **values)
+
+
+def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
+    """The change of basis of rates by name, such as "velocity.x". [P, P]"""
+    change = np.eye(len(names))
+    parts = [name.partition(".") for name in names]
+    for i, (field, _, axis) in enumerate(parts):
+        for j, (other, _, other_axis) in enumerate(parts):
+            if axis and field == other and field in maps:
+                change[i, j] = maps[field]["xyz".index(axis), "xyz".index(other_axis)]
+    return change
+
+
+def _track(sampled: Motion, knots: slice, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float):
+    """Poses of a group at the knots, relative to the new bind state.
+
+    Args:
+        sampled: What Blender shows, at the knots and later.
+        knots: Its rows at the knots; the last one is t_max.
+        pivot: Of the group, at t_max. [3]
+        known: What the file has, turned: taken where Blender shows the same. [S, 7]
+        reach: Largest distance of a member from the pivot.
+        allowed: Difference that counts as none, world units.
+
+    Returns:
+        The poses [S, 7], and whether they are the known ones.
+    """
+    quats, moves = sampled.quats[knots], sampled.moves(pivot)[knots]
+    if (drawn.pose_errors(known[:, :4], known[:, 4:], quats, moves, reach) <= allowed).all():
+        return known, True
+    poses = np.concatenate([rotations.make_continuous(quats[::-1])[::-1], moves], axis=-1)
+    poses[-1] = (1.0, 0, 0, 0, 0, 0, 0)
+    return poses, False
+
+
+def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cluster]:
+    """Groups of the new scene in order: the pinned one, then those of the file, then what moves otherwise now.
+
+    Args:
+        scene: The scene that was edited.
+        pieces: What is left of it.
+        notes: Gets what cannot be kept.
+    """
+    last = len(scene.track_times) - 1
+    pinned = scene.groups[0]
+    still = Motion(rotations.identity(1), np.eye(3)[None], np.zeros((1, 3)))
+    found: list[Cluster] = [Cluster([], pinned, still)]
+    for piece in pieces:
+        source = scene.groups[piece.motion_id] if 0 < piece.motion_id < len(scene.groups) else pinned
+        motion = _since_bind(np.asarray(piece.matrices, np.float64), last)
+        if motion.bent > RIGID_TOLERANCE:
+            notes.append(f"{piece.name}: its scale changes with time, which a scene file cannot hold")
+        reach = _reach(scene, piece)
+        if source is pinned and (_apart(motion, None, reach) <= piece.allowed).all():
+            found[0].pieces.append(piece)
+            continue
+        for cluster in found[1:]:
+            first = cluster.pieces[0]
+            alike = cluster.source is source and first.mover == piece.mover
+            if alike and (_apart(motion, cluster.motion, reach) <= piece.allowed).all():
+                cluster.pieces.append(piece)
+                break
+        else:
+            found.append(Cluster([piece], source, motion))
+    used = {cluster.source.id for cluster in found}
+    members = set(np.unique(scene.motion_ids).tolist())
+    for group in scene.groups[1:]:  # those without members were there before, so they stay
+        if group.id not in used and group.id not in members:
+            found.append(Cluster([], group, still))
+    firsts: set[int] = set()
+
+    def order(cluster: Cluster) -> tuple[bool, int]:
+        again = cluster.source.id in firsts or (cluster.source is pinned and cluster is not found[0])
+        firsts.add(cluster.source.id)
+        return (again, cluster.source.id)
+
+    found = [cluster for _, cluster in sorted(((order(c), c) for c in found), key=lambda entry: entry[0])]
+    for number, cluster in enumerate(found):
+        cluster.id = number
+    return found
+
+
+def _apart(motion: Motion, other: Motion | None, reach: float) -> np.ndarray:
+    """How far two motions bring points apart that lie within ``reach`` of the origin; from rest where None. [T]"""
+    linears = np.eye(3) if other is None else other.linears
+    shifts = np.zeros(3) if other is None else other.shifts
+    return np.linalg.norm(motion.shifts - shifts, axis=-1) + reach * np.linalg.norm(
+        motion.linears - linears, axis=(-2, -1)
+    )
+
+
+def _reach(scene: Scene, piece: Piece) -> float:
+    """Largest distance of a piece's Gaussians from the origin in the new bind state."""
+    last = len(scene.track_times) - 1
+    means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
+    placed = means @ piece.matrices[last][:3, :3].T + piece.matrices[last][:3, 3]
+    return float(np.linalg.norm(placed, axis=-1).max())
+
+
+def move(scene: Scene, found: list[Cluster], times: np.ndarray, notes: list[str]) -> None:
+    """Find track and model of every cluster; those that follow another come last.
+
+    Args:
+        scene: The scene that was edited.
+        found: What `clusters` gave.
+        times: The observed times and later ones. [T]
+        notes: Gets what cannot be kept.
+    """
+    count = len(scene.track_times)
+    quats, moves = playback.knots(scene)
+    known = np.concatenate([quats, moves], axis=-1)
+    for cluster in found:
+        source = cluster.source
+        if not cluster.pieces or cluster.id == 0:
+            cluster.group, cluster.poses = replace(source, id=cluster.id), scene.track_poses[source.id]
+            cluster.pivot, cluster.parent = np.asarray(source.pivot, np.float64), np.eye(3)
+            continue
+        first = max(cluster.pieces, key=lambda piece: piece.count)
+        cluster.allowed = max(piece.allowed for piece in cluster.pieces)
+        cluster.parent = np.eye(3) if first.parent is None else first.parent
+        cluster.pivot = _pivot(scene, cluster, first)
+        cluster.reach = _radius(scene, cluster)
+        if source.id == 0 and cluster.id != 0:
+            before = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
+        else:
+            before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], cluster.parent), axis=-1)
+        cluster.poses, observed = _track(
+            cluster.motion, slice(0, count), cluster.pivot, before, cluster.reach, cluster.allowed
+        )
+        if observed and (before == known[source.id]).all() and source.id:
+            cluster.poses = scene.track_poses[source.id].copy()  # signs included
+        cluster.same = observed and bool((cluster.parent == np.eye(3)).all())
+    later = np.asarray(times[count:], np.float64) - scene.t_max
+    for follows in (False, True):
+        for cluster in found[1:]:
+            if cluster.pieces and (cluster.source.follows is not None) == follows:
+                _go_on(scene, cluster, found, later, notes)
+
+
+def _pivot(scene: Scene, cluster: Cluster, first: Piece) -> np.ndarray:
+    """Where the pivot is at t_max; the file's own where that is it."""
+    own = np.asarray(cluster.source.pivot, np.float64)
+    bind = first.matrices[len(scene.track_times) - 1]
+    if cluster.source.id == 0:
+        own = np.median(scene.means[first.start : first.start + first.count].astype(np.float64), axis=0)
+    pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
+    return own if np.linalg.norm(pivot - own) <= cluster.allowed else pivot
+
+
+def _radius(scene: Scene, cluster: Cluster) -> float:
+    """Largest distance of a member from the pivot in the new bind state."""
+    last, best = len(scene.track_times) - 1, 1e-9 * scene.extent
+    for piece in cluster.pieces:
+        means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
+        placed = means @ piece.matrices[last][:3, :3].T + piece.matrices[last][:3, 3]
+        best = max(best, float(np.linalg.norm(placed - cluster.pivot, axis=-1).max()))
+    return best
+
+
+def _go_on(scene: Scene, cluster: Cluster, found: list[Cluster], later: np.ndarray, notes: list[str]) -> None:
+    """The motion model of a cluster: the one it had or was given where Blender shows that, else one that is fitted."""
+    source, first = cluster.source, max(cluster.pieces, key=lambda piece: piece.count)
+    rows = slice(len(scene.track_times), None)
+    quats, moves = cluster.motion.quats[rows], cluster.motion.moves(cluster.pivot)[rows]
+    scale = float(abs(np.linalg.det(cluster.parent)) ** (1 / 3))
+    known = {"pivot": cluster.pivot, "id": cluster.id, "seen": source.seen}
+    known |= {"rigid_rms": scale * source.rigid_rms, "rigid_max": scale * source.rigid_max}
+    if source.id == 0:
+        known |= {"role": "body", "object_id": first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
+
+    def shown(q: np.ndarray, d: np.ndarray) -> bool:
+        return bool((drawn.pose_errors(q, d, quats, moves, cluster.reach) <= cluster.allowed).all())
+
+    if source.follows is not None and source.follow_matrix is not None:
+        for leader in found[1:]:
+            if leader.source.id == source.follows and leader.group is not None:
+                back = np.linalg.inv(leader.parent)
+                matrix = cluster.parent @ source.follow_matrix @ back
+                _, led = models.evaluate(leader.group.model, later)
+                if shown(rotations.identity(len(later)), led @ matrix.T):
+                    cluster.group = replace(source, **known, follows=leader.id, follow_matrix=matrix)
+                    cluster.same &= leader.same
+                    return
+    else:
+        given = [] if first.model is None else [first.model]
+        for model in (*given, source.model):
+            turned = _turned_model(model, cluster.parent)
+            if shown(*models.evaluate(turned, later)):
+                cluster.same &= turned == source.model
+                cluster.group = replace(source, **known, model=turned)
+                return
+    model, error = drawn.fit(later, quats, moves, cluster.reach, cluster.allowed)
+    cluster.same = False
+    cluster.group = replace(source, **known, model=model, follows=None, follow_matrix=None)
+    if error > 10 * cluster.allowed:
+        notes.append(
+            f"{first.name}: no motion model goes on past t_max as its curves do; the nearest one is up to "
+            f"{error:.3g} away from them"
+        )
