@@ -66,8 +66,8 @@ def plays(bpy, collection, path, times=(0.0, 0.333, scenes.T_MAX, 0.9)):
 
 
 def draw_panels(bpy):
-    panels = addon("panels")
-    return layouts.draw(bpy, *(panel for module in panels.MODULES for panel in module.CLASSES))
+    classes = [cls for module in addon("panels").MODULES for cls in module.CLASSES]
+    return layouts.draw(bpy, *(cls for cls in classes if issubclass(cls, bpy.types.Panel)))
 
 
 def contents(bpy):

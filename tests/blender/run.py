@@ -168,19 +168,19 @@ def figures(path: Path | None) -> Table:
     return table
 
 
-class _WithoutTorch:
-    """Leaves out test files that cannot be imported because torch is absent, and remembers them."""
+def _without_torch(pytest, left_out: list[str]):
+    """A plugin for pytest that leaves out files that cannot be imported because torch is absent, and names them."""
 
-    def __init__(self, pytest):
-        self.left_out: list[str] = []
-        self.pytest_make_collect_report = pytest.hookimpl(wrapper=True)(self._report)
+    class Plugin:
+        @pytest.hookimpl(wrapper=True)
+        def pytest_make_collect_report(self, collector):
+            report = yield
+            if report.outcome == "failed" and "No module named 'torch'" in str(report.longrepr):
+                report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: torch is not installed")
+                left_out.append(collector.path.name)
+            return report
 
-    def _report(self, collector):
-        report = yield
-        if report.outcome == "failed" and "No module named 'torch'" in str(report.longrepr):
-            report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: torch is not installed")
-            self.left_out.append(collector.path.name)
-        return report
+    return Plugin()
 
 
 def tests(arguments: list[str]) -> str:
@@ -192,10 +192,11 @@ def tests(arguments: list[str]) -> str:
     import pytest
 
     os.chdir(ROOT)
-    plugin = _WithoutTorch(pytest)
+    absent: list[str] = []
     given = arguments or ["tests/addon"]
-    code = pytest.main(["-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT), *given], plugins=[plugin])
-    left_out = f"; left out for want of torch: {', '.join(sorted(plugin.left_out))}" if plugin.left_out else ""
+    options = ["-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT)]
+    code = pytest.main([*options, *given], plugins=[_without_torch(pytest, absent)])
+    left_out = f"; left out for want of torch: {', '.join(sorted(absent))}" if absent else ""
     return f"{'passed' if code == 0 else f'FAILED with code {int(code)}'}{left_out}"
 
 
