@@ -9,7 +9,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, scene_file
 from ..r5dgs_core.scene.scene import Scene
-from . import export_running, look, objects, picture
+from . import export_running, look, picture, visible
 from .export_running import Outcome, Step, Steps
 
 AXES = (
@@ -53,78 +53,63 @@ class Sources:
             self.notes.append(text)
 
 
-def clouds(context: bpy.types.Context, which: str) -> list[bpy.types.Object]:
-    """The clouds to export, of `WHICH`, in the order of their scenes; hidden ones are left out at each frame."""
-    found = [obj for obj in context.view_layer.objects if obj.r5dgs.role == "CLOUD" and obj.type == "POINTCLOUD"]
-    if which == "SELECTED":
-        selected = set(context.selected_objects)
-        selected |= {
-            child for obj in selected if obj.r5dgs.role in ("ANCHOR", "ROOT") for child in obj.children_recursive
-        }
-        found = [obj for obj in found if obj in selected]
-    return sorted(found, key=lambda obj: (obj.r5dgs.start, obj.name))
+def chosen(context: bpy.types.Context, which: str) -> set[bpy.types.Object] | None:
+    """Objects whose clouds are exported, of `WHICH`: the selected ones and what hangs from them; None for all."""
+    if which == "VISIBLE":
+        return None
+    selected = set(context.selected_objects)
+    return selected | {child for obj in selected for child in obj.children_recursive}
 
 
-def scene_of(obj: bpy.types.Object) -> bpy.types.Collection | None:
-    """The loaded scene that an object belongs to."""
-    for collection in objects.scene_collections():
-        if obj.name in collection.all_objects and collection.all_objects[obj.name] == obj:
-            return collection
-    return None
+def world_to(axes: str, world: np.ndarray) -> np.ndarray:
+    """The map from Blender's world to the axes wanted, of `AXES`.
 
+    Args:
+        axes: Of `AXES`.
+        world: Map of the scene's own world to Blender's. [4, 4]
 
-def world_to(axes: str, collection: bpy.types.Collection | None, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
-    """The map from Blender's world to the axes wanted, of `AXES`. [4, 4]"""
-    result = np.eye(4)
+    Returns:
+        The map. [4, 4]
+    """
     if axes == "FILE":
-        root = None if collection is None else collection.r5dgs.root
-        if root is not None:
-            result = np.linalg.inv(np.array(root.evaluated_get(depsgraph).matrix_world, np.float64))
-    elif axes != "BLENDER":
+        return np.linalg.inv(world)
+    result = np.eye(4)
+    if axes != "BLENDER":
         result[:3, :3] = cameras.WORLD_TO_BLENDER[axes.lower()].T
     return result
 
 
 def splats_of(
-    context: bpy.types.Context, chosen: list[bpy.types.Object], axes: str, sources: Sources
+    context: bpy.types.Context, wanted: set[bpy.types.Object] | None, axes: str, sources: Sources
 ) -> tuple[ply.Splats, list[str]]:
-    """The Gaussians of clouds as they are at the current frame.
+    """The Gaussians that Blender shows at the current frame.
 
     Args:
         context: Its scene has the frame; what its view layer hides is left out.
-        chosen: Clouds.
+        wanted: What `chosen` gave.
         axes: Of `AXES`.
         sources: Where they come from, and what has to be said.
 
     Returns:
         The Gaussians, and the names of the clouds that are in them.
     """
-    depsgraph = context.evaluated_depsgraph_get()
-    parts, names = [], []
-    for obj in chosen:
-        if not obj.visible_get(view_layer=context.view_layer):
+    _, found = visible.instances(context.evaluated_depsgraph_get())
+    parts, names, from_blender = [], [], set()
+    for one in found:
+        if wanted is not None and one.object not in wanted and one.parent not in wanted:
             continue
-        collection = scene_of(obj)
-        matrix = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
-        if np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) < 3:
-            sources.note(f"{obj.name}: left out where it is scaled to nothing")
-            continue
-        parts.append(_splats(obj, world_to(axes, collection, depsgraph) @ matrix, sources, collection))
-        names.append(obj.name)
+        scene, turn = sources.scene(one.collection), world_to(axes, one.world)
+        matrix, names = turn @ one.matrix, [*names, one.object.name]
+        if scene is not None and one.start + one.count <= len(scene.means):
+            tint = None if one.tint == look.NONE else np.array(one.tint)
+            parts.append(carried.place(scene, one.start, one.count, matrix, world=turn @ one.world, tint=tint))
+        elif (one.object, one.parent) not in from_blender:  # all its stretches of rows at once
+            from_blender.add((one.object, one.parent))
+            points = from_points(one.object.data, one.object.r5dgs.object_id)
+            parts.append(carried.carry(points, matrix, np.array(one.tint)))
         if parts[-1].sh.shape[1] > 1 and not carried.is_similarity(matrix[:3, :3]):
-            sources.note(f"{obj.name}: scaled unevenly; how its colours change with the direction is a best fit")
+            sources.note(f"{names[-1]}: scaled unevenly; how its colours change with the direction is a best fit")
     return carried.join(parts), names
-
-
-def _splats(
-    obj: bpy.types.Object, matrix: np.ndarray, sources: Sources, collection: bpy.types.Collection | None
-) -> ply.Splats:
-    scene, state = sources.scene(collection), obj.r5dgs
-    if scene is not None and state.start + state.count <= len(scene.means):
-        if len(obj.data.points) == state.count:
-            return carried.place(scene, state.start, state.count, matrix, look.tint(obj))
-        sources.note(f"{obj.name}: taken from its points in Blender, as some were added or removed; without shading")
-    return carried.carry(from_points(obj.data, state.object_id), matrix, look.tint(obj))
 
 
 def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
@@ -176,23 +161,25 @@ def ply_steps(
         step: Frames from one file to the next.
 
     Raises:
-        ConfigError: Nothing is chosen.
+        ConfigError: The current frame shows nothing of it.
         SceneFileError: A file cannot be written, or points are no Gaussians.
     """
-    chosen, sources, scene = clouds(context, which), Sources(), context.scene
-    if not chosen:
-        wanted = "a selected object of a loaded scene" if which == "SELECTED" else "a loaded scene with objects"
-        raise errors.ConfigError(f"export: expected {wanted}, found none; select objects or load a scene first")
-    frames, counts = export_running.frames_of(scene, every, step), []
+    wanted, sources, scene = chosen(context, which), Sources(), context.scene
+    frames, most, clouds = export_running.frames_of(scene, every, step), 0, set()
     with export_running.frame_kept(scene):
         for number, frame in enumerate(frames):
             target = export_running.numbered(path, frame) if every else path
             yield Step(number, len(frames), target.name)
             export_running.go_to(scene, frame)
-            splats, names = splats_of(context, chosen, axes, sources)
+            splats, names = splats_of(context, wanted, axes, sources)
             if not names and not every:
-                raise errors.ConfigError("export: expected something visible, found all of it hidden; show it first")
+                raise errors.ConfigError(
+                    "export: expected a visible object of a loaded scene" + (", selected" if wanted is not None else "")
+                    + ", found none; select or show one first"
+                )  # fmt: skip
             ply.write(splats, target, plain=plain)
-            counts.append(len(splats.means))
+            most, clouds = max(most, len(splats.means)), clouds | set(names)
+    if not clouds:
+        sources.note("No frame shows anything to export; the files are empty")
     files = f"{len(frames)} files" if every else path.name
-    return Outcome(f"{files}: {max(counts)} Gaussians of {len(chosen)} clouds", sources.notes)
+    return Outcome(f"{files}: {most} Gaussians of {len(clouds)} clouds", sources.notes)

@@ -44,14 +44,24 @@ def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) 
     return Splats(means, quats, log_scales, splats.opacity_logits, sh, splats.identities, splats.object_ids)
 
 
-def place(scene: Scene, start: int, count: int, matrix: np.ndarray, tint: np.ndarray | None = None) -> Splats:
+def place(
+    scene: Scene,
+    start: int,
+    count: int,
+    matrix: np.ndarray,
+    *,
+    world: np.ndarray | None = None,
+    tint: np.ndarray | None = None,
+) -> Splats:
     """A range of a scene's Gaussians, carried from the bind state, with the shading of the pose it brings them to.
 
     Args:
         scene: The scene.
         start: First row.
         count: Number of rows.
-        matrix: Affine map from the bind state to the wanted world. Shading turns with its nearest rotation. [4, 4]
+        matrix: Affine map from the bind state to the wanted world. [4, 4]
+        world: Map from the scene's own world, in which its light stands, to the wanted one; None where they are the
+            same. Shading turns with the rotation nearest to ``matrix``, seen from there. [4, 4]
         tint: Factor on the display-referred colour, or None. [3]
 
     Returns:
@@ -62,8 +72,10 @@ def place(scene: Scene, start: int, count: int, matrix: np.ndarray, tint: np.nda
     """
     if not 0 <= start <= start + count <= len(scene.means):
         raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.means)} Gaussians")
-    rows = slice(start, start + count)
-    factor = shading_factors(scene, rows, nearest_rotation(affine(matrix)[0]))
+    rows, turn = slice(start, start + count), nearest_rotation(affine(matrix)[0])
+    if world is not None:
+        turn = nearest_rotation(affine(world)[0]).T @ turn
+    factor = shading_factors(scene, rows, turn)
     if tint is not None:
         factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
     return carry(bind_state(scene, rows), matrix, factor)

@@ -16,6 +16,7 @@ pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra
 from mathutils import Matrix, Quaternion  # noqa: E402  (bpy brings it)
 
 WORLD = cameras.WORLD_TO_BLENDER["colmap"]
+WORLD_4 = np.block([[WORLD, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 @pytest.fixture
@@ -73,7 +74,7 @@ def psnr(a, b):
 def shown(scene, collection, camera):
     """The core's picture of what Blender shows, by maps of the bind state."""
     instances = [
-        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64))
+        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
         for o in collection.all_objects
         if o.r5dgs.role == "CLOUD" and o.visible_get()
     ]
@@ -150,6 +151,19 @@ def test_a_range_is_a_numbered_file_for_each_frame_and_the_frame_stays(blender, 
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 
 
+def test_instances_of_a_collection_come_with_their_own_place(blender, scene, loaded, tmp_path):
+    home = next(child for child in loaded.children if child.name == "mug")
+    handle = blender.data.objects.new("copy", None)
+    handle.instance_type, handle.instance_collection, handle.location = "COLLECTION", home, (0, 0, 5)
+    blender.context.scene.collection.objects.link(handle)
+    blender.context.view_layer.update()
+    found = export(blender, tmp_path / "a.ply")
+    count = scene.object(1).count
+    assert len(found.means) == len(scene.means) + count
+    mugs = np.sort(found.means[found.object_ids == 1][:, 2])
+    np.testing.assert_allclose(mugs[count:], mugs[:count] + 5, atol=1e-4)
+
+
 def test_stopping_keeps_the_files_that_were_finished(blender, loaded, gaussians, tmp_path):
     view = blender.context.scene
     view.frame_start, view.frame_end = 1, 5
@@ -200,12 +214,12 @@ def test_third_parties_read_the_columns(blender, loaded, tmp_path):
 
 def test_what_cannot_be_exact_is_said(blender, loaded, tmp_path, capsys):
     cloud(loaded, "mug").scale = (1, 2, 1)
-    cloud(loaded, "red apple").scale = (0, 0, 0)
+    cloud(loaded, "red apple").scale = (0, 0, 0)  # nothing to see, so nothing to export
     blender.context.view_layer.update()
-    export(blender, tmp_path / "a.ply")
+    assert 2 not in export(blender, tmp_path / "a.ply").object_ids
     said = capsys.readouterr().out
     assert "mug: scaled unevenly" in said
-    assert "red apple: left out" in said
+    assert "red apple" not in said
 
 
 def test_a_folder_that_is_not_there_is_an_error_and_no_file(blender, loaded, tmp_path):

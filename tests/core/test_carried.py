@@ -88,7 +88,7 @@ def test_carrying_there_and_back_changes_nothing():
 def test_a_placed_range_has_the_colours_that_the_renderer_gives_it(tint):
     scene = make_scene(n=200, sh_degree=3, shading=True)
     matrix, start, count = matrix_of(0.6 * TURN), 60, 120
-    placed = carried.place(scene, start, count, matrix, tint)
+    placed = carried.place(scene, start, count, matrix, tint=tint)
     posed = scene_render.pose_instances(scene, [scene_render.Instance(start, count, matrix)])
     wanted = scene_render.colors(posed, scene.cameras[0]) * (1 if tint is None else np.array(tint))
     towards = placed.means - scene.cameras[0].center
@@ -110,6 +110,14 @@ def test_a_placed_range_is_lit_as_playback_lights_it():
     placed = carried.place(scene, int(rows[0]), len(rows), matrix)
     colour = np.maximum(0.5 + harmonics.C0 * scene.sh[rows, 0], 0) * frame.shading_factor[rows, None]
     np.testing.assert_allclose(np.maximum(0.5 + harmonics.C0 * placed.sh[:, 0], 0), colour, atol=1e-6)
+
+
+def test_the_light_turns_with_the_world():
+    scene = make_scene(n=200, shading=True)
+    world, matrix = matrix_of(0.5 * TURN), matrix_of(TURN @ TURN)
+    placed = carried.place(scene, 60, 120, world @ matrix, world=world)
+    np.testing.assert_allclose(placed.sh, carried.place(scene, 60, 120, matrix).sh, atol=1e-6)
+    assert np.abs(placed.sh - carried.place(scene, 60, 120, world @ matrix).sh).max() > 1e-2
 
 
 def test_joining_keeps_order_and_fills_lower_degrees_with_nothing():
