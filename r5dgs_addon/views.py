@@ -1,5 +1,6 @@
 """What looks at the scenes: Blender's camera or a 3D view, as a camera of the core in Blender's world."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +38,7 @@ class View:
 
 def of_camera(
     depsgraph: bpy.types.Depsgraph,
-    points: np.ndarray,  # [P, 3]
+    points: Callable[[], np.ndarray],  # [P, 3]
     camera: bpy.types.Object | None = None,
     border: bool = True,
 ) -> View:
@@ -45,7 +46,7 @@ def of_camera(
 
     Args:
         depsgraph: Its scene has the resolution, its percentage, the pixel aspect and the border.
-        points: Points around what is seen, Blender's world; read for orthographic cameras alone.
+        points: Gives points around what is seen, Blender's world; called for orthographic cameras alone.
         camera: The camera; the scene's active one where None.
         border: Whether a render border cuts the picture; else it is whole.
 
@@ -80,7 +81,7 @@ def of_camera(
 def of_region(
     region: bpy.types.Region,
     region_3d: bpy.types.RegionView3D,
-    points: np.ndarray,  # [P, 3]
+    points: Callable[[], np.ndarray],  # [P, 3]
     width: int = 0,
     height: int = 0,
 ) -> View:
@@ -89,7 +90,7 @@ def of_region(
     Args:
         region: Its window region.
         region_3d: How it looks.
-        points: Points around what is seen, Blender's world; read for orthographic views alone.
+        points: Gives points around what is seen, Blender's world; called for orthographic views alone.
         width: Width of the picture in pixels; the region's where 0.
         height: Its height; the region's where 0.
 
@@ -120,12 +121,14 @@ def border_of(scene: bpy.types.Scene) -> tuple[int, int, int, int]:
     return left, height - top, max(right - left, 1), max(top - bottom, 1)
 
 
-def _view(projection, matrix_world, width: int, height: int, points: np.ndarray, name: str, behind: bool) -> View:
-    world = np.array(matrix_world, np.float64)
-    forward = -world[:3, 2] / np.linalg.norm(world[:3, 2])
-    depths = (points - world[:3, 3]) @ forward if len(points) else np.array([0.0, 1.0])
-    span = (float(depths.min()), float(depths.max()))
-    camera, distance = cameras.from_projection(np.array(projection), world, width, height, span, name)
+def _view(projection, matrix_world, width: int, height: int, points: Callable, name: str, behind: bool) -> View:
+    p, world = np.array(projection, np.float64), np.array(matrix_world, np.float64)
+    span = (0.0, 1.0)
+    if cameras.is_parallel(p):
+        forward = -world[:3, 2] / np.linalg.norm(world[:3, 2])
+        depths = (points() - world[:3, 3]) @ forward
+        span = (float(depths.min()), float(depths.max())) if len(depths) else span
+    camera, distance = cameras.from_projection(p, world, width, height, span, name)
     # Behind an orthographic camera nothing is drawn, before or behind an orthographic view everything is.
     near = distance if distance and not behind else None
     return View(camera, distance, near)

@@ -4,6 +4,8 @@ A cloud of a scene is shown at A x for a point x of its bind state, A being its 
 own world, in which its light stands, is turned with its root; an instance of a collection turns both.
 """
 
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,35 +119,57 @@ def rows_of(obj: bpy.types.Object) -> list[tuple[int, int]]:
     return [(int(part[0]), len(part)) for part in np.split(rows, cuts) if len(part)]
 
 
-def points(found: tuple[Instance, ...]) -> np.ndarray:
-    """Corners of the boxes around visible clouds, Blender's world. [P, 3] float64"""
-    corners = [np.zeros((0, 3))]
-    for one in found:
-        box = np.array(one.object.bound_box, np.float64)
-        corners.append(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
-    return np.concatenate(corners)
+def points(found: tuple[Instance, ...]) -> Callable[[], np.ndarray]:
+    """A function that gives the corners of boxes around visible clouds, Blender's world. [P, 3] float64
+
+    It looks at every point, for which perspective views have no need. (Blender's own boxes are not up to date.)
+    """
+
+    def corners() -> np.ndarray:
+        boxes, result = {}, [np.zeros((0, 3))]
+        for one in found:
+            data = one.object.data
+            if data not in boxes:
+                boxes[data] = _box(data)
+            result.append(boxes[data] @ one.matrix[:3, :3].T + one.matrix[:3, 3])
+        return np.concatenate(result)
+
+    return corners
 
 
-def _clouds(depsgraph, space):
+def _box(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Corners of the box around a cloud. [8, 3]"""
+    positions = np.zeros(3 * len(cloud.points), np.float32)
+    if "position" in cloud.attributes:
+        cloud.attributes["position"].data.foreach_get("vector", positions)
+    if len(positions) == 0:
+        return np.zeros((0, 3))
+    ends = [(column.min(), column.max()) for column in positions.reshape(-1, 3).T]
+    return np.array(list(itertools.product(*ends)), np.float64)
+
+
+def _clouds(
+    depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None
+) -> Iterator[tuple[bpy.types.Object, np.ndarray, bpy.types.Object | None]]:
     """Visible clouds: object, matrix in Blender's world, and what makes an instance of it, or None."""
     instancing = False
     for obj in depsgraph.objects:
         instancing |= obj.instance_type == "COLLECTION" and obj.instance_collection is not None
-        original = obj.original
-        if original.r5dgs.role == "CLOUD" and obj.type == "POINTCLOUD" and _in_local_view(original, space):
-            yield original, np.array(obj.matrix_world, np.float64), None
+        if obj.original.r5dgs.role == "CLOUD" and obj.type == "POINTCLOUD" and _seen(obj.original, depsgraph, space):
+            yield obj.original, np.array(obj.matrix_world, np.float64), None
     if not instancing:  # going through instances is slow where ellipsoids stand for Gaussians
         return
     for instance in depsgraph.object_instances:
         if not instance.is_instance or instance.object.type != "POINTCLOUD":
             continue
         original, parent = instance.object.original, instance.parent.original
-        if original.r5dgs.role == "CLOUD" and original != parent and _in_local_view(parent, space):
+        if original.r5dgs.role == "CLOUD" and original != parent and _seen(parent, depsgraph, space):
             yield original, np.array(instance.matrix_world, np.float64), parent
 
 
-def _in_local_view(obj: bpy.types.Object, space: bpy.types.SpaceView3D | None) -> bool:
-    return space is None or space.local_view is None or obj.local_view_get(space)
+def _seen(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None) -> bool:
+    """Whether a viewport shows an object: the depsgraph of one knows neither local views nor collections' eyes."""
+    return depsgraph.mode == "RENDER" or obj.visible_get(view_layer=depsgraph.view_layer, viewport=space)
 
 
 def _homes() -> dict[bpy.types.Object, bpy.types.Collection]:

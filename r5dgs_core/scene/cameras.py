@@ -87,7 +87,7 @@ def from_projection(
     p = np.asarray(projection, np.float64)
     T_cam_world = opengl_to_cam_world(matrix_world)
     intrinsics = np.eye(3)
-    if abs(p[3, 3]) < 0.5:  # perspective: clip w is -z, not 1
+    if not is_parallel(p):
         intrinsics[0] = 0.5 * width * p[0, 0], 0.0, 0.5 * width * (1 - p[0, 2])
         intrinsics[1] = 0.0, 0.5 * height * p[1, 1], 0.5 * height * (1 + p[1, 2])
         return Camera(width, height, intrinsics, T_cam_world, name), 0.0
@@ -97,6 +97,11 @@ def from_projection(
     intrinsics[1] = 0.0, 0.5 * height * p[1, 1] * away, 0.5 * height * (1 - p[1, 3])
     T_cam_world[2, 3] += away - middle
     return Camera(width, height, intrinsics, T_cam_world, name), away - middle
+
+
+def is_parallel(projection: np.ndarray) -> bool:
+    """Whether an OpenGL projection is parallel: clip w is 1 and not the depth. [4, 4]"""
+    return bool(abs(projection[3, 3]) > 0.5)
 
 
 def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
