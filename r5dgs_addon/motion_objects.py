@@ -184,6 +184,7 @@ class Replacement:
         times: The target's times.
         location: Where the target is while no curve says otherwise. [3]
         quat: How it is turned then, unit wxyz. [4]
+        turn: How it is turned against the source in its own frame, unit wxyz. [4]
         curves: Its curves by path and component.
     """
 
@@ -192,6 +193,7 @@ class Replacement:
     times: timeline.Times
     location: np.ndarray
     quat: np.ndarray
+    turn: np.ndarray
     curves: dict[tuple[str, int], Curve]
 
 
@@ -239,7 +241,7 @@ def replacement(target: bpy.types.Object, source: bpy.types.Object, frame: float
         ]
         parts = parts if np.allclose(turn, [1, 0, 0, 0], atol=1e-7) else _mixed(source.name, parts, mix)
         written.update({("rotation_quaternion", index): part for index, part in enumerate(parts)})
-    return Replacement(target, source, times, location, rotations.normalize(quat), written)
+    return Replacement(target, source, times, location, rotations.normalize(quat), turn, written)
 
 
 def replace(plan: Replacement) -> None:
@@ -252,7 +254,7 @@ def replace(plan: Replacement) -> None:
         owned = compat.own_fcurves(target, target.name)
         for (path, index), part in plan.curves.items():
             _write(owned.new(path, index=index), part)
-    motion_physics.copy(plan.source, target)
+    motion_physics.take(plan.source, target, plan.turn)
     motion_physics.sign(target, plan.times)
     motion_confidence.refresh(target, plan.times)
 

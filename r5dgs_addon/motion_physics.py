@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
 
-from ..r5dgs_core.motion import confidence, models, top
+from ..r5dgs_core.motion import confidence, models, rotations, top
 from ..r5dgs_core.motion.models import MotionModel
 from ..r5dgs_core.scene import posing
 from ..r5dgs_core.scene.scene import Scene
@@ -81,6 +81,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     """The motion of an anchor past the last observed time."""
 
     learned: StringProperty(name="Learned Motion", description="The motion of the scene file, as JSON", options=set())
+    taken: StringProperty(name="Taken Motion", description="That of the object it was taken from", options={"HIDDEN"})
     written: StringProperty(name="Written Keys", description="Digest of the keys written last", options={"HIDDEN"})
     frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
     kind: EnumProperty(name="Motion", description="How the object moves on", items=KINDS, options=set())
@@ -212,30 +213,43 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     state.stored_frequency = model.frequency
 
 
-def copy(source: bpy.types.Object, target: bpy.types.Object) -> None:
-    """Give an anchor the motion of another that follows nobody; what it learned itself stays remembered."""
+def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
+    """Give an anchor the motion of another that follows nobody; what it learned itself stays remembered.
+
+    Args:
+        source: The anchor that has the motion.
+        target: The anchor that gets it.
+        turn: How the target is turned against the source in its own frame, unit wxyz. [4]
+    """
     giver, taker = source.r5dgs_motion, target.r5dgs_motion
-    taker.kind = giver.kind
+    base = basis(giver)
+    if base.inertia is not None:  # that of the source in the world, seen from the target
+        back = rotations.quats_to_rotmats(rotations.conjugate(turn))
+        base = replace(base, inertia=back @ base.inertia @ back.T)
+    taker.taken = json.dumps(base.to_dict())
+    taker.kind, taker.leader = giver.kind, None
     for name in (*RATES, "frequency"):
         setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
-    taker.leader = None
 
 
 def reset(anchor: bpy.types.Object) -> None:
     """Bring the fields of an anchor back to the learned motion."""
     state = anchor.r5dgs_motion
-    show(state, learned(state))
+    state.taken = ""
+    show(state, basis(state))
     state.leader = state.learned_leader
 
 
-def learned(state: bpy.types.PropertyGroup) -> MotionModel:
-    """The motion that the scene file gave; static where there was none."""
+def basis(state: bpy.types.PropertyGroup) -> MotionModel:
+    """What the fields were set to before anybody edited them: the motion of the scene file, or one that was taken."""
+    if state.taken:
+        return MotionModel.from_dict(json.loads(state.taken))
     return MotionModel.from_dict(json.loads(state.learned)["model"]) if state.learned else models.STATIC
 
 
 def edited(state: bpy.types.PropertyGroup) -> set[str]:
-    """Fields of the motion that differ from the learned one."""
-    model = learned(state)
+    """Fields of the motion that differ from its `basis`."""
+    model = basis(state)
     stored = {name: np.array(getattr(state, f"stored_{name}"), np.float32) for name in (*RATES, "frequency")}
     found = {name for name, value in stored.items() if (value != np.float32(getattr(model, name))).any()}
     return found | ({"kind"} if state.kind != model.kind else set())
@@ -249,7 +263,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     the others.
     """
     state = anchor.r5dgs_motion
-    base, changed = learned(state), edited(state)
+    base, changed = basis(state), edited(state)
     values = {name: np.array(getattr(state, f"stored_{name}"), np.float64) for name in RATES if name in changed}
     if "frequency" in changed:
         values["frequency"] = state.stored_frequency

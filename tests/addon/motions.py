@@ -1,0 +1,81 @@
+"""Loaded scenes for tests of motion: where their points are, what their curves hold."""
+
+import importlib
+
+import numpy as np
+
+from r5dgs_core.scene import cameras, playback
+
+POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
+
+
+def addon(name):
+    """A module of the add-on."""
+    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+
+
+def load(bpy, path, **options):
+    """Load a scene file; its collection."""
+    before = set(bpy.data.collections)
+    assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
+    return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
+
+
+def choose(bpy, *objects):
+    """Select objects, the last one active."""
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
+    for obj in objects:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = objects[-1]
+
+
+def go_to(bpy, collection, t):
+    """Set the frame of a scene time."""
+    frame = collection.r5dgs.frame_zero + t * collection.r5dgs.frames_per_unit
+    bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
+
+
+def matrix(bpy, obj):
+    """Where an object is in the world. [4, 4]"""
+    return np.array(obj.evaluated_get(bpy.context.evaluated_depsgraph_get()).matrix_world, np.float64)
+
+
+def points(bpy, cloud):
+    """Where the points of a cloud are in the world. [n, 3]"""
+    evaluated = cloud.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    local = np.empty(3 * len(evaluated.data.points), np.float32)
+    evaluated.data.attributes["position"].data.foreach_get("vector", local)
+    world = np.array(evaluated.matrix_world, np.float64)
+    return local.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+
+
+def assert_plays_like_the_core(bpy, collection, scene, times):
+    """Every point of a loaded scene lies where playback has it."""
+    world = cameras.WORLD_TO_BLENDER[scene.world_convention]
+    clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]
+    for t in times:
+        go_to(bpy, collection, t)
+        expected = playback.frame(scene, t).means.astype(np.float64) @ world.T
+        for cloud in clouds:
+            rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
+            worst = np.linalg.norm(points(bpy, cloud) - expected[rows], axis=-1).max()
+            assert worst <= POSITION_TOLERANCE * scene.extent, f"{cloud.name}, t = {t}"
+
+
+def curves(anchor):
+    """F-curves by path and component."""
+    return {(curve.data_path, curve.array_index): curve for curve in addon("compat").fcurves(anchor)}
+
+
+def keys(anchor, until=np.inf):
+    """All that is stored of an anchor's keys up to a frame, by path and component, and the left side of the last."""
+    found = {}
+    for name, curve in curves(anchor).items():
+        rows = [point for point in curve.keyframe_points if point.co[0] <= until + 1e-3]
+        found[name] = [
+            (tuple(p.co), tuple(p.handle_left), p.type)
+            + ((tuple(p.handle_right), p.interpolation) if p is not rows[-1] else ())
+            for p in rows
+        ]
+    return found

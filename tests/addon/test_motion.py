@@ -1,0 +1,413 @@
+"""Motion that was edited as physics is written past t_max, and nothing else is touched."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.scene import playback, scene_file
+from tests import scenes
+from tests.addon import motions
+
+T_MAX = scenes.T_MAX
+LAST = 1 + 60 * T_MAX  # frame of t_max
+TIMES = (0.0, 0.3334, 0.7499, T_MAX, 0.7507, 0.9111, 1.0)
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
+
+
+@pytest.fixture
+def loaded(blender, scene_path):
+    return motions.load(blender, scene_path)
+
+
+@pytest.fixture
+def mug(blender, loaded):
+    anchor = blender.data.objects["mug anchor"]
+    motions.choose(blender, anchor)
+    return anchor
+
+
+def per_second(bpy, value, power=1):
+    """A rate per unit of scene time in Blender's units."""
+    return value * (bpy.context.scene.render.fps / 60.0) ** power
+
+
+def test_fields_show_the_learned_motion_per_second_of_blenders_time(blender, scene_path, mug):
+    model = scene_file.read(scene_path).groups[1].model
+    state = mug.r5dgs_motion
+    for fps in (24, 30):
+        blender.context.scene.render.fps = fps
+        assert state.kind == "ballistic_spin"
+        np.testing.assert_allclose(state.velocity, model.velocity * fps / 60, rtol=1e-6)
+        np.testing.assert_allclose(state.acceleration, model.acceleration * (fps / 60) ** 2, rtol=1e-6)
+        np.testing.assert_allclose(state.angular_velocity, model.angular_velocity * fps / 60, rtol=1e-6)
+        np.testing.assert_allclose(state.angular_acceleration, model.angular_acceleration * (fps / 60) ** 2, rtol=1e-6)
+    assert not motions.addon("motion_physics").edited(state)
+
+
+def test_a_motion_that_was_not_edited_is_written_as_it_was_learned(blender, scene_path, loaded):
+    anchors = [obj for obj in loaded.all_objects if obj.r5dgs.role == "ANCHOR"]
+    motions.choose(blender, *anchors)
+    before = {anchor.name: motions.keys(anchor) for anchor in anchors}
+    for _ in range(2):
+        assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    for anchor in anchors:
+        after = motions.keys(anchor)
+        assert after.keys() == before[anchor.name].keys()
+        for name, rows in after.items():  # what was one cubic across t_max now has a key there
+            assert 0 <= len(rows) - len(before[anchor.name][name]) <= 1
+    motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
+
+
+def test_an_edited_velocity_moves_that_far_and_leaves_the_observed_keys_to_the_bit(blender, loaded, mug):
+    before = motions.keys(mug, LAST)
+    state = mug.r5dgs_motion
+    state.kind, state.frequency = "translation", 0.0
+    state.velocity, state.acceleration = (per_second(blender, 1.0), 0.0, 0.0), (0.0, 0.0, 0.0)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    assert motions.keys(mug, LAST) == before
+    motions.go_to(blender, loaded, T_MAX)
+    start = motions.matrix(blender, mug)
+    for frames in (0.5, 6.0, 15.0):  # 60 frames are a unit of time, in which it moves by one
+        motions.go_to(blender, loaded, T_MAX + frames / 60)
+        moved = motions.matrix(blender, mug)
+        np.testing.assert_allclose(moved[:3, 3] - start[:3, 3], [frames / 60, 0, 0], atol=2e-6)
+        np.testing.assert_allclose(moved[:3, :3], start[:3, :3], atol=1e-6)
+
+
+def test_the_motion_is_continuous_at_t_max(blender, loaded, mug):
+    mug.r5dgs_motion.velocity = (3.0, -2.0, 1.0)
+    mug.r5dgs_motion.angular_velocity = (0.0, 4.0, 0.0)
+    blender.ops.r5dgs.re_extrapolate()
+    step = 1e-3
+    around = []
+    for t in (T_MAX - step / 60, T_MAX, T_MAX + step / 60):
+        motions.go_to(blender, loaded, t)
+        around.append(motions.matrix(blender, mug))
+    for side in (around[0], around[2]):
+        assert np.abs(side - around[1]).max() < 30 * step / 60
+
+
+@pytest.mark.parametrize("kind", models.KINDS)
+def test_any_kind_of_motion_can_be_given_to_what_stood_still(blender, loaded, kind):
+    anchor = blender.data.objects["wooden block anchor"]
+    motions.choose(blender, anchor)
+    state = anchor.r5dgs_motion
+    assert state.kind == "static" and not motions.curves(anchor)
+    rates = {
+        "velocity": [0.4, 0.0, 0.8],
+        "acceleration": [0.0, 0.0, -2.0],
+        "angular_velocity": [0.5, 2.0, -1.0],
+        "angular_acceleration": [0.0, 0.3, 0.0],
+        "center_offset": [0.1, 0.0, 0.2],
+    }
+    factor = blender.context.scene.render.fps / 60
+    powers = {"acceleration": 2, "angular_acceleration": 2, "center_offset": 0}
+    state.kind = kind
+    for name, value in rates.items():
+        setattr(state, name, np.array(value) * factor ** powers.get(name, 1))
+    blender.ops.r5dgs.re_extrapolate()
+    inertia = motions.addon("motion_physics").inertia(anchor) if kind == "free_top" else None
+    model = models.MotionModel(kind, **rates, inertia=inertia)
+    pivot = np.array(anchor.r5dgs.pivot)
+    for t in (0.2, T_MAX, 0.8, 0.95):
+        motions.go_to(blender, loaded, t)
+        quat, displacement = models.evaluate(model, max(t - T_MAX, 0.0))
+        found = motions.matrix(blender, anchor)
+        np.testing.assert_allclose(found[:3, 3], pivot + displacement, atol=3e-5)
+        np.testing.assert_allclose(found[:3, :3], rotations.quats_to_rotmats(quat), atol=1e-4)
+    assert bool(motions.curves(anchor)) == (kind != "static")
+
+
+def test_no_scene_file_is_needed(blender, scene_path, tmp_path):
+    motions.load(blender, scene_path)
+    blend = tmp_path / "saved.blend"
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    scene = scene_file.read(scene_path)
+    scene_path.unlink()
+    blender.ops.wm.read_homefile(app_template="")
+    blender.ops.wm.open_mainfile(filepath=str(blend))
+    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    anchor = blender.data.objects["toy car anchor"]
+    motions.choose(blender, anchor)
+    anchor.r5dgs_motion.velocity = (5.0, 0.0, 0.0)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    motions.go_to(blender, collection, 0.9)
+    assert np.linalg.norm(motions.matrix(blender, anchor)[:3, 3] - scene.groups[3].pivot) > 0.5
+    assert blender.ops.r5dgs.extrapolate_until(t_end=1.25) == {"FINISHED"}
+    assert blender.ops.r5dgs.reset_motion() == {"FINISHED"}
+    motions.assert_plays_like_the_core(blender, collection, scene, (*TIMES, 1.2))
+
+
+def test_it_starts_from_where_the_user_brought_the_object(blender, loaded, mug):
+    """Keys before t_max that were moved, turned and added, and other channels, stay as they are."""
+    turn = rotations.rotvecs_to_quats(np.array([0.0, 0.0, math.pi / 2]))
+    for (path, index), curve in motions.curves(mug).items():
+        for point in curve.keyframe_points:
+            if path == "location":
+                point.co_ui = (point.co[0], point.co[1] + (0.5, -0.25, 0.125)[index])
+            elif abs(point.co[0] - LAST) < 1e-3:
+                point.co_ui = (point.co[0], turn[index])
+    mug.scale = (2.0, 1.0, 1.0)
+    mug.keyframe_insert("scale", frame=20)
+    mug.scale = (1.0, 1.0, 1.0)
+    mug.keyframe_insert("scale", frame=60)
+    before = motions.keys(mug, LAST)
+    scales = {name: rows for name, rows in motions.keys(mug).items() if name[0] == "scale"}
+    motions.go_to(blender, loaded, T_MAX)
+    start = motions.matrix(blender, mug)
+    state = mug.r5dgs_motion
+    state.kind, state.velocity, state.angular_velocity = "constant_twist", (0, 0, 0), (0, 0, per_second(blender, 2.0))
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    after = motions.keys(mug, LAST)
+    for name in before:
+        if name[0] != "scale":
+            assert after[name] == before[name]
+    assert {name: rows for name, rows in motions.keys(mug).items() if name[0] == "scale"} == scales
+    motions.go_to(blender, loaded, T_MAX + 0.2)
+    moved = motions.matrix(blender, mug)
+    np.testing.assert_allclose(moved[:3, 3], start[:3, 3], atol=1e-5)  # about its own place
+    spin = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(np.array([0, 0, 0.4])))
+    directions = start[:3, :3] / np.linalg.norm(start[:3, :3], axis=0)
+    found = moved[:3, :3] / np.linalg.norm(moved[:3, :3], axis=0)
+    np.testing.assert_allclose(found, spin @ directions, atol=1e-4)
+
+
+@pytest.mark.parametrize("handles", ["FREE", "AUTO", "AUTO_CLAMPED", "VECTOR", "ALIGNED"])
+def test_handles_of_any_type_before_t_max_stay_where_they_are(blender, mug, handles):
+    for curve in motions.curves(mug).values():
+        for point in curve.keyframe_points:
+            point.handle_left_type = point.handle_right_type = handles
+        curve.update()
+    before = motions.keys(mug, LAST)
+    mug.r5dgs_motion.velocity = (9.0, 9.0, 9.0)
+    blender.ops.r5dgs.re_extrapolate()
+    assert motions.keys(mug, LAST) == before
+
+
+@pytest.mark.parametrize("interpolation", ["BEZIER", "LINEAR", "CONSTANT"])
+def test_a_curve_without_a_key_at_t_max_is_cut_there_and_keeps_its_shape(blender, loaded, mug, interpolation):
+    for curve in motions.curves(mug).values():
+        at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
+        curve.keyframe_points.remove(curve.keyframe_points[at])
+        for point in curve.keyframe_points:
+            point.interpolation = interpolation
+        curve.update()
+    frames = np.linspace(1, LAST, 40)
+    before = {name: [curve.evaluate(f) for f in frames] for name, curve in motions.curves(mug).items()}
+    mug.r5dgs_motion.velocity = (1.0, 2.0, 3.0)
+    blender.ops.r5dgs.re_extrapolate()
+    for name, curve in motions.curves(mug).items():
+        np.testing.assert_allclose([curve.evaluate(f) for f in frames], before[name], atol=2e-6)
+        assert any(abs(point.co[0] - LAST) < 1e-3 for point in curve.keyframe_points)
+
+
+def test_what_cannot_be_cut_is_refused_and_nothing_changes(blender, mug):
+    for curve in motions.curves(mug).values():
+        at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
+        curve.keyframe_points.remove(curve.keyframe_points[at])
+        for point in curve.keyframe_points:
+            point.interpolation = "ELASTIC"
+    before = motions.keys(mug)
+    with pytest.raises(RuntimeError, match="set a key at frame 46"):
+        blender.ops.r5dgs.re_extrapolate()
+    assert motions.keys(mug) == before
+
+
+def test_another_rotation_mode_is_refused_by_name(blender, mug):
+    mug.rotation_mode = "XYZ"
+    with pytest.raises(RuntimeError, match=r"mug anchor.*Quaternion"):
+        blender.ops.r5dgs.re_extrapolate()
+
+
+def test_a_shadow_follows_its_caster_again(blender, loaded, mug):
+    shadow = blender.data.objects["mug shadow anchor"]
+    assert shadow.r5dgs_motion.leader == mug
+    follow = np.diag([1.0, 1.0, 0.0])
+    follow[0, 2] = 0.3
+    state = mug.r5dgs_motion
+    state.kind, state.velocity, state.acceleration = "translation", (1.0, -2.0, 3.0), (0, 0, 0)
+    blender.ops.r5dgs.re_extrapolate()
+    places = {}
+    for t in (T_MAX, 0.9):
+        motions.go_to(blender, loaded, t)
+        places[t] = [motions.matrix(blender, obj)[:3, 3] for obj in (mug, shadow)]
+    moved, dragged = (places[0.9][k] - places[T_MAX][k] for k in (0, 1))
+    assert np.linalg.norm(moved) > 0.1
+    np.testing.assert_allclose(dragged, follow @ moved, atol=1e-5)
+
+
+def push_down(bpy, anchor):
+    """What *Push Down* does: the action becomes a strip of the NLA."""
+    action = anchor.animation_data.action
+    slot = getattr(anchor.animation_data, "action_slot", None)
+    track = anchor.animation_data.nla_tracks.new()
+    strip = track.strips.new(action.name, int(action.frame_range[0]), action)
+    if slot is not None:
+        strip.action_slot = slot
+    anchor.animation_data.action = None
+    return strip
+
+
+def test_an_action_in_the_nla_is_written_where_it_lies(blender, loaded, mug):
+    strip = push_down(blender, mug)
+    strip.frame_start, strip.frame_end = strip.frame_start + 0, strip.frame_end + 0
+    state = mug.r5dgs_motion
+    state.kind, state.velocity, state.acceleration = "translation", (per_second(blender, 1.0), 0, 0), (0, 0, 0)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    assert blender.ops.r5dgs.extrapolate_until(t_end=1.5) == {"FINISHED"}
+    assert mug.animation_data.action is None
+    motions.go_to(blender, loaded, T_MAX)
+    start = motions.matrix(blender, mug)[:3, 3]
+    motions.go_to(blender, loaded, 1.45)
+    np.testing.assert_allclose(motions.matrix(blender, mug)[:3, 3] - start, [0.7, 0, 0], atol=1e-5)
+
+
+def test_a_scaled_strip_of_the_nla_is_refused(blender, loaded, mug):
+    strip = push_down(blender, mug)
+    strip.scale = 2.0
+    with pytest.raises(RuntimeError, match="NLA"):
+        blender.ops.r5dgs.re_extrapolate()
+
+
+def test_an_action_that_two_anchors_play_is_made_single_before_it_is_written(blender, loaded, mug):
+    other = mug.copy()
+    loaded.objects.link(other)
+    motions.choose(blender, mug)
+    assert other.animation_data.action == mug.animation_data.action
+    before = motions.keys(other)
+    mug.r5dgs_motion.velocity = (4.0, 0.0, 0.0)
+    blender.ops.r5dgs.re_extrapolate()
+    assert other.animation_data.action != mug.animation_data.action
+    assert motions.keys(other) == before
+
+
+def test_reset_brings_the_learned_motion_back(blender, scene_path, loaded, mug):
+    state = mug.r5dgs_motion
+    state.kind, state.velocity = "constant_twist", (4.0, 5.0, 6.0)
+    blender.ops.r5dgs.re_extrapolate()
+    assert blender.ops.r5dgs.reset_motion() == {"FINISHED"}
+    assert state.kind == "ballistic_spin" and not motions.addon("motion_physics").edited(state)
+    motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
+
+
+def test_reset_reads_observed_keys_from_the_file_when_asked_to(blender, scene_path, loaded, mug):
+    mug.scale = (2.0, 2.0, 2.0)
+    mug.keyframe_insert("scale", frame=20)
+    mug.scale = (1.0, 1.0, 1.0)
+    for (path, _), curve in motions.curves(mug).items():
+        if path == "location":
+            for point in curve.keyframe_points:
+                point.co_ui = (point.co[0], point.co[1] + 1.0)
+    blender.ops.r5dgs.reset_motion()
+    motions.go_to(blender, loaded, 0.3)
+    pivot = scene_file.read(scene_path).groups[1].pivot
+    assert np.linalg.norm(motions.matrix(blender, mug)[:3, 3] - pivot) > 1
+    assert blender.ops.r5dgs.reset_motion(observed=True) == {"FINISHED"}
+    assert len(motions.curves(mug)["scale", 0].keyframe_points) == 1
+    for curve in [curve for name, curve in motions.curves(mug).items() if name[0] == "scale"]:
+        motions.addon("compat").fcurves(mug).remove(curve)
+    mug.scale = (1.0, 1.0, 1.0)
+    motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
+
+
+def test_reset_from_a_file_that_is_gone_says_so_and_changes_nothing(blender, scene_path, loaded, mug):
+    scene_path.unlink()
+    before = motions.keys(mug)
+    with pytest.raises(RuntimeError, match="synthetic.r5dgs"):
+        blender.ops.r5dgs.reset_motion(observed=True)
+    assert motions.keys(mug) == before
+
+
+@pytest.mark.parametrize("t_end", [1.7, 0.85, T_MAX, 0.2])
+def test_the_future_is_extended_and_shortened(blender, scene_path, loaded, t_end):
+    scene = scene_file.read(scene_path)
+    assert blender.ops.r5dgs.extrapolate_until(t_end=t_end) == {"FINISHED"}
+    end = max(t_end, T_MAX)
+    assert loaded.r5dgs.t_end == pytest.approx(end)
+    assert blender.context.scene.frame_end == math.ceil(1 + 60 * end - 1e-4)
+    last = max(p.co[0] for a in loaded.all_objects for c in motions.curves(a).values() for p in c.keyframe_points)
+    assert last == pytest.approx(1 + 60 * end, abs=1e-3)
+    motions.assert_plays_like_the_core(blender, loaded, scene, (*(t for t in TIMES if t <= end), end))
+
+
+def test_a_later_end_obeys_edited_physics_and_leaves_keys_edited_by_hand(blender, loaded, mug, capfd):
+    car = blender.data.objects["toy car anchor"]
+    curve = motions.curves(car)["location", 1]
+    curve.keyframe_points[-1].co_ui = (curve.keyframe_points[-1].co[0], 7.0)
+    by_hand = motions.keys(car)
+    state = mug.r5dgs_motion
+    state.kind, state.velocity, state.acceleration = "translation", (0, 0, per_second(blender, 2.0)), (0, 0, 0)
+    assert blender.ops.r5dgs.extrapolate_until(t_end=1.5) == {"FINISHED"}
+    assert "toy car anchor" in capfd.readouterr().out
+    assert motions.keys(car) == by_hand
+    places = []
+    for t in (T_MAX, 1.5):
+        motions.go_to(blender, loaded, t)
+        places.append(motions.matrix(blender, mug)[:3, 3])
+    np.testing.assert_allclose(places[1] - places[0], [0, 0, 1.5], atol=1e-5)
+
+
+def snapshot(bpy):
+    """What an undo has to bring back."""
+    names = {kind: sorted(d.name for d in getattr(bpy.data, kind)) for kind in ("objects", "collections", "actions")}
+    places = {}
+    for frame in (1, 30, 55):
+        bpy.context.scene.frame_set(frame)
+        for obj in bpy.data.objects:
+            places[obj.name, frame] = np.round(motions.matrix(bpy, obj), 5).tolist()
+    return names, places
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        lambda ops: ops.re_extrapolate(),
+        lambda ops: ops.reset_motion(),
+        lambda ops: ops.reset_motion(observed=True),
+        lambda ops: ops.extrapolate_until(t_end=1.6),
+        lambda ops: ops.replace_motion(),
+        lambda ops: ops.duplicate_object(),
+        lambda ops: ops.delete_object(),
+        lambda ops: ops.show_confidence(),
+    ],
+)
+def test_every_action_can_be_undone_and_redone(blender, loaded, action):
+    anchors = [blender.data.objects[f"{name} anchor"] for name in ("toy car", "mug")]
+    anchors[1].r5dgs_motion.velocity = (1.0, 2.0, 3.0)
+    motions.choose(blender, *anchors)
+    blender.ops.ed.undo_push(message="before")
+    before = snapshot(blender)
+    blender.ops.ed.undo_push(message="before")
+    assert action(blender.ops.r5dgs) == {"FINISHED"}
+    after = snapshot(blender)
+    blender.ops.ed.undo_push(message="action")  # the window does this after an operator of the user
+    blender.ops.ed.undo()
+    assert snapshot(blender) == before
+    blender.ops.ed.redo()
+    assert snapshot(blender) == after
+
+
+def test_without_a_chosen_object_the_actions_say_what_to_do(blender, loaded):
+    motions.choose(blender, loaded.r5dgs.root)
+    for name in ("re_extrapolate", "reset_motion", "replace_motion", "duplicate_object", "delete_object"):
+        with pytest.raises(RuntimeError, match=r"[Ss]elect"):
+            getattr(blender.ops.r5dgs, name)()
+
+
+def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
+    scene = scenes.make_scene(n=300, objects=3)
+    shift = np.array([40.0, -25.0, 3.0])
+    groups = tuple(dataclasses.replace(g, pivot=g.pivot + shift) for g in scene.groups)
+    far = dataclasses.replace(scene, means=(scene.means + shift).astype(np.float32), groups=groups)
+    path = scene_file.write(far, tmp_path / "far.r5dgs")
+    collection = motions.load(blender, path)
+    blender.ops.r5dgs.extrapolate_until(t_end=1.3)
+    motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (*TIMES, 1.3))
+    assert playback.frame(far, 1.3).means.shape == (300, 3)
