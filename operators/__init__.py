@@ -10,6 +10,7 @@ from . import (
     duplicate_object,
     exact_mode,
     export_ply,
+    export_scene,
     extrapolate_until,
     isolate,
     live_preview,
@@ -55,6 +56,7 @@ MODULES = (
     use_engine,
     check_worker,
     export_ply,
+    export_scene,
     capture_dataset,
 )
 
@@ -65,6 +67,7 @@ def _menu_import(menu, context):
 
 def _menu_export(menu, context):
     menu.layout.operator(export_ply.R5DGS_OT_export_ply.bl_idname, text="R5DGS Gaussians (.ply)")
+    menu.layout.operator(export_scene.R5DGS_OT_export_scene.bl_idname, text="R5DGS Edited Scene (.r5dgs)")
     menu.layout.operator(capture_dataset.R5DGS_OT_capture_dataset.bl_idname, text="R5DGS Training Data Set")
 
 

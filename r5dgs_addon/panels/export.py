@@ -6,6 +6,7 @@ from . import sidebar
 
 ENTRIES = (
     ("r5dgs.export_ply", "Gaussians (.ply)", "POINTCLOUD_DATA"),
+    ("r5dgs.export_scene", "Edited Scene (.r5dgs)", "FILE_TICK"),
 )  # fmt: skip
 
 

@@ -27,6 +27,8 @@ JSON_MEMBER = "scene.json"
 
 # Fixed point: stored int16 i stands for i / scale.
 FIXED_POINT = {"quats": 32767.0, "residual_quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
+_QUATS = ("quats", "residual_quats")
+_READ_BEFORE = 1e-7  # float32 rounding of what was read
 _HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
 _MEMORY_DTYPES: dict[str, type] = {
     "means": np.float32,
@@ -207,7 +209,7 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 def _encode(name: str, array: np.ndarray) -> np.ndarray:
     """Compact form of a member, or the member itself where the compact one cannot hold it."""
     if name in FIXED_POINT:
-        scaled = np.rint(array.astype(np.float64) * FIXED_POINT[name])
+        scaled = _whole_units(array) if name in _QUATS else np.rint(array.astype(np.float64) * FIXED_POINT[name])
         fits = len(array) == 0 or np.abs(scaled).max() <= 32767
         return scaled.astype("<i2") if fits else array
     if name in _HALF and (array.size == 0 or np.abs(array).max() < 6e4):
@@ -215,10 +217,25 @@ def _encode(name: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
+def _whole_units(quats: np.ndarray) -> np.ndarray:
+    """Quaternions as whole numbers; those that they were read from, where they were.
+
+    Reading normalises, so that the stored ones may be longer or shorter by their rounding, and others a step beside
+    them would be written for what was read.
+    """
+    wide, unit = quats.astype(np.float64), FIXED_POINT["quats"]
+    result = np.rint(wide * unit)
+    for radius in (unit - 0.75, unit + 0.75):
+        other = np.clip(np.rint(wide * radius), -unit, unit)
+        missed = np.abs(other / np.linalg.norm(other, axis=-1, keepdims=True) - wide).max(-1, keepdims=True)
+        result = np.where(missed <= _READ_BEFORE, other, result)
+    return result
+
+
 def _decode(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype == np.int16:
         values = array.astype(np.float64) / FIXED_POINT[name]
-        if name in ("quats", "residual_quats"):
+        if name in _QUATS:
             norms = np.linalg.norm(values, axis=-1, keepdims=True)
             values = np.divide(values, norms, out=values, where=np.abs(norms - 1) < 1e-3)
         return values.astype(np.float32)

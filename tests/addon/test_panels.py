@@ -46,7 +46,7 @@ def test_with_a_scene_the_sidebar_says_what_is_loaded_and_whether_now_is_the_fut
 def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar, scene_path):
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     blender.ops.r5dgs.select_by_prompt(text="cup")
-    assert {"mug", "0.97"} <= set(sidebar())
+    assert {"mug", "0.97  alias 'cup'"} <= set(sidebar())
     blender.ops.r5dgs.select_by_prompt(text="submarine")
     assert "Nothing matches 'submarine'" in sidebar()
 
@@ -60,7 +60,7 @@ def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, s
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
-    exports = ["r5dgs.export_ply", "r5dgs.capture_dataset"]
+    exports = ["r5dgs.export_ply", "r5dgs.export_scene", "r5dgs.capture_dataset"]
     for menu, operators in (("import", ["r5dgs.load_scene"]), ("export", exports)):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs
         ours = [function for function in functions if function.__module__.startswith("r5dgs.")]

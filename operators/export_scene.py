@@ -1,0 +1,54 @@
+"""Save Edited Scene: a loaded scene with its edits as a new .r5dgs file."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, StringProperty
+
+from ..r5dgs_addon import export_running, export_scene, objects, picture
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_export_scene(export_running.Exporter, bpy.types.Operator):
+    """Write the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
+
+    bl_idname = "r5dgs.export_scene"
+    bl_label = "Save Edited Scene"
+    bl_options = {"REGISTER", "PRESET"}
+
+    filepath: StringProperty(name="File", description="The new .r5dgs file", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filter_glob: StringProperty(default="*.r5dgs", options={"HIDDEN"})
+    check_existing: BoolProperty(default=True, options={"HIDDEN"})
+    exact: BoolProperty(
+        name="Full Precision",
+        description="Store all numbers as they are, in a file about twice as large",
+        default=False,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+    def suggest(self, context):
+        if not self.filepath:
+            try:
+                source = picture.scene_path(objects.active_collection(context))
+                self.filepath = str(source.with_name(f"{source.stem}_edited.r5dgs"))
+            except errors.R5dgsError:
+                self.filepath = "edited.r5dgs"
+        return False
+
+    def steps(self, context):
+        path = Path(bpy.path.abspath(self.filepath))
+        return export_scene.steps(
+            context,
+            objects.active_collection(context),
+            path if path.suffix.lower() == ".r5dgs" else path.with_name(path.name + ".r5dgs"),
+            exact=self.exact,
+        )
+
+
+CLASSES = (R5DGS_OT_export_scene,)
