@@ -32,11 +32,17 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
             self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
 
     def render(self, depsgraph):
-        """Render a view layer; called for every frame, in a thread of its own where there is a window."""
+        """Render a view layer; called for every frame, in a thread of its own where there is a window.
+
+        An error that is reported ends the render, and nothing is written; without, a black picture would be saved.
+        """
         try:
             self._render(depsgraph)
         except errors.R5dgsError as error:
-            self.error_set(f"R5DGS: {error}")
+            self.report({"ERROR"}, f"R5DGS: {error}")
+        except Exception as error:
+            self.report({"ERROR"}, f"R5DGS: {type(error).__name__}: {error}; the console has more")
+            raise
 
     def view_update(self, context, depsgraph):
         """Nothing to do: `view_draw`, which follows, sees by itself what has changed."""

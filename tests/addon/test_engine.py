@@ -1,0 +1,289 @@
+"""The engine R5DGS renders the core's own pictures, with the passes, films and borders that Blender asks for."""
+
+import importlib
+import os
+import signal
+import types
+
+import numpy as np
+import pytest
+
+from r5dgs_core.data import images
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import cameras, playback, scene_file
+from tests import scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+from mathutils import Matrix  # noqa: E402  (bpy brings it)
+
+NOTHING = 1e10
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return scenes.make_scene(n=400, objects=3, sh_degree=2, seed=4, world_convention="colmap")
+
+
+@pytest.fixture
+def loaded(blender, scene, tmp_path, monkeypatch):
+    """The scene as Blender renders it: engine, its first camera, multilayer EXR."""
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
+    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    camera = scene.cameras[0]
+    data = blender.data.cameras.new("view")
+    data.sensor_fit, data.lens = "HORIZONTAL", camera.intrinsics[0, 0] * data.sensor_width / camera.width
+    view = blender.data.objects.new("view", data)
+    blender.context.scene.collection.objects.link(view)
+    world = np.array(collection.r5dgs.root.matrix_world, np.float64)
+    view.matrix_world = Matrix((world @ cameras.cam_world_to_opengl(camera.T_cam_world)).tolist())
+    blender.context.scene.camera = view
+    blender.ops.r5dgs.use_engine()
+    settings = blender.context.scene.render
+    settings.resolution_x, settings.resolution_y, settings.resolution_percentage = camera.width, camera.height, 100
+    settings.dither_intensity = 0.0
+    return collection
+
+
+def go_to(bpy, t):
+    frame = 1 + 60 * t
+    bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
+
+
+def render_png(bpy, folder, name="out"):
+    """What Blender saves, as 8 bits per channel, / 255. [H, W, 3 or 4]"""
+    settings = bpy.context.scene.render
+    settings.filepath = str(folder / f"{name}.png")
+    settings.image_settings.file_format = "PNG"
+    settings.image_settings.color_mode = "RGBA" if settings.film_transparent else "RGB"
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    return images.read(settings.filepath)
+
+
+def render_passes(bpy, folder):
+    """Passes of a multilayer EXR by name. [H, W, channels] each"""
+    compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
+    settings = bpy.context.scene.render
+    settings.filepath = str(folder / "out.exr")
+    if hasattr(settings.image_settings, "media_type"):
+        settings.image_settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.image_settings.file_format, settings.image_settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    found = read_exr(settings.filepath)
+    return types.SimpleNamespace(
+        combined=np.stack([found[f"Combined.{c}"] for c in "RGBA"], -1),
+        depth=found.get("Depth.Z"),
+        index=found.get(f"{compat.OBJECT_INDEX}.X"),
+        names={name.split(".")[0] for name in found},
+        found=found,
+    )
+
+
+def read_exr(path):
+    """Channels of all parts of an EXR by pass and channel. [H, W] each"""
+    OpenImageIO = pytest.importorskip("OpenImageIO")
+    source, found, part = OpenImageIO.ImageInput.open(str(path)), {}, 0
+    while source.seek_subimage(part, 0):
+        pixels = source.read_image("float").reshape(source.spec().height, source.spec().width, -1)
+        for index, name in enumerate(source.spec().channelnames):
+            found[".".join(name.split(".")[-2:])] = pixels[..., index]
+        part += 1
+    return found
+
+
+def core(scene, t, background="scene", camera=None):
+    """The core's own picture."""
+    pose = playback.frame(scene, t)
+    return scene_render.render_frame(scene, pose, camera or scene.cameras[0], background=background)
+
+
+def to_linear(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def assert_almost_all_close(actual, expected, atol):
+    """But for a few pixels at which a Gaussian is at the border of what is drawn, and rounding decides."""
+    assert actual.shape == expected.shape
+    assert (np.abs(actual - expected) > atol).mean() < 1e-3 and np.abs(actual - expected).max() < 0.02
+
+
+def psnr(a, b):
+    return -10 * np.log10(max(float(np.square(np.asarray(a, np.float64) - b).mean()), 1e-12))
+
+
+@pytest.mark.parametrize("t", [0.0, 0.3334, 0.9071])
+def test_a_rendered_picture_is_saved_with_the_cores_bytes(blender, loaded, scene, tmp_path, t):
+    go_to(blender, t)
+    expected = np.clip(core(scene, t).color.numpy(), 0, 1)
+    saved = render_png(blender, tmp_path)
+    assert psnr(saved, expected) > 45
+    assert np.abs(255 * saved - np.round(255 * expected)).max() <= 1.001
+
+
+def test_the_passes_are_linear_colour_depth_along_the_axis_and_the_object_in_front(blender, loaded, scene, tmp_path):
+    layer = blender.context.view_layer
+    layer.use_pass_z = layer.use_pass_object_index = True
+    loaded.all_objects["mug"].pass_index = 77
+    go_to(blender, scene.t_max)
+    passes = render_passes(blender, tmp_path)
+    expected = core(scene, scene.t_max)
+    color, alpha, depth = (value.numpy() for value in (expected.color, expected.alpha, expected.depth))
+    assert_almost_all_close(passes.combined[..., :3], to_linear(color), 1e-3)
+    assert (passes.combined[..., 3] == 1).all()
+    solid = alpha > 0.5 + 1e-4
+    assert_almost_all_close(passes.depth[solid], depth[solid], 1e-3)
+    assert (passes.depth[alpha < 0.5 - 1e-4] == NOTHING).all() and solid.any() and not solid.all()
+    names = {item.name: item.id for item in scene.objects}
+    wanted = {77 if name == "mug" else max(number, 0) for name, number in names.items()}
+    assert set(np.unique(passes.index)) <= wanted and 77 in passes.index
+    loaded.all_objects["mug"].hide_render = True
+    assert 77 not in render_passes(blender, tmp_path).index
+
+
+def test_passes_that_nobody_asked_for_are_not_there(blender, loaded, tmp_path):
+    assert render_passes(blender, tmp_path).names == {"Combined"}
+
+
+def test_a_transparent_film_has_the_cores_alpha_and_straight_colours(blender, loaded, scene, tmp_path):
+    go_to(blender, 0.4)
+    blender.context.scene.render.film_transparent = True
+    expected = core(scene, 0.4, background=None)
+    alpha = expected.alpha.numpy()
+    straight = expected.color.numpy() / np.maximum(alpha, 1e-6)[..., None]
+    passes = render_passes(blender, tmp_path)
+    assert_almost_all_close(passes.combined[..., 3], alpha, 1e-3)
+    assert_almost_all_close(passes.combined[..., :3], alpha[..., None] * to_linear(straight), 1e-3)
+    saved = render_png(blender, tmp_path)
+    seen = alpha > 0.1
+    assert psnr(saved[..., 3], alpha) > 45 and psnr(saved[seen][:, :3], np.clip(straight, 0, 1)[seen]) > 45
+
+
+def test_without_sky_it_is_black_behind(blender, loaded, scene, tmp_path):
+    blender.context.scene.r5dgs_render.sky = False
+    go_to(blender, 0.0)
+    assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.0, background=None).color.numpy(), 0, 1)) > 45
+
+
+@pytest.mark.parametrize("border", [(0.3, 0.8, 0.1, 0.6), (0.0, 0.5, 0.71, 1.0), (0.123, 0.777, 0.311, 0.899)])
+def test_a_border_is_a_part_of_the_whole_picture(blender, loaded, tmp_path, border):
+    settings = blender.context.scene.render
+    settings.resolution_x, settings.resolution_y = 97, 71
+    whole = render_png(blender, tmp_path)
+    settings.use_border = True
+    settings.border_min_x, settings.border_max_x, settings.border_min_y, settings.border_max_y = border
+    part = render_png(blender, tmp_path)
+    settings.use_crop_to_border = True
+    cut = render_png(blender, tmp_path)
+    left, below = int(border[0] * 97), int(border[2] * 71)
+    height, width = cut.shape[:2]
+    rows = slice(71 - below - height, 71 - below)
+    assert part.shape == whole.shape
+    assert np.abs(255 * (part[rows, left : left + width] - whole[rows, left : left + width])).max() <= 1.001
+    np.testing.assert_array_equal(cut, part[rows, left : left + width])
+    outside = part.copy()
+    outside[rows, left : left + width] = 0
+    assert not outside.any()
+
+
+def test_percentage_scales_the_picture(blender, loaded, scene, tmp_path):
+    settings = blender.context.scene.render
+    settings.resolution_x, settings.resolution_y, settings.resolution_percentage = 192, 144, 50
+    go_to(blender, 0.2)
+    assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.2).color.numpy(), 0, 1)) > 45
+
+
+def test_two_scenes_are_in_one_picture_and_cover_each_other(blender, loaded, scene, tmp_path):
+    other = scenes.make_scene(n=300, objects=1, sh_degree=0, seed=9, world_convention="colmap")
+    blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(other, tmp_path / "other.r5dgs")))
+    blender.context.view_layer.use_pass_object_index = True
+    second = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != loaded)
+    for obj in list(second.all_objects):  # a change may end going through them
+        obj.pass_index = 50
+    both = render_passes(blender, tmp_path).index
+    for obj in list(loaded.all_objects):
+        obj.hide_render = True
+    alone = render_passes(blender, tmp_path).index
+    assert set(np.unique(alone)) == {0, 50} and (alone[both == 50] == 50).mean() > 0.9
+    assert ((alone == 50) & (both != 50)).any() and len(np.unique(both)) > 2
+
+
+def test_an_animation_is_its_frames(blender, loaded, tmp_path):
+    blend_scene = blender.context.scene
+    blend_scene.frame_start, blend_scene.frame_end, blend_scene.frame_step = 2, 50, 24
+    (tmp_path / "many").mkdir()
+    blend_scene.render.filepath = str(tmp_path / "many") + "/"
+    blend_scene.render.image_settings.file_format = "PNG"
+    assert blender.ops.render.render(animation=True) == {"FINISHED"}
+    written = sorted(path.name for path in (tmp_path / "many").iterdir())
+    assert written == ["0002.png", "0026.png", "0050.png"]
+    for name in written:
+        blend_scene.frame_set(int(name[:4]))
+        np.testing.assert_array_equal(images.read(tmp_path / "many" / name)[..., :3], render_png(blender, tmp_path))
+
+
+def test_colour_management_that_changes_colours_is_named_and_put_right(blender, loaded):
+    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    blend_scene = blender.context.scene
+    view = blend_scene.view_settings
+    assert color.objections(blend_scene) == []
+    view.view_transform, view.exposure, view.gamma, view.use_curve_mapping = "AgX", 0.5, 1.2, True
+    view.look = "AgX - Punchy"
+    found = color.objections(blend_scene)
+    assert found == ["view transform AgX", "look AgX - Punchy", "exposure 0.5", "gamma 1.2", "curves"]
+    layouts = importlib.import_module("tests.layouts")
+    panels = importlib.import_module("r5dgs.r5dgs_addon.panels.render")
+    said = layouts.draw(blender, *panels.CLASSES)
+    assert ", ".join(found) in said and "r5dgs.show_colors_as_trained" in said and "use_pass_z" in said
+    blender.ops.r5dgs.show_colors_as_trained()
+    assert color.objections(blend_scene) == []
+    assert "r5dgs.show_colors_as_trained" not in layouts.draw(blender, *panels.CLASSES)
+
+
+def test_a_render_that_cannot_be_says_why_and_writes_nothing(blender, loaded, tmp_path):
+    (tmp_path / "scene.r5dgs").rename(tmp_path / "gone.r5dgs")
+    with pytest.raises(RuntimeError, match="scene.r5dgs.*Scene File"):
+        render_png(blender, tmp_path, "nothing")
+    assert not (tmp_path / "nothing.png").exists()
+    (tmp_path / "gone.r5dgs").rename(tmp_path / "scene.r5dgs")
+    blender.context.scene.camera.data.type = "PANO"
+    with pytest.raises(RuntimeError, match="Perspective"):
+        render_png(blender, tmp_path, "nothing")
+    assert not (tmp_path / "nothing.png").exists()
+
+
+class Engine:
+    """As much of Blender's engine as asking the worker touches; the user stops it at once."""
+
+    def __init__(self, module):
+        self.said = []
+        methods = {name: vars(module.R5DGS_RenderEngine)[name] for name in ("_ask", "_stopped", "_say", "_said")}
+        stub = {"update_stats": lambda _, __, text: self.said.append(text), "test_break": lambda _: True}
+        self.engine = type("Engine", (), {**methods, **stub})()
+
+
+def test_a_render_is_stopped_while_the_worker_hangs_and_the_next_one_works(blender, loaded, tmp_path):
+    engine = importlib.import_module("r5dgs.r5dgs_addon.engine")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    stopped = Engine(engine)
+    steps = picture.steps(picture.shown(blender.context.evaluated_depsgraph_get()))
+    assert stopped.engine._ask(steps) is None and stopped.said
+    assert not running.alive and not worker.busy()
+    render_png(blender, tmp_path)
+
+
+def test_blenders_panels_for_all_engines_are_shown_and_given_back(blender, extension):
+    compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
+    panels = {panel.__name__ for panel in blender.types.Panel.__subclasses__()}
+    assert {"RENDER_PT_format", "RENDER_PT_output", "DATA_PT_lens"} <= panels
+    assert all("R5DGS" in panel.COMPAT_ENGINES for panel in compat.panels_of_all_engines())
+    extension.unregister()
+    try:
+        left = [p for p in blender.types.Panel.__subclasses__() if "R5DGS" in getattr(p, "COMPAT_ENGINES", ())]
+        assert [panel for panel in left if not panel.__module__.startswith("r5dgs.")] == []
+        assert not hasattr(blender.types.Scene, "r5dgs_render")
+    finally:
+        extension.register()
