@@ -9,14 +9,16 @@ from bpy.app.handlers import persistent
 
 CLICK = "VIEW3D_OT_select"
 _listener = object()  # owns the subscription
+_active = [0]  # `session_uid` of the active object after the last change that was heard of
 
 
-def follow(context: bpy.types.Context, extend: bool) -> bpy.types.Object | None:
+def follow(context: bpy.types.Context, extend: bool, before: int = 0) -> bpy.types.Object | None:
     """Let the anchor of the active cloud take its place in the selection.
 
     Args:
         context: Its view layer's selection is changed.
-        extend: Whether others stay selected. An anchor that was selected with others already is then taken out.
+        extend: Whether others stay selected. An anchor that was active already is then taken out, as Blender does it.
+        before: The `session_uid` of what was active before the click; 0 where that is not known.
 
     Returns:
         The anchor; None where the active object is no cloud with an anchor that can be selected.
@@ -30,7 +32,7 @@ def follow(context: bpy.types.Context, extend: bool) -> bpy.types.Object | None:
         return None
     if not anchor.visible_get(view_layer=layer):
         return None
-    taken_out = extend and anchor.select_get(view_layer=layer)
+    taken_out = extend and anchor.session_uid == before and anchor.select_get(view_layer=layer)
     if not extend:
         for chosen in context.selected_objects:
             chosen.select_set(False)
@@ -50,14 +52,16 @@ def listen() -> None:
 
 def _when_active_changes() -> None:
     context = bpy.context
-    if context.scene is None or context.mode != "OBJECT" or not context.scene.r5dgs_words.click_selects_anchor:
+    if context.scene is None or context.mode != "OBJECT":
         return
+    before = _active[0]
     done = context.window_manager.operators
-    if not done or done[-1].bl_idname != CLICK:
-        return
-    click = done[-1].properties
-    if follow(context, click.extend or click.toggle) is not None:
-        bpy.ops.ed.undo_push(message="Select Anchor")
+    if context.scene.r5dgs_words.click_selects_anchor and done and done[-1].bl_idname == CLICK:
+        click = done[-1].properties
+        if follow(context, click.extend or click.toggle, before) is not None:
+            bpy.ops.ed.undo_push(message="Select Anchor")
+    active = context.view_layer.objects.active
+    _active[0] = 0 if active is None else active.session_uid
 
 
 @persistent

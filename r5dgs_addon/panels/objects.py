@@ -5,7 +5,8 @@ import bpy
 from .. import isolation, look, objects, table
 from . import sidebar
 
-OTHERS = (("r5dgs.duplicate_object", "DUPLICATE"), ("r5dgs.delete_object", "TRASH"))  # where they are registered
+OTHERS = (("r5dgs.duplicate_object", "Duplicate", "DUPLICATE"), ("r5dgs.delete_object", "Delete", "TRASH"))
+WIDE = 350  # points of a sidebar in which rows have room for how objects move
 
 
 class R5DGS_UL_objects(bpy.types.UIList):
@@ -20,9 +21,8 @@ class R5DGS_UL_objects(bpy.types.UIList):
         swatch.ui_units_x = 1.0
         swatch.prop(item, "color", text="")
         row.prop(item, "label", text="", emboss=False)
-        kind = _motion(own)
-        if kind:
-            row.label(text=kind)
+        if context.region is None or context.region.width > WIDE * context.preferences.system.ui_scale:
+            row.label(text=_motion(own))
         if not own:
             row.label(text="deleted")
             return
@@ -55,14 +55,12 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
         state = collection.r5dgs
         layout.template_list("R5DGS_UL_objects", "", state, "table", state, "row", rows=5)
         row = layout.row(align=True)
-        row.operator("r5dgs.isolate", icon="HIDE_ON")
+        row.operator("r5dgs.isolate", text="Isolate Selected", icon="HIDE_ON")
         if isolation.is_isolated(context.scene):
             row.operator("r5dgs.unisolate", icon="HIDE_OFF")
-        others = [(idname, icon) for idname, icon in OTHERS if _is_registered(idname)]
-        if others:
-            row = layout.row(align=True)
-            for idname, icon in others:
-                row.operator(idname, icon=icon)
+        row = layout.row(align=True)
+        for idname, text, icon in OTHERS:
+            row.operator(idname, text=text, icon=icon)
         layout.prop(context.scene.r5dgs_words, "click_selects_anchor")
         index = state.row
         if 0 <= index < len(state.table):
@@ -71,6 +69,9 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
 
 def _draw_active(box, collection, entry):
     box.prop(entry, "label", text="Name")
+    moves = _motion(table.clouds(collection, entry.object_id))
+    if moves:
+        box.label(text=f"Motion: {moves}", icon="CON_FOLLOWPATH")
     row = box.row(align=True)
     row.prop(entry, "tint")
     row.operator("r5dgs.reset_colour", text="", icon="LOOP_BACK")
@@ -96,11 +97,6 @@ def _motion(own) -> str:
             items = physics.bl_rna.properties["kind"].enum_items
             return items[physics.kind].name if physics.kind in items else ""
     return ""
-
-
-def _is_registered(idname: str) -> bool:
-    module, name = idname.split(".")
-    return hasattr(bpy.types, f"{module.upper()}_OT_{name}")
 
 
 CLASSES = (R5DGS_UL_objects, R5DGS_PT_objects)

@@ -29,7 +29,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
         layout = self.layout
         session, settings = context.window_manager.r5dgs_words, context.scene.r5dgs_words
         row = layout.row(align=True)
-        row.prop(session, "prompt", text="", icon="VIEWZOOM")
+        row.prop(session, "prompt", text="", icon="VIEWZOOM", placeholder="Words, such as red mug")
         row.menu("R5DGS_MT_prompts", text="", icon="TIME")
         row = layout.row(align=True)
         row.prop(settings, "threshold", slider=True)
@@ -41,7 +41,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
             action.mode = mode
             action.text = session.prompt
         row = layout.row(align=True)
-        row.operator("r5dgs.isolate", icon="HIDE_ON").text = session.prompt
+        row.operator("r5dgs.isolate", text="Isolate Matches", icon="HIDE_ON").text = session.prompt
         if isolation.is_isolated(context.scene):
             row.operator("r5dgs.unisolate", icon="HIDE_OFF")
         if session.asked:
@@ -52,15 +52,14 @@ def _draw_answers(box, session, names):
     if not session.matches:
         box.label(text=f"Nothing matches '{session.asked}'", icon="INFO")
     for match in session.matches:
-        line = box.row()
+        line = box.split(factor=0.5)
         action = line.operator(
             "r5dgs.select_object",
             text=names.get((match.scene, match.object_id), match.name),
             icon="OUTLINER_OB_POINTCLOUD",
         )
         action.scene, action.object_id = match.scene, match.object_id
-        line.label(text=match.why)
-        line.label(text=f"{match.score:.2f}")
+        line.label(text=f"{match.score:.2f}  {match.why}")
     if session.meant:
         row = box.row()
         row.label(text="Did you mean")

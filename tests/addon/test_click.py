@@ -36,15 +36,18 @@ def test_the_anchor_takes_the_place_of_its_cloud(blender, click):
     assert blender.context.view_layer.objects.active.name == "mug anchor"
 
 
-def test_shift_adds_anchors_and_takes_them_out_again(blender, click):
+def test_shift_adds_anchors_makes_them_active_and_takes_the_active_one_out(blender, click, monkeypatch):
+    def shift_click(name):
+        choose(blender, name, extend=True)
+        heard(monkeypatch, blender, click, "VIEW3D_OT_select", toggle=True)
+        return selected(blender), blender.context.view_layer.objects.active.name
+
     choose(blender, "mug")
-    click.follow(blender.context, extend=False)
-    choose(blender, "toy car", extend=True)
-    click.follow(blender.context, extend=True)
-    assert selected(blender) == {"mug anchor", "toy car anchor"}
-    choose(blender, "mug", extend=True)
-    click.follow(blender.context, extend=True)
-    assert selected(blender) == {"toy car anchor"}
+    heard(monkeypatch, blender, click, "VIEW3D_OT_select")
+    both = {"mug anchor", "toy car anchor"}
+    assert shift_click("toy car") == (both, "toy car anchor")
+    assert shift_click("mug") == (both, "mug anchor")
+    assert shift_click("mug") == ({"toy car anchor"}, "mug anchor")
 
 
 @pytest.mark.parametrize("name", ["Cube", "mug anchor"])
