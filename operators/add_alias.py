@@ -35,7 +35,7 @@ class R5DGS_OT_add_alias(bpy.types.Operator):
     def execute(self, context):
         found = selection.find(context, self.scene, self.object_id)
         entry = None if found is None else table.entry_of(*found)
-        if entry is None or entry.id_data.library is not None:
+        if entry is None or not table.is_kept(found[0]):
             self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")
             return {"CANCELLED"}
         word = self.word.strip()

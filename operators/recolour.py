@@ -32,10 +32,11 @@ class R5DGS_OT_recolour(bpy.types.Operator):
         return True
 
     def execute(self, context):
-        for collection, object_id in selection.selected(context):
-            for cloud in table.clouds(collection, object_id):
-                cloud.r5dgs_look.tint = self.tint
-        return {"FINISHED"}
+        wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
+        linked = look.recolour(wanted, self.tint)
+        if linked:
+            self.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
+        return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
 
 
 CLASSES = (R5DGS_OT_recolour,)

@@ -30,7 +30,7 @@ class R5DGS_OT_remove_alias(bpy.types.Operator):
         found = selection.find(context, self.scene, self.object_id)
         entry = None if found is None else table.entry_of(*found)
         words = [] if entry is None else [alias.name for alias in entry.aliases]
-        if entry is None or entry.id_data.library is not None or self.word not in words:
+        if entry is None or not table.is_kept(found[0]) or self.word not in words:
             self.report({"WARNING"}, f"No such word to remove: '{self.word}'")
             return {"CANCELLED"}
         entry.aliases.remove(words.index(self.word))

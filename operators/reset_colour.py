@@ -20,9 +20,8 @@ class R5DGS_OT_reset_colour(bpy.types.Operator):
         return True
 
     def execute(self, context):
-        for item in selection.selected(context):
-            for cloud in table.clouds(*item):
-                cloud.r5dgs_look.tint = look.NONE
+        wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
+        look.recolour(wanted, look.NONE)
         return {"FINISHED"}
 
 

@@ -48,6 +48,22 @@ def is_tinted(obj: bpy.types.Object) -> bool:
     return tuple(obj.r5dgs_look.tint) != NONE
 
 
+def recolour(wanted: list[bpy.types.Object], tint) -> list[str]:
+    """Tint clouds.
+
+    Args:
+        wanted: The clouds.
+        tint: Factors on display-referred sRGB. [3]
+
+    Returns:
+        Names of those that are linked from another file and therefore left as they are.
+    """
+    for cloud in wanted:
+        if cloud.library is None:
+            cloud.r5dgs_look.tint = tuple(tint)
+    return [cloud.name for cloud in wanted if cloud.library is not None]
+
+
 def show(cloud: bpy.types.Object) -> None:
     """Let a cloud's viewport colour and the display colour of its points follow its tint."""
     look, factors = cloud.r5dgs_look, tint(cloud)

@@ -128,6 +128,31 @@ def test_recolouring_can_be_undone_and_redone(blender, loaded):
     assert state() == states[1]
 
 
+def test_of_a_linked_scene_only_what_is_kept_here_changes(blender, loaded, tmp_path):
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    with blender.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    linked = target.collections[0]
+    blender.context.scene.collection.children.link(linked)
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    assert {obj.name for obj in blender.context.selected_objects} == {"mug", "mug anchor"}
+    assert blender.ops.r5dgs.recolour(tint=TINT) == {"CANCELLED"}
+    assert blender.ops.r5dgs.add_alias(word="beaker") == {"CANCELLED"}
+    with pytest.raises(RuntimeError, match="linked"):
+        blender.ops.r5dgs.rename_object(new_name="beaker")
+    row_of(linked, "mug").label = "beaker"
+    row_of(linked, "mug").color = TINT
+    row_of(linked, "mug").hidden_in_renders = True
+    mug = linked.all_objects["mug"]
+    assert tuple(mug.r5dgs_look.tint) == (1, 1, 1) and not mug.hide_render
+    assert blender.ops.r5dgs.isolate() == {"FINISHED"}
+    clouds = [obj for obj in linked.all_objects if obj.r5dgs.role == "CLOUD"]
+    assert [obj.name for obj in clouds if obj.visible_get()] == ["mug"] and not any(o.hide_render for o in clouds)
+    blender.ops.r5dgs.unisolate()
+    assert all(obj.visible_get() for obj in clouds)
+
+
 def test_the_list_filters_by_the_names_that_it_shows(blender, loaded):
     lists = importlib.import_module("r5dgs.r5dgs_addon.panels.objects")
     row_of(loaded, "mug").label = "Teapot"
