@@ -27,6 +27,7 @@ from . import (
     select_object,
     set_display,
     show_confidence,
+    simplify_keys,
     unisolate,
     use_engine,
 )
@@ -35,6 +36,7 @@ MODULES = (
     load_scene,
     set_display,
     select_by_prompt,
+    simplify_keys,
     select_object,
     isolate,
     unisolate,

@@ -152,7 +152,7 @@ def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
     """Write a curve as F-curves with Bezier keys and free handles; a component that never changes gets one key.
 
     Args:
-        fcurves: Where they go; free of this path.
+        fcurves: Where they go; the keys of those of this path are replaced.
         data_path: "location" or "rotation_quaternion".
         curve: The keys.
         times: Scene times and their frames.
@@ -171,8 +171,10 @@ def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
         left = np.stack([frame - frames * before / 3, value - curve.left_slopes[keep, index] * before / 3], axis=-1)
         right = np.stack([frame + frames * after / 3, value + curve.right_slopes[keep, index] * after / 3], axis=-1)
         kind = np.where(t > times.t_max + 1e-9, kinds[EXTRAPOLATED_KEY], kinds[OBSERVED_KEY])
-        fcurve = fcurves.new(data_path, index=index)
+        fcurve = fcurves.find(data_path, index=index) or fcurves.new(data_path, index=index)
         points = fcurve.keyframe_points
+        for k in range(len(points) - 1, -1, -1):
+            points.remove(points[k], fast=True)
         points.add(len(t))
         count = len(t)
         points.foreach_set("interpolation", np.full(count, bezier, np.int32))

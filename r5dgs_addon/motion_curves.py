@@ -5,7 +5,6 @@ there without changing its shape.
 """
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import bpy
@@ -340,9 +339,3 @@ def frames(keys: Keys, times: timeline.Times) -> Keys:
     """Keys over scene time as keys over frames."""
     per = times.frames_per_unit
     return Keys(times.frame(0.0) + per * keys.times, keys.values, keys.left_slopes / per, keys.right_slopes / per)
-
-
-def all_points(where: Place) -> Iterator[bpy.types.Keyframe]:
-    """Every key of an anchor's motion."""
-    for curve in where.curves().values():
-        yield from curve.keyframe_points

@@ -329,11 +329,6 @@ def _write(curve: bpy.types.FCurve, part: Curve) -> None:
     curve.update()
 
 
-def key_count(anchors: Iterable[bpy.types.Object]) -> int:
-    """Number of keys of location and rotation, over all curves of anchors."""
-    return sum(1 for anchor in anchors for _ in motion_curves.all_points(motion_curves.place(anchor)))
-
-
 def by_scene(anchors: Iterable[bpy.types.Object]) -> dict[bpy.types.Collection, list[bpy.types.Object]]:
     """Anchors by the loaded scene that they belong to."""
     found: dict[bpy.types.Collection, list[bpy.types.Object]] = {}

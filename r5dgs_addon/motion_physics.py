@@ -283,6 +283,18 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
     return body + _LEAST_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
 
 
+def allow(anchor: bpy.types.Object, error: float) -> None:
+    """Set the allowed error of an anchor's keys, in scene units."""
+    kept = json.loads(anchor.r5dgs_motion.learned)
+    anchor.r5dgs_motion.learned = json.dumps({**kept, "allowed": error})
+
+
+def size(anchor: bpy.types.Object) -> float:
+    """The size of what an anchor carries: twice the radius that its learned motion was weighed with, scene units."""
+    kept = json.loads(anchor.r5dgs_motion.learned)
+    return 2.0 * (kept["model"]["radius"] if kept["reach"] else key_error(anchor)[1])
+
+
 def _points(anchor: bpy.types.Object) -> np.ndarray:
     """Centres of the Gaussians that an anchor carries, bind state. [n, 3] float64"""
     parts = [np.zeros((0, 3))]

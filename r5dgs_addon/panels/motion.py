@@ -24,6 +24,7 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
             column = layout.column(align=True)
             column.operator("r5dgs.re_extrapolate", icon="TRACKING_FORWARDS")
             column.operator("r5dgs.reset_motion", icon="LOOP_BACK")
+            column.operator("r5dgs.simplify_keys", icon="IPO_BEZIER")
             column = layout.column(align=True)
             column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
             column.operator("r5dgs.duplicate_object", icon="DUPLICATE")

@@ -49,3 +49,41 @@ def _levels(points: np.ndarray, share: float) -> list[np.ndarray]:
     while len(levels[-1]) > 1:
         levels.append((1 - share) * levels[-1][:-1] + share * levels[-1][1:])
     return levels
+
+
+def evaluate(segments: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values and slopes of a curve of segments, at times within it; at a key, those of the segment that starts there.
+
+    Args:
+        segments: Consecutive, each ending at the key where the next begins. [K, 4, 2]
+        times: [S]
+
+    Returns:
+        Values [S] and slopes per unit of time [S].
+    """
+    points = np.stack([within(segment) for segment in segments])
+    starts = points[:, 0, 0]
+    chosen = points[np.clip(np.searchsorted(starts, times, side="right") - 1, 0, len(points) - 1)]  # [S, 4, 2]
+    x, y = chosen[..., 0], chosen[..., 1]
+    low, high = np.zeros(len(times)), np.ones(len(times))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        before = _cubic(x, middle) < times
+        low, high = np.where(before, middle, low), np.where(before, high, middle)
+    share = 0.5 * (low + high)
+    run, rise = _rate(x, share), _rate(y, share)
+    return _cubic(y, share), np.divide(rise, run, out=np.zeros_like(rise), where=np.abs(run) > 1e-12)
+
+
+def _cubic(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """[S, 4], [S] -> [S]"""
+    rest = 1 - share
+    weights = np.stack([rest**3, 3 * share * rest**2, 3 * share**2 * rest, share**3], axis=-1)
+    return (weights * points).sum(-1)
+
+
+def _rate(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Derivative of `_cubic` by the share. [S, 4], [S] -> [S]"""
+    rest = 1 - share
+    weights = np.stack([rest**2, 2 * share * rest, share**2], axis=-1)
+    return 3 * (weights * np.diff(points, axis=-1)).sum(-1)

@@ -1,6 +1,7 @@
 """Motion that was edited as physics is written past t_max, and nothing else is touched."""
 
 import dataclasses
+import importlib
 import math
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import playback, scene_file
-from tests import scenes
+from tests import layouts, scenes
 from tests.addon import motions
 
 T_MAX = scenes.T_MAX
@@ -411,3 +412,59 @@ def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
     blender.ops.r5dgs.extrapolate_until(t_end=1.3)
     motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (*TIMES, 1.3))
     assert playback.frame(far, 1.3).means.shape == (300, 3)
+
+
+def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded):
+    scene = scene_file.read(scene_path)
+    anchors = [o for o in loaded.all_objects if o.r5dgs.role == "ANCHOR" and motions.curves(o)]
+    count = sum(len(rows) for anchor in anchors for rows in motions.keys(anchor).values())
+    motions.choose(blender, *anchors)
+    assert blender.ops.r5dgs.simplify_keys(tolerance=2e-3) == {"FINISHED"}
+    fewer = sum(len(rows) for anchor in anchors for rows in motions.keys(anchor).values())
+    assert fewer < 0.6 * count
+    for t in np.linspace(0, 1, 23):
+        motions.go_to(blender, loaded, t)
+        frame = playback.frame(scene, t)
+        for cloud in (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD"):
+            rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
+            worst = np.linalg.norm(motions.points(blender, cloud) - frame.means[rows], axis=-1).max()
+            assert worst <= 2e-3 * motions.addon("motion_physics").size(cloud.parent) + 1e-5 * scene.extent
+    motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.0))
+    blender.ops.r5dgs.extrapolate_until(t_end=1.2)  # nobody edited these by hand
+    motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.2))
+
+
+def test_kinks_that_the_user_made_survive_fewer_keys(blender, loaded, mug):
+    curve = motions.curves(mug)["location", 2]
+    point = curve.keyframe_points.insert(20.0, 2.0)
+    point.handle_left_type = point.handle_right_type = "VECTOR"
+    curve.update()
+    frames = np.linspace(1, 61, 121)
+    before = [curve.evaluate(f) for f in frames]
+    assert blender.ops.r5dgs.simplify_keys(tolerance=1e-3) == {"FINISHED"}
+    curve = motions.curves(mug)["location", 2]
+    np.testing.assert_allclose([curve.evaluate(f) for f in frames], before, atol=1e-3 * 0.6)
+    assert curve.evaluate(20.0) == pytest.approx(2.0, abs=1e-5)
+
+
+def test_stepped_keys_are_not_smoothed_away(blender, loaded, mug):
+    for curve in motions.curves(mug).values():
+        curve.keyframe_points[0].interpolation = "CONSTANT"
+    before = motions.keys(mug)
+    with pytest.raises(RuntimeError, match="Constant"):
+        blender.ops.r5dgs.simplify_keys()
+    assert motions.keys(mug) == before
+
+
+def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, loaded, mug):
+    (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
+    physics = motions.addon("motion_physics")
+    for kind, fields in physics.FIELDS.items():
+        mug.r5dgs_motion.kind = kind
+        said = layouts.draw(blender, panel)
+        assert set(fields) <= set(said) and "r5dgs.re_extrapolate" in said
+        assert ("As learned" in said) == (kind == "ballistic_spin")
+    motions.choose(blender, blender.data.objects["mug shadow anchor"])
+    assert "Moves with what it follows" in layouts.draw(blender, panel)
+    motions.choose(blender, loaded.r5dgs.root)
+    assert "Select an object to see its motion" in layouts.draw(blender, panel)

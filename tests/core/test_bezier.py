@@ -51,3 +51,18 @@ def test_handles_that_pass_each_other_are_shortened_to_meet():
 def test_a_cut_outside_is_refused(time):
     with pytest.raises(ValueError, match="between"):
         bezier.split(np.array([[0.0, 0], [0.5, 0], [1.5, 0], [2.0, 0]]), time)
+
+
+def test_values_and_slopes_are_those_of_the_segments():
+    segments = np.array([
+        [[0.0, 1.0], [0.5, 2.0], [1.2, -1.0], [2.0, 0.0]],
+        [[2.0, 0.0], [4.0, 0.0], [2.0, 3.0], [5.0, 1.0]],
+    ])  # fmt: skip
+    times = np.array([0.3, 1.0, 1.9, 2.5, 4.6])
+    values, slopes = bezier.evaluate(segments, times)
+    expected = [value_at(bezier.within(segments[0 if t < 2 else 1]), t) for t in times]
+    np.testing.assert_allclose(values, expected, atol=1e-9)
+    ahead, _ = bezier.evaluate(segments, times + 1e-5)
+    behind, _ = bezier.evaluate(segments, times - 1e-5)
+    np.testing.assert_allclose(slopes, (ahead - behind) / 2e-5, rtol=1e-4)
+    np.testing.assert_allclose(bezier.evaluate(segments, np.array([0.0, 2.0, 5.0]))[0], [1.0, 0.0, 1.0], atol=1e-12)

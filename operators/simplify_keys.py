@@ -1,0 +1,40 @@
+"""Simplify Keys: few keys to edit by hand, within a stated distance of the motion."""
+
+import bpy
+from bpy.props import FloatProperty
+
+from ..r5dgs_addon import motion_objects, motion_simplify
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_simplify_keys(bpy.types.Operator):
+    """Leave the selected objects as few keys as keep their motion, so that they can be edited by hand"""
+
+    bl_idname = "r5dgs.simplify_keys"
+    bl_label = "Simplify Keys"
+    bl_options = {"REGISTER", "UNDO"}
+
+    tolerance: FloatProperty(
+        name="Tolerance",
+        description="Largest distance of any point from its place before, as a share of the object's size",
+        default=1e-3,
+        min=1e-6,
+        max=0.5,
+        precision=5,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        return motion_objects.poll_chosen(cls, context)
+
+    def execute(self, context):
+        try:
+            before, after = motion_simplify.simplify(motion_objects.chosen(context), self.tolerance)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{before} keys became {after}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_simplify_keys,)
