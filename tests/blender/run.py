@@ -228,5 +228,9 @@ def main(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     given = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
-    if code := main(given):
+    code = main(given)
+    if not bpy.app.binary_path:
+        sys.stdout.flush()
+        os._exit(code)  # the module of 4.5 beside torch hangs while its libraries are unloaded
+    if code:
         raise SystemExit(code)

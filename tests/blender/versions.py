@@ -1,0 +1,73 @@
+"""Run `tests/blender/run.py` in every Blender that the extension is tested on: `python tests/blender/versions.py`.
+
+For each version of the bpy module an environment is made once in ``--folder`` (about 1.5 GB each) and used again; the
+module's Python has to be installed (3.11 up to 5.0, 3.13 from 5.1 on). ``--blender PROGRAM`` adds Blender programs.
+Previews use ``--worker``, by default the Python that runs this; torch is not installed beside the modules unless
+``--torch`` says so, and without it the tests that draw pictures themselves are left out. What follows ``--`` goes to
+`run.py`. Ends with exit code 1 where a version failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+RUN = Path(__file__).with_name("run.py")
+MODULES = {"4.2.23": "3.11", "4.5.15": "3.11", "5.0.1": "3.11", "5.2.3": "3.13"}  # bpy, and the Python that it is for
+BESIDE = ("pytest", "hypothesis", "OpenImageIO", "rich", "packaging", "scipy", "trimesh")
+
+
+def python_of(version: str) -> str:
+    """A Python of a version such as "3.13"."""
+    found = shutil.which(f"python{version}")
+    if found is None:
+        raise SystemExit(f"python{version}: not found; the bpy module of this version is for it alone, so install it")
+    return found
+
+
+def environment(bpy: str, folder: Path, torch: bool) -> Path:
+    """The Python of an environment with a version of bpy, made where it is not there yet."""
+    place = folder / bpy
+    python = place / "bin" / "python"
+    done = place / "installed"
+    wanted = [f"bpy=={bpy}", *BESIDE, *(("torch", "numba") if torch else ())]
+    if not done.exists() or done.read_text() != " ".join(wanted):
+        subprocess.run([python_of(MODULES[bpy]), "-m", "venv", str(place)], check=True)
+        subprocess.run([str(python), "-m", "pip", "install", "-q", *wanted], check=True)
+        done.write_text(" ".join(wanted))
+    return python
+
+
+def main(arguments: list[str]) -> int:
+    """Run all; returns the exit code."""
+    split = arguments.index("--") if "--" in arguments else len(arguments)
+    parser = argparse.ArgumentParser(description="The extension's figures and tests in every version of Blender.")
+    parser.add_argument("versions", nargs="*", help=f"versions of bpy, by default {', '.join(MODULES)}")
+    parser.add_argument("--folder", type=Path, default=Path.home() / ".cache" / "r5dgs-blenders")
+    parser.add_argument("--blender", action="append", default=[], help="a Blender program to run it in, too")
+    parser.add_argument("--worker", default=sys.executable, help="Python with torch for the previews")
+    parser.add_argument("--torch", action="store_true", help="install torch beside the modules")
+    options = parser.parse_args(arguments[:split])
+    rest = arguments[split + 1 :]
+    unknown = [version for version in options.versions if version not in MODULES]
+    if unknown:
+        parser.error(f"unknown versions {', '.join(unknown)}; known are {', '.join(MODULES)}")
+    settings = {**os.environ, "R5DGS_PYTHON": options.worker}
+    codes = {}
+    for version in options.versions or MODULES:
+        command = [str(environment(version, options.folder, options.torch)), str(RUN), *rest]
+        codes[f"bpy {version}"] = subprocess.run(command, env=settings, cwd=ROOT).returncode
+    for program in options.blender:
+        command = [program, "-b", "--factory-startup", "--python-exit-code", "1", "--python", str(RUN), "--", *rest]
+        codes[program] = subprocess.run(command, env=settings, cwd=ROOT).returncode
+    print("\n".join(f"{name:<40} {'ok' if code == 0 else f'FAILED with code {code}'}" for name, code in codes.items()))
+    return int(any(codes.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
