@@ -1,51 +1,48 @@
-"""Test Worker: start the worker's Python and say what it has."""
+"""Test Worker: start the worker's Python, say what it has and how fast it is."""
 
 import time
 
 import bpy
 
-from ..r5dgs_addon import preferences, worker
-from ..r5dgs_core import errors
+from ..r5dgs_addon import preferences, waiting, worker
+
+KEY = "check"
 
 
-class R5DGS_OT_check_worker(bpy.types.Operator):
-    """Start the worker with the Python chosen above and say whether it can render (the first time it compiles, 10 s)"""
+class R5DGS_OT_check_worker(waiting.Waiting, bpy.types.Operator):
+    """Start the worker anew, with the Python chosen above or found, and say its versions, device and speed (the \
+first time it compiles, 10 s)"""
 
     bl_idname = "r5dgs.check_worker"
     bl_label = "Test Worker"
+    waits_for = "Test Worker"
 
     @classmethod
     def poll(cls, context):
         if worker.busy():
-            cls.poll_message_set("A preview is being rendered; Esc stops it")
+            cls.poll_message_set("The worker is rendering; wait for it, or stop it with Esc")
             return False
         return True
 
-    def execute(self, context):
-        began = time.monotonic()
-        _wait(context, True)
-        try:
-            worker.stop()
-            hello = worker.current().hello
-            warm, _ = worker.request("warm_up")
-        except errors.R5dgsError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        finally:
-            _wait(context, False)
-        seconds = time.monotonic() - began
-        rasterizer = f"rasterizer compiled in {seconds:.0f} s, once" if warm["compiled"] else "rasterizer ready"
-        self.report({"INFO"}, f"Worker ready: {preferences.worker_python()} (Python {hello['python']}), {rasterizer}")
+    def _begin(self, context):
+        self._began = time.monotonic()
+        worker.stop()
+        preferences.forget()
+        self._python = preferences.worker_python()
+        return worker.submit(KEY, [("testing", "check", {})])
+
+    def _finish(self, context, answer):
+        found, _ = answer
+        versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+        seconds = time.monotonic() - self._began
+        compiled = f", rasterizer compiled in {seconds:.0f} s, once" if found["compiled"] else ""
+        width, height = found["size"]
+        self.report(
+            {"INFO"},
+            f"Worker ready: {self._python} ({versions}), {found['device']}{compiled}; {found['gaussians']:,} Gaussians "
+            f"at {width} x {height} in {found['milliseconds']:.0f} ms",
+        )
         return {"FINISHED"}
-
-
-def _wait(context, busy):
-    """Show by the pointer that Blender waits."""
-    if context.window is not None:
-        if busy:
-            context.window.cursor_modal_set("WAIT")
-        else:
-            context.window.cursor_modal_restore()
 
 
 CLASSES = (R5DGS_OT_check_worker,)

@@ -3,6 +3,7 @@
 from . import (
     click,
     engine,
+    figures,
     handlers,
     live_preview,
     look,
@@ -24,6 +25,7 @@ MODULES = (
     motion_physics,
     motion_exact,
     preferences,
+    figures,
     engine,
     panels,
     handlers,

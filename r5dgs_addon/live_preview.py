@@ -55,7 +55,7 @@ def look() -> float:
             return LOOK_S
         job, _job = _job, None
         try:
-            _show(*picture.finish(job.answer()))
+            picture.finish(job.answer())
             _message = ""
         except errors.R5dgsError as error:
             _message = str(error)
@@ -77,12 +77,6 @@ def look() -> float:
                 _redraw()
             return IDLE_S
     return LOOK_S
-
-
-def _show(image: bpy.types.Image, result: dict[str, Any]) -> None:
-    session = bpy.context.window_manager.r5dgs
-    session.preview_ms = result["ms_motion"] + result["ms_raster"]
-    session.preview_size = f"{image.size[0]} x {image.size[1]}"
 
 
 def _redraw() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
-from . import handlers, views, visible, worker
+from . import figures, handlers, views, visible, worker
 
 IMAGE = "R5DGS Preview"
 PREVIEW = "preview"  # what `worker.busy` knows previews by
@@ -124,28 +124,21 @@ def scene_path(collection: bpy.types.Collection) -> Path:
     )
 
 
-def preview(context: bpy.types.Context) -> tuple[bpy.types.Image, dict[str, Any]]:
-    """Render what Blender shows into the image `R5DGS Preview`, and wait for it.
-
-    Args:
-        context: Its scene has the camera, the resolution and the frame; what its view layer hides is left out.
-
-    Returns:
-        The image, and the worker's result: ``ms_motion``, ``ms_raster``, ``gaussians``.
-    """
-    result, arrays = render(shown(context.evaluated_depsgraph_get()))
-    return write_image(IMAGE, arrays["color"]), result
-
-
 def start(context: bpy.types.Context) -> worker.Job:
-    """Begin a `preview` without waiting; give the job's answer to `finish`."""
+    """Begin a picture of what Blender shows without waiting; give the job's answer to `finish`."""
     return worker.submit(PREVIEW, steps(shown(context.evaluated_depsgraph_get())))
 
 
 def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.types.Image, dict[str, Any]]:
-    """Put the worker's answer into the image `R5DGS Preview`; returns what `preview` does."""
+    """Put the worker's answer into the image `R5DGS Preview`, and its figures where the sidebar shows them.
+
+    Returns:
+        The image, and the result: ``ms_motion ms_raster gaussians``, and ``name error unbent`` for each of ``scenes``.
+    """
     result, arrays = answer
-    return write_image(IMAGE, arrays["color"]), result
+    image = write_image(IMAGE, arrays["color"])
+    figures.remember(image, result)
+    return image, result
 
 
 def write_image(name: str, color: np.ndarray) -> bpy.types.Image:

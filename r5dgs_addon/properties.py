@@ -125,9 +125,6 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
 class R5DGS_PG_session(bpy.types.PropertyGroup):
     """What the sidebar shows; not saved."""
 
-    preview_ms: FloatProperty(name="Preview Time", description="Milliseconds of the last preview in the worker")
-    preview_size: StringProperty(name="Preview Size", description="Size of the last preview")
-
 
 CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_session)
 

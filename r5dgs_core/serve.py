@@ -20,6 +20,8 @@ between answers:
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -34,8 +36,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from . import errors
-from .scene import lookup, playback, scene_file
+from . import __version__, errors
+from .scene import lookup, playback, quality, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
 
@@ -99,6 +101,7 @@ class Server:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
         self._stage = None  # of the scenes, from the first picture on
+        self._errors: list[quality.Quality] = []  # what is known of theirs
         self._players: dict[int, playback.Player] = {}  # of each scene, from the first time that is asked for
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
@@ -106,6 +109,7 @@ class Server:
             "render": self._render,
             "query": self._query,
             "warm_up": self._warm_up,
+            "check": self._check,
         }
 
     def answer(self, request: dict[str, Any]) -> Answer:
@@ -137,6 +141,7 @@ class Server:
             known, self._scenes, self._stage, self._players = self._scenes, {}, None, {}
             known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # before others need room
             found = {stamp: known.get(stamp) or scene_file.read(Path(stamp[0])) for stamp in stamps}
+            self._errors = [quality.of(scene, Path(stamp[0])) for stamp, scene in found.items()]
             self._scenes = found
         places = list(self._scenes)
         return {
@@ -176,7 +181,16 @@ class Server:
         for name in want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
-        return {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count}, arrays
+        result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}
+        return result, arrays
+
+    def _known(self, request: dict[str, Any]) -> list[dict[str, Any]]:
+        """What is known of each scene's error, and how many of its Gaussians bend and are shown unbent."""
+        bent = {entry.get("scene", 0) for entry in request.get("instances", ()) if "t" in entry}
+        return [
+            {"name": scene.name, "error": known.text(), "unbent": 0 if "t" in request or k in bent else known.bending}
+            for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
+        ]
 
     def _instances(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
         from .raster import stage
@@ -219,6 +233,16 @@ class Server:
 
         warming.warm_up(gradients=False)
         return {"compiled": compilation.compiled()}, {}
+
+    def _check(self, _: dict[str, Any]) -> Answer:
+        """Versions, device, and the milliseconds of a made picture; what ``warm_up`` says besides."""
+        warm, _ = self._warm_up({})
+        from .raster import trial
+
+        found = trial.run()
+        versions = {"Python": platform.python_version(), "R5DGS": __version__}
+        versions |= {name: importlib.metadata.version(name) for name in NEEDED}
+        return {**warm, "versions": versions, **dataclasses.asdict(found)}, {}
 
     def _query(self, request: dict[str, Any]) -> Answer:
         """``text``: ranked objects of a loaded ``scene``, the first one where left out."""

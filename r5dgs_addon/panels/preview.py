@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import live_preview, worker
+from .. import figures, live_preview, worker
 from . import sidebar
 
 
@@ -21,9 +21,11 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
             layout.label(text=live_preview.message(), icon="ERROR")
         if worker.notice():
             layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
-        session = context.window_manager.r5dgs
-        if session.preview_size:
-            layout.label(text=f"{session.preview_size} in {session.preview_ms:.0f} ms", icon="TIME")
+        if figures.speed():
+            column = layout.column(align=True)
+            column.label(text=figures.speed(), icon="TIME")
+            for line in figures.errors():
+                column.label(text=line[0].upper() + line[1:], icon="BLANK1")
         if context.scene.camera is None:
             layout.label(text="The scene has no camera", icon="INFO")
 

@@ -55,12 +55,14 @@ def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, s
     worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     before = sidebar()
-    monkeypatch.setattr(worker, "notice", lambda: worker.COMPILING)
+    process = importlib.import_module("r5dgs.r5dgs_addon.worker_process")
+    monkeypatch.setattr(worker, "notice", lambda: process.COMPILING)
     assert [text for text in sidebar() if text not in before] == ["Preparing the rasterizer (first use, about 10 s)"]
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):
-    exports = ["r5dgs.export_ply", "r5dgs.export_scene", "r5dgs.capture_dataset"]
+    exports = [f"r5dgs.{name}" for name in ("export_ply", "export_scene", "export_masks", "export_cameras")]
+    exports.append("r5dgs.capture_dataset")
     for menu, operators in (("import", ["r5dgs.load_scene"]), ("export", exports)):
         functions = getattr(blender.types, f"TOPBAR_MT_file_{menu}").draw._draw_funcs
         ours = [function for function in functions if function.__module__.startswith("r5dgs.")]

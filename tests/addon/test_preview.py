@@ -1,6 +1,7 @@
 """The preview is the core's picture of what Blender shows, and a worker in trouble says so."""
 
 import importlib
+import inspect
 import os
 import re
 import signal
@@ -219,7 +220,8 @@ class Window:
         self.status_text_set, self.event_timer_remove = self.said.append, self.removed.append
         self.reports = []
         members = {"_job": job, "_timer": "timer", "report": lambda _, kind, text: self.reports.append((kind, text))}
-        methods = {name: vars(operator)[name] for name in ("modal", "cancel", "_leave", "_done")}
+        names = ("modal", "cancel", "_leave", "_answered", "_finish", "waits_for")
+        methods = {name: inspect.getattr_static(operator, name) for name in names}
         self.operator = type("Operator", (), {**methods, **members})()
 
     def send(self, kind):
@@ -331,7 +333,9 @@ def test_a_wrong_python_is_named(blender, loaded, monkeypatch, tmp_path, kind):
 
 def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blender, worker, capfd):
     assert blender.ops.r5dgs.check_worker() == {"FINISHED"}
-    assert re.search(r"Worker ready: .*, rasterizer (ready|compiled in \d+ s, once)$", capfd.readouterr().out, re.M)
+    told = capfd.readouterr().out
+    versions = r"\(Python 3\.\S+, R5DGS \S+, torch \S+, numba \S+\)"
+    assert re.search(rf"Worker ready: .* {versions}, CPU, .*20,000 Gaussians at 400 x 400 in \d+ ms$", told, re.M), told
     running = worker.current()
     worker.unregister()
     assert not running.alive

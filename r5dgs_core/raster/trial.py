@@ -1,0 +1,68 @@
+"""How fast this machine draws: one made picture, timed."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..scene.cameras import Camera
+from . import rasterize_splats, splatting, warming
+
+GAUSSIANS = 20_000
+SIZE = 400
+REPEATS = 7
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of it.
+
+    Attributes:
+        milliseconds: Median of a few pictures.
+        gaussians: Number of Gaussians.
+        size: Width and height in pixels.
+        device: What drew them.
+    """
+
+    milliseconds: float
+    gaussians: int
+    size: tuple[int, int]
+    device: str
+
+
+def run() -> Trial:
+    """Draw a ball of Gaussians a few times, after the kernels are ready. Raises BackendError without a rasterizer."""
+    random = np.random.default_rng(0)
+    directions = random.normal(size=(GAUSSIANS, 3))
+    means = (
+        directions / np.linalg.norm(directions, axis=1, keepdims=True) * np.cbrt(random.uniform(size=(GAUSSIANS, 1)))
+    )
+    scales = 0.015 * np.exp(0.5 * random.normal(size=(GAUSSIANS, 3)))
+    quats, opacities, colors = (random.uniform(0.1, 0.9, (GAUSSIANS, width)) for width in (4, 1, 3))
+    inputs = [torch.from_numpy(array.astype(np.float32)) for array in (means, quats, scales, opacities[:, 0], colors)]
+    T_cam_world = np.eye(4)
+    T_cam_world[2, 3] = 3.0
+    half = SIZE / 2
+    camera = Camera(SIZE, SIZE, np.array([[2.2 * half, 0, half], [0, 2.2 * half, half], [0, 0, 1]]), T_cam_world)
+    if splatting.numba_is_there():
+        warming.warm_up(gradients=False)
+    milliseconds = []
+    with torch.no_grad():
+        for _ in range(REPEATS):
+            start = time.perf_counter()
+            rasterize_splats(*inputs, camera)
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+    return Trial(statistics.median(milliseconds), GAUSSIANS, (SIZE, SIZE), _device())
+
+
+def _device() -> str:
+    if not splatting.numba_is_there():
+        return "CPU without kernels"
+    from . import compile as compilation
+
+    count = compilation.threads()
+    return f"CPU, {count} threads" if count > 1 else "CPU, 1 thread"
