@@ -9,6 +9,8 @@ from . import (
     delete_object,
     duplicate_object,
     exact_mode,
+    export_cameras,
+    export_masks,
     export_ply,
     export_scene,
     extrapolate_until,
@@ -59,6 +61,8 @@ MODULES = (
     check_worker,
     export_ply,
     export_scene,
+    export_masks,
+    export_cameras,
     capture_dataset,
 )
 
@@ -70,6 +74,8 @@ def _menu_import(menu, context):
 def _menu_export(menu, context):
     menu.layout.operator(export_ply.R5DGS_OT_export_ply.bl_idname, text="R5DGS Gaussians (.ply)")
     menu.layout.operator(export_scene.R5DGS_OT_export_scene.bl_idname, text="R5DGS Edited Scene (.r5dgs)")
+    menu.layout.operator(export_masks.R5DGS_OT_export_masks.bl_idname, text="R5DGS Object Masks")
+    menu.layout.operator(export_cameras.R5DGS_OT_export_cameras.bl_idname, text="R5DGS Cameras")
     menu.layout.operator(capture_dataset.R5DGS_OT_capture_dataset.bl_idname, text="R5DGS Training Data Set")
 
 

@@ -19,14 +19,7 @@ class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     which: EnumProperty(name="Objects", description="What is exported", items=export_gaussians.WHICH, default="VISIBLE")
-    frames: EnumProperty(
-        name="Frames",
-        description="When it is exported",
-        items=(
-            ("CURRENT", "This Frame", "One file"),
-            ("RANGE", "Frame Range", "A numbered file for each frame of the scene's range"),
-        ),
-    )
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES)
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
     axes: EnumProperty(name="Axes", description="World that the positions are in", items=export_gaussians.AXES)
     plain: BoolProperty(
@@ -61,15 +54,7 @@ class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
         )
 
     def draw(self, context):
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        layout.prop(self, "which")
-        layout.prop(self, "frames")
-        if self.frames == "RANGE":
-            layout.prop(self, "frame_step")
-        layout.prop(self, "axes")
-        layout.prop(self, "plain")
+        export_running.draw_properties(self, "which", "frames", "frame_step", "axes", "plain")
 
 
 CLASSES = (R5DGS_OT_export_ply,)

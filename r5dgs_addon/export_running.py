@@ -37,6 +37,10 @@ class Outcome:
     warnings: list[str] = field(default_factory=list)
 
 
+FRAMES = (
+    ("CURRENT", "This Frame", "The frame that is shown"),
+    ("RANGE", "Frame Range", "Every frame of the scene's range, numbered"),
+)
 Steps = Iterator[Step]  # a generator that returns an `Outcome`
 
 
@@ -62,7 +66,11 @@ class Exporter:
         return False
 
     def execute(self, context):
-        self._running = self.steps(context)
+        try:
+            self._running = self.steps(context)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
         if bpy.app.background or context.window is None or not getattr(self, "_interactive", False):
             while True:
                 finished = self._step(context)
@@ -119,6 +127,16 @@ class Exporter:
         context.window_manager.progress_end()
         if context.workspace is not None:
             context.workspace.status_text_set(None)
+
+
+def draw_properties(operator, *names: str) -> None:
+    """Draw properties of an export; the frame step where there is a range alone."""
+    layout = operator.layout
+    layout.use_property_split = True
+    layout.use_property_decorate = False
+    for name in names:
+        if name != "frame_step" or operator.frames == "RANGE":
+            layout.prop(operator, name)
 
 
 @contextmanager

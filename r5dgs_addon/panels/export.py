@@ -7,6 +7,8 @@ from . import sidebar
 ENTRIES = (
     ("r5dgs.export_ply", "Gaussians (.ply)", "POINTCLOUD_DATA"),
     ("r5dgs.export_scene", "Edited Scene (.r5dgs)", "FILE_TICK"),
+    ("r5dgs.export_masks", "Object Masks", "MOD_MASK"),
+    ("r5dgs.export_cameras", "Cameras", "CAMERA_DATA"),
 )  # fmt: skip
 
 

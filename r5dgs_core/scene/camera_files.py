@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..motion import rotations
 from . import cameras, files
 from .cameras import Camera
@@ -91,13 +89,6 @@ def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
     _write_lines(folder / "images.txt", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points", image_lines)
     _write_lines(folder / "points3D.txt", "POINT3D_ID X Y Z R G B ERROR TRACK[]", [])
     return folder
-
-
-def in_axes(camera: Camera, rotation: np.ndarray) -> Camera:
-    """The same camera in a world whose axes are turned: a point p of the old world is rotation p of the new. [3, 3]"""
-    turned = camera.T_cam_world.copy()
-    turned[:3, :3] = camera.T_cam_world[:3, :3] @ np.asarray(rotation, np.float64).T
-    return Camera(camera.width, camera.height, camera.intrinsics, turned, camera.name)
 
 
 def _lens(camera: Camera) -> dict[str, float]:

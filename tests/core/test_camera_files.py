@@ -52,12 +52,3 @@ def test_colmap_text_is_read_back(tmp_path):
         )
     times = json.loads((tmp_path / "times.json").read_text())["times"]
     assert times == {view.file_path.removeprefix("images/"): view.t for view in written}
-
-
-def test_turned_axes_show_turned_points_in_the_same_place():
-    camera, rotation = orbit_camera(0.7), cameras.WORLD_TO_BLENDER["colmap"]
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    turned = camera_files.in_axes(camera, rotation)
-    np.testing.assert_allclose(
-        cameras.project(turned, points @ rotation.T)[0], cameras.project(camera, points)[0], atol=1e-9
-    )

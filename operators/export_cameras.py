@@ -1,0 +1,53 @@
+"""Export Cameras: Blender's cameras as transforms.json or COLMAP text."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..r5dgs_addon import export_cameras, export_gaussians, export_running
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_export_cameras(export_running.Exporter, bpy.types.Operator):
+    """Write cameras with lens, pose and time for radiance-field tools"""
+
+    bl_idname = "r5dgs.export_cameras"
+    bl_label = "Export Cameras"
+    bl_options = {"REGISTER", "PRESET"}
+
+    directory: StringProperty(
+        name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    which: EnumProperty(name="Cameras", description="What is exported", items=export_cameras.WHICH)
+    format: EnumProperty(name="Format", description="What is written", items=export_cameras.FORMATS)
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES, default="RANGE")
+    frame_step: IntProperty(name="Frame Step", description="Frames from one view to the next", default=1, min=1)
+    axes: EnumProperty(name="Axes", description="World that the cameras are in", items=export_gaussians.AXES)
+
+    @classmethod
+    def poll(cls, context):
+        if not any(obj.type == "CAMERA" for obj in context.scene.objects):
+            cls.poll_message_set("Add a camera to the scene first")
+            return False
+        return True
+
+    def steps(self, context):
+        if not self.directory:
+            raise errors.ConfigError("export: expected a folder for the cameras, got nothing; choose one")
+        return export_cameras.steps(
+            context,
+            Path(bpy.path.abspath(self.directory)),
+            self.which,
+            format=self.format,
+            axes=self.axes,
+            every=self.frames == "RANGE",
+            step=self.frame_step,
+        )
+
+    def draw(self, context):
+        export_running.draw_properties(self, "which", "format", "frames", "frame_step", "axes")
+
+
+CLASSES = (R5DGS_OT_export_cameras,)

@@ -1,0 +1,49 @@
+"""Export Masks: which object each pixel shows, as PNG masks and index EXR."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+
+from ..r5dgs_addon import export_masks, export_running, objects
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_export_masks(export_running.Exporter, bpy.types.Operator):
+    """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
+
+    bl_idname = "r5dgs.export_masks"
+    bl_label = "Export Object Masks"
+    bl_options = {"REGISTER", "PRESET"}
+
+    directory: StringProperty(
+        name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    format: EnumProperty(name="Format", description="What is written", items=export_masks.FORMATS)
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES, default="RANGE")
+    frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
+
+    @classmethod
+    def poll(cls, context):
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        if context.scene.camera is None:
+            cls.poll_message_set("Add a camera to the scene first")
+            return False
+        return True
+
+    def steps(self, context):
+        if not self.directory:
+            raise errors.ConfigError("export: expected a folder for the masks, got nothing; choose one")
+        folder = Path(bpy.path.abspath(self.directory))
+        return export_masks.steps(
+            context, folder, format=self.format, every=self.frames == "RANGE", step=self.frame_step
+        )
+
+    def draw(self, context):
+        export_running.draw_properties(self, "format", "frames", "frame_step")
+
+
+CLASSES = (R5DGS_OT_export_masks,)

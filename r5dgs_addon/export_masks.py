@@ -1,0 +1,94 @@
+"""Which object each pixel shows, for a range of frames: masks as data sets have them, and index with depth as EXR."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..r5dgs_core import errors
+from ..r5dgs_core.scene import files, image_files
+from . import engine_passes, export_cameras, export_running, picture, table, views, visible
+from .export_running import Outcome, Step, Steps
+
+LAYER = "R5DGS"  # of the EXR's channels, as in Blender's own multilayer files
+FORMATS = (
+    ("PNG", "Masks", "PNG of 8 bits, or 16 where an id exceeds 255, in object_mask; 0 is the background"),
+    ("EXR", "Index and Depth", "Multilayer OpenEXR in object_index: object index, depth and alpha, for the compositor"),
+    ("BOTH", "Both", "Masks, and index with depth"),
+)
+
+
+def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool, step: int = 1) -> Steps:
+    """Write ``object_mask/images/frame_0001.png``, ``object_index/frame_0001.exr`` and ``objects.json`` into a folder.
+
+    Args:
+        context: Its scene has camera, resolution and frames; what its view layer hides is left out.
+        folder: Made where it does not exist.
+        format: Of `FORMATS`.
+        every: The scene's frame range instead of the current frame.
+        step: Frames from one file to the next.
+
+    Raises:
+        R5dgsError: There is no camera, the worker cannot render, or a file cannot be written.
+    """
+    scene, names = context.scene, {}
+    frames = export_running.frames_of(scene, every, step)
+    with export_running.frame_kept(scene):
+        for number, frame in enumerate(frames):
+            yield Step(number, len(frames), f"frame {frame}")
+            export_running.go_to(scene, frame)
+            depsgraph = context.evaluated_depsgraph_get()
+            seen = picture.shown(depsgraph)
+            view = views.of_camera(depsgraph, visible.points(seen.instances), border=False)
+            seen = picture.Shown(view, seen.scenes, seen.worlds, seen.instances)
+            _, arrays = picture.render(seen, ("owners", "depth", "alpha"), sky=False)
+            names |= _names(seen)
+            try:
+                _write(folder, export_cameras.image_name(frame), format, *planes(seen, arrays))
+                files.write(folder / "objects.json", (json.dumps(names, indent=1, ensure_ascii=False) + "\n").encode())
+            except OSError as error:
+                raise errors.SceneFileError(f"{folder}: cannot be written: {error}") from error
+    return Outcome(f"{folder}: {len(frames)} frames of {len(names)} objects")
+
+
+def planes(seen: picture.Shown, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Object index, depth and alpha of a picture: the index is the render engine's, 0 where nothing is in front.
+
+    Args:
+        seen: What was rendered.
+        arrays: The worker's ``owners``, ``depth`` and ``alpha``. [H, W]
+
+    Returns:
+        Indices int64, depths along the view and alphas float32. [H, W] each
+    """
+    indices = np.array([*(engine_passes.index_of(instance) for instance in seen.instances), 0], np.int64)
+    solid = arrays["alpha"] >= engine_passes.SOLID
+    depth = np.where(solid, arrays["depth"], np.float32(engine_passes.NOTHING)).astype(np.float32)
+    return indices[arrays["owners"]], depth, arrays["alpha"].astype(np.float32)
+
+
+def _write(folder: Path, image: str, format: str, indices: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
+    if format in ("PNG", "BOTH"):
+        if indices.max() > 65535:
+            raise errors.ConfigError(f"pass index {indices.max()}: expected at most 65535 for a mask; set a lower one")
+        path = folder / "object_mask" / image
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image_files.write_png(path, indices.astype(np.uint8 if indices.max() < 256 else np.uint16))
+    if format in ("EXR", "BOTH"):
+        path = folder / "object_index" / Path(image).with_suffix(".exr").name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        channels = {"IndexOB.X": indices.astype(np.float32), "Depth.Z": depth, "Alpha.V": alpha}
+        image_files.write_exr(path, {f"{LAYER}.{name}": values for name, values in channels.items()})
+
+
+def _names(seen: picture.Shown) -> dict[str, str]:
+    """Names by index of what is shown, as ``objects.json`` of a data set has them."""
+    found = {}
+    current = {collection: table.names(collection) for collection in seen.scenes}
+    for instance in seen.instances:
+        index, object_id = engine_passes.index_of(instance), instance.object.r5dgs.object_id
+        if index > 0:
+            own = instance.object.name
+            found.setdefault(str(index), current[instance.collection].get(object_id, own) if object_id > 0 else own)
+    return found
