@@ -76,7 +76,7 @@ class Port:
         """Draw the last picture over the region, and wish for what it shows now."""
         region, scene = context.region, depsgraph.scene
         try:
-            self._want(context, depsgraph)
+            self.want(_wish(context, depsgraph))
         except errors.R5dgsError as error:
             self._message = str(error)
         if self._pixels is not None:
@@ -91,17 +91,12 @@ class Port:
             gpu.state.blend_set("NONE")
         engine.update_stats("R5DGS", self._message)
 
-    def _want(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        scene, settings = depsgraph.scene, engine_settings.of(depsgraph.scene)
-        scenes, instances = visible.instances(depsgraph, context.space_data)
-        view = views.of_region(context.region, context.region_data, visible.points(instances))
-        seen = picture.Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
-        transparent = scene.render.film_transparent
-        wish = Wish(seen, settings.sky and not transparent, transparent, int(settings.moving))
+    def want(self, wish: Wish) -> None:
+        """Wish for a picture; nothing happens where it is the one that was wished for."""
         if not wish.same(self._wish):
             self._wish, self._failed = wish, None
-        if self.next() is not None:
-            _run()
+        if self.next() is not None and not bpy.app.timers.is_registered(look):
+            bpy.app.timers.register(look, first_interval=0.0)
 
     def next(self) -> tuple[Wish, int] | None:
         """The picture that it waits for and by what that is smaller; None where it shows what it should."""
@@ -138,10 +133,14 @@ class Port:
         self._failed, self._message = wish, str(error)
 
 
-def _run() -> None:
-    """Have the timer look after the viewports until they show what they should."""
-    if not bpy.app.timers.is_registered(look):
-        bpy.app.timers.register(look, first_interval=0.0)
+def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
+    """What the viewport that is being drawn should show."""
+    scene, settings = depsgraph.scene, engine_settings.of(depsgraph.scene)
+    scenes, instances = visible.instances(depsgraph, context.space_data)
+    view = views.of_region(context.region, context.region_data, visible.points(instances))
+    seen = picture.Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
+    transparent = scene.render.film_transparent
+    return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving))
 
 
 def look() -> float | None:

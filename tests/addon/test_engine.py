@@ -55,6 +55,8 @@ def render_png(bpy, folder, name="out"):
     """What Blender saves, as 8 bits per channel, / 255. [H, W, 3 or 4]"""
     settings = bpy.context.scene.render
     settings.filepath = str(folder / f"{name}.png")
+    if hasattr(settings.image_settings, "media_type"):
+        settings.image_settings.media_type = "IMAGE"
     settings.image_settings.file_format = "PNG"
     settings.image_settings.color_mode = "RGBA" if settings.film_transparent else "RGB"
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
@@ -238,6 +240,15 @@ def test_colour_management_that_changes_colours_is_named_and_put_right(blender, 
     blender.ops.r5dgs.show_colors_as_trained()
     assert color.objections(blend_scene) == []
     assert "r5dgs.show_colors_as_trained" not in layouts.draw(blender, *panels.CLASSES)
+
+
+@pytest.mark.parametrize("space", ["Linear Rec.2020", "ACEScg"])
+def test_other_working_spaces_show_the_same_bytes(blender, loaded, scene, tmp_path, space):
+    if not hasattr(blender.data, "colorspace"):
+        pytest.skip("this Blender has one scene-linear space only")
+    blender.ops.wm.set_working_color_space(working_space=space, convert_colors=False)
+    go_to(blender, 0.0)
+    assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.0).color.numpy(), 0, 1)) > 45
 
 
 def test_a_render_that_cannot_be_says_why_and_writes_nothing(blender, loaded, tmp_path):
