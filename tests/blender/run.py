@@ -193,9 +193,8 @@ def tests(arguments: list[str]) -> str:
 
     os.chdir(ROOT)
     absent: list[str] = []
-    given = arguments or ["tests/addon"]
     options = ["-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT)]
-    code = pytest.main([*options, *given], plugins=[_without_torch(pytest, absent)])
+    code = pytest.main([*options, *arguments], plugins=[_without_torch(pytest, absent)])
     left_out = f"; left out for want of torch: {', '.join(sorted(absent))}" if absent else ""
     return f"{'passed' if code == 0 else f'FAILED with code {int(code)}'}{left_out}"
 
@@ -207,8 +206,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--no-figures", action="store_true", help="tests only")
     parser.add_argument("--no-tests", action="store_true", help="figures only")
-    parser.add_argument("tests", nargs="*", help="which tests, as for pytest; all of the extension's by default")
-    options = parser.parse_args(arguments)
+    parser.add_argument(
+        "tests", nargs="*", help="which tests and how, as for pytest; all of the extension's by default"
+    )
+    options, others = parser.parse_known_args(arguments)
     kind = "program" if bpy.app.binary_path else "module"
     print(f"Blender {bpy.app.version_string} ({kind}), Python {platform.python_version()}, numpy {np.__version__}")
     failed, result = [], {"blender": bpy.app.version_string, "kind": kind, "rows": []}
@@ -217,7 +218,7 @@ def main(arguments: list[str]) -> int:
         failed += table.failed
         result["rows"] = [{**row, "value": row["value"] if math.isfinite(row["value"]) else None} for row in table.rows]
     if not options.no_tests:
-        result["tests"] = tests(options.tests)
+        result["tests"] = tests([*(options.tests or ["tests/addon"]), *others])
         failed += ["tests"] if result["tests"].startswith("FAILED") else []
         print(f"  tests: {result['tests']}")
     if options.json:

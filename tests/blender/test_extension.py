@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.blender
 ROOT = Path(__file__).resolve().parents[2]
 
 SESSION = r"""
-import importlib.abc, json, sys
+import importlib.abc, json, os, sys
 
 class Blocked(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
@@ -30,8 +31,22 @@ sys.meta_path.insert(0, Blocked())
 import bpy
 import addon_utils
 
-archive, scene_path = sys.argv[1:]
+archive, scene_path, *others = sys.argv[1:]
+reloading = others == ["reloading"]
 module = "bl_ext.user_default.r5dgs"
+
+
+def traces():
+    found = [name for name in dir(bpy.types) if "R5DGS" in name.upper()]
+    for name in dir(bpy.app.handlers):
+        listening = getattr(bpy.app.handlers, name)
+        if isinstance(listening, list):
+            found += [f for f in listening if getattr(f, "__module__", "").startswith(module)]
+    for owner in ("Object", "Collection", "Scene", "WindowManager"):
+        found += [p.identifier for p in getattr(bpy.types, owner).bl_rna.properties if "r5dgs" in p.identifier.lower()]
+    return found
+
+
 seen = []
 for turn in range(2):
     bpy.ops.wm.read_homefile(app_template="", use_empty=True)
@@ -46,8 +61,14 @@ for turn in range(2):
     assert bpy.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
     mug = bpy.data.objects["mug"]
     seen.append([mug.matrix_world[i][3] for i in range(3)] + [len(mug.data.points)])
+    if reloading:
+        bpy.ops.script.reload()  # Blender's Reload Scripts
+        assert addon_utils.check(module)[1] and traces(), "not enabled after reloading"
+        assert [c.r5dgs.gaussians for c in bpy.data.collections if c.r5dgs.is_scene] == [300]
+        assert bpy.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+        assert bpy.ops.r5dgs.load_scene(filepath=scene_path) == {"FINISHED"}
     addon_utils.disable(module, default_set=True)
-    assert not hasattr(bpy.types, "R5DGS_OT_load_scene") and not hasattr(bpy.types.Object, "r5dgs")
+    assert traces() == [], traces()
     bpy.context.scene.frame_set(20)  # the motion plays on without the extension
     repositories = list(bpy.context.preferences.extensions.repos)
     index = next(i for i, repository in enumerate(repositories) if repository.module == "user_default")
@@ -55,7 +76,9 @@ for turn in range(2):
     for name in [name for name in sys.modules if name.startswith(module)]:
         del sys.modules[name]
 loaded = sorted(name for name in sys.modules if name.split(".")[0] in ("torch", "numba", "scipy"))
-print("RESULT " + json.dumps({"seen": seen, "loaded": loaded}))
+print("RESULT " + json.dumps({"seen": seen, "loaded": loaded}), flush=True)
+if reloading:
+    os._exit(0)  # the bpy module of 4.2 crashes at its end once scripts were reloaded, with or without extensions
 """
 
 
@@ -91,14 +114,15 @@ def test_the_archive_validates_and_holds_the_extension_only(archive):
     assert archive.stat().st_size < 2_000_000
 
 
-def test_installs_works_without_torch_and_goes_away_twice_in_a_row(archive, tmp_path):
+@pytest.mark.parametrize("options", [[], ["reloading"]], ids=["plain", "reloading scripts"])
+def test_installs_works_without_torch_and_goes_away_twice_in_a_row(archive, tmp_path, options):
     scene_path = scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")
     script = tmp_path / "session.py"
     script.write_text(SESSION)
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user"), "PYTHONPATH": ""}
     environment.pop("R5DGS_PYTHON", None)
     done = subprocess.run(
-        [sys.executable, str(script), str(archive), str(scene_path)],
+        [sys.executable, str(script), str(archive), str(scene_path), *options],
         capture_output=True, text=True, env=environment, cwd=tmp_path, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -107,3 +131,55 @@ def test_installs_works_without_torch_and_goes_away_twice_in_a_row(archive, tmp_
     result = json.loads(line.removeprefix("RESULT "))
     assert result["loaded"] == []
     assert result["seen"][0] == result["seen"][1] and result["seen"][0][3] > 0
+    assert named_after_us(tmp_path / "user") == []
+
+
+def named_after_us(folder):
+    """Files and folders that the extension left in a user's folder."""
+    return [str(path) for path in folder.rglob("*r5dgs*")]
+
+
+USING = """
+import bpy, sys
+assert "R5DGS_OT_load_scene" in dir(bpy.types)
+assert bpy.ops.r5dgs.load_scene(filepath=sys.argv[-1]) == {"FINISHED"}
+bpy.context.scene.frame_set(55)
+assert bpy.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+print("USED", len(bpy.data.objects["mug"].data.points))
+"""
+GONE = """
+import bpy
+assert not [name for name in dir(bpy.types) if "R5DGS" in name.upper()]
+assert not hasattr(bpy.types.Object, "r5dgs")
+print("GONE")
+"""
+
+
+@pytest.mark.skipif(shutil.which("blender") is None, reason="there is no program 'blender' here")
+def test_blenders_command_line_installs_it_and_removes_it_without_a_trace(tmp_path):
+    scene_path = scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")
+    user, out = tmp_path / "user", tmp_path / "out"
+    user.mkdir()
+    out.mkdir()
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(user), "PYTHONPATH": ""}
+    environment.pop("R5DGS_PYTHON", None)
+
+    def blender(*arguments):
+        command = ["blender", *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, timeout=300)
+        said = done.stdout + done.stderr
+        assert done.returncode == 0 and "Traceback" not in said, said
+        return said
+
+    blender("--command", "extension", "validate", ROOT)
+    blender("--command", "extension", "build", "--source-dir", ROOT, "--output-dir", out)
+    (archive,) = out.glob("*.zip")
+    blender("--command", "extension", "validate", archive)
+    blender("--command", "extension", "install-file", "-r", "user_default", "--enable", archive)
+    (tmp_path / "using.py").write_text(USING)
+    (tmp_path / "gone.py").write_text(GONE)
+    used = blender("-b", "--python-exit-code", "1", "--python", tmp_path / "using.py", "--", scene_path)
+    assert "USED" in used
+    blender("--command", "extension", "remove", "r5dgs")
+    assert "GONE" in blender("-b", "--python-exit-code", "1", "--python", tmp_path / "gone.py")
+    assert named_after_us(user) == []
