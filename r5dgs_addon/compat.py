@@ -180,5 +180,10 @@ def working_space() -> str:
 
 
 def panels_of_all_engines() -> list[type]:
-    """Blender's own panels that are for every engine. It knows them by an engine that it no longer has."""
-    return [p for p in bpy.types.Panel.__subclasses__() if "BLENDER_RENDER" in getattr(p, "COMPAT_ENGINES", ())]
+    """Blender's own panels that are for every engine. It knows them by an engine that it no longer has.
+
+    What means nothing for Gaussians is left out: simplifying, Freestyle, Grease Pencil.
+    """
+    panels = [p for p in bpy.types.Panel.__subclasses__() if "BLENDER_RENDER" in getattr(p, "COMPAT_ENGINES", ())]
+    words = ("simplify", "freestyle", "gpencil", "grease_pencil")
+    return [panel for panel in panels if not any(word in panel.__name__.lower() for word in words)]

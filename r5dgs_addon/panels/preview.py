@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import figures, live_preview, worker
+from .. import engine, figures, live_preview, worker
 from . import sidebar
 
 
@@ -28,6 +28,8 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
                 column.label(text=line[0].upper() + line[1:], icon="BLANK1")
         if context.scene.camera is None:
             layout.label(text="The scene has no camera", icon="INFO")
+        if context.scene.render.engine != engine.ENGINE:
+            layout.operator("r5dgs.use_engine", icon="SCENE")
 
 
 CLASSES = (R5DGS_PT_preview,)
