@@ -50,7 +50,9 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
         state.tube = tube
     tube.parent = anchor.parent
     tube.matrix_parent_inverse = anchor.matrix_parent_inverse
-    _fill(tube.data, centers, np.maximum(sigmas, THINNEST * reach), sigmas / (LOST * reach))
+    doubts = np.clip(sigmas / (LOST * reach), 0.0, 1.0)
+    _fill(tube.data, centers, np.maximum(sigmas, THINNEST * reach), doubts)
+    tube.color = (*_color(doubts[-1:])[0], 1.0)  # of viewports that show objects by their own colour
     return tube
 
 
@@ -94,7 +96,7 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
 
 
 def _fill(mesh: bpy.types.Mesh, centers: np.ndarray, radii: np.ndarray, doubts: np.ndarray) -> None:
-    """Write a tube of rings to a mesh: centres [H, 3], radii [H], doubts from 0 (sure) to 1 and above [H]."""
+    """Write a tube of rings to a mesh: centres [H, 3], radii [H], doubts from 0 (sure) to 1 (unsure) [H]."""
     count = len(centers)
     rings = _rings(centers)
     points = centers[:, None] + radii[:, None, None] * rings
@@ -103,13 +105,16 @@ def _fill(mesh: bpy.types.Mesh, centers: np.ndarray, radii: np.ndarray, doubts: 
     faces = np.stack([a, b, b + SIDES, a + SIDES], axis=-1)
     mesh.clear_geometry()
     mesh.from_pydata(points.reshape(-1, 3).tolist(), [], faces.tolist())
-    share = np.clip(doubts, 0.0, 1.0)[:, None]
-    color = (1 - share) * np.array(SURE) + share * np.array(UNSURE)
-    colors = np.repeat(np.concatenate([color, np.ones((count, 1))], axis=-1), SIDES, axis=0)
+    colors = np.repeat(np.concatenate([_color(doubts), np.ones((count, 1))], axis=-1), SIDES, axis=0)
     attribute = mesh.attributes.get(COLOR) or mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT")
     attribute.data.foreach_set("color", colors.astype(np.float32).ravel())
     mesh.attributes.active_color_name = COLOR
     mesh.update()
+
+
+def _color(doubts: np.ndarray) -> np.ndarray:
+    """[H] -> [H, 3] linear"""
+    return (1 - doubts[:, None]) * np.array(SURE) + doubts[:, None] * np.array(UNSURE)
 
 
 def _rings(centers: np.ndarray) -> np.ndarray:
@@ -136,6 +141,7 @@ def _material() -> bpy.types.Material:
     if found is not None:
         return found
     result = bpy.data.materials.new(name)
+    result.diffuse_color = (*(0.5 * (np.array(SURE) + np.array(UNSURE))), 1.0)
     tree = compat.empty_nodes(result)
     attribute = tree.nodes.new("ShaderNodeAttribute")
     attribute.attribute_name = COLOR

@@ -104,14 +104,14 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         **_vector("acceleration"),
     )
     angular_velocity: FloatVectorProperty(
-        name="Spin",
+        name="Spin /s",
         description="Rotation vector per second: the axis, as long as the angle",
         subtype="EULER",
         unit="ROTATION",
         **_vector("angular_velocity"),
     )
     angular_acceleration: FloatVectorProperty(
-        name="Spin Change",
+        name="Spin Change /s²",
         description="How the spin changes, per second and second",
         subtype="EULER",
         unit="ROTATION",
@@ -125,8 +125,8 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         **_vector("center_offset"),
     )
     frequency: FloatProperty(
-        name="Swings per Second",
-        description="0 moves steadily; else the motion swings to and fro",
+        name="Swings /s",
+        description="How often a second the motion swings to and fro; 0 moves steadily",
         get=_read_swing,
         set=_write_swing,
         options=set(),

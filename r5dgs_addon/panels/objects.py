@@ -91,7 +91,7 @@ def _draw_active(box, collection, entry):
 
 def _motion(own) -> str:
     """How an object moves, as its anchor's physics say; "" where that is not known."""
-    for cloud in own:
+    for cloud in sorted(own, key=lambda cloud: -cloud.r5dgs.count):
         physics = getattr(cloud.parent, "r5dgs_motion", None)
         if physics is not None and "kind" in physics.bl_rna.properties:
             items = physics.bl_rna.properties["kind"].enum_items
