@@ -45,11 +45,17 @@ def cloud(collection, name):
     return next(o for o in collection.all_objects if o.name == name and o.r5dgs.role == "CLOUD")
 
 
+def turn_about(obj, turn):
+    """A rotation and a scale about an object's pivot."""
+    pivot = Matrix.Translation(obj.r5dgs.pivot)
+    return pivot @ turn @ Matrix.Scale(1.6, 4) @ pivot.inverted()
+
+
 def edit(bpy, collection):
     """Move, turn and scale one object, mirror another, hide a third. Its anchor moves the first all the same."""
     mug, apple, car = (cloud(collection, name) for name in ("mug", "red apple", "toy car"))
     turn = Quaternion((0.6, 0.3, -0.5, 0.4)).normalized().to_matrix().to_4x4()
-    mug.matrix_local = Matrix.Translation((0.3, -0.2, 0.4)) @ turn @ Matrix.Scale(1.6, 4)
+    mug.matrix_local = Matrix.Translation((0.1, -0.2, 0.1)) @ mug.matrix_local @ turn_about(mug, turn)
     apple.scale = (-1, 1, 1)
     car.hide_set(True)
     bpy.context.view_layer.update()
@@ -89,16 +95,45 @@ def in_blender(camera):
     return dataclasses.replace(camera, T_cam_world=camera.T_cam_world @ np.linalg.inv(world))
 
 
+def select(splats, rows):
+    """Some of the Gaussians of a file."""
+    parts = {field.name: getattr(splats, field.name) for field in dataclasses.fields(splats)}
+    return ply.Splats(**{name: None if values is None else values[rows] for name, values in parts.items()})
+
+
 def test_what_was_moved_turned_scaled_and_mirrored_looks_as_in_blender(blender, scene, loaded, tmp_path):
-    blender.context.scene.frame_set(20)
+    blender.context.scene.frame_set(43)
     edit(blender, loaded)
     camera = in_blender(scene.cameras[0])
     splats = export(blender, tmp_path / "a.ply")
     assert splats.sh.shape[1] == 16
     wanted = shown(scene, loaded, camera)
     assert psnr(render(splats, scene, camera), wanted) > 50
-    blender.context.scene.frame_set(50)
-    assert psnr(render(splats, scene, camera), shown(scene, loaded, camera)) < 35  # the file is that of frame 20
+    without = select(splats, splats.object_ids != 1)
+    assert psnr(render(without, scene, camera), wanted) < 35  # it can be seen
+    blender.context.scene.frame_set(30)
+    assert psnr(render(splats, scene, camera), shown(scene, loaded, camera)) < 35  # the file is that of frame 43
+
+
+def test_a_moved_turned_scaled_and_tinted_object_looks_as_in_the_preview(blender, scene, loaded, tmp_path, monkeypatch):
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    blender.context.scene.frame_set(43)
+    mug, _, _ = edit(blender, loaded)
+    mug.r5dgs_look.tint = (0.4, 1.3, 0.8)
+    camera, view = in_blender(scene.cameras[0]), blender.context.scene
+    view.camera.data.sensor_fit = "HORIZONTAL"
+    view.camera.data.lens = camera.intrinsics[0, 0] * view.camera.data.sensor_width / camera.width
+    view.camera.matrix_world = Matrix(cameras.cam_world_to_opengl(camera.T_cam_world).tolist())
+    view.render.resolution_x, view.render.resolution_y, view.render.resolution_percentage = 96, 72, 100
+    blender.context.view_layer.update()
+    assert blender.ops.r5dgs.preview() == {"FINISHED"}
+    image = blender.data.images["R5DGS Preview"]
+    pixels = np.empty(4 * 96 * 72, np.float32)
+    image.pixels.foreach_get(pixels)
+    shown_there = pixels.reshape(72, 96, 4)[::-1, :, :3]
+    assert psnr(render(export(blender, tmp_path / "a.ply"), scene, camera), shown_there) > 40
+    mug.r5dgs_look.tint = (1, 1, 1)
+    assert psnr(render(export(blender, tmp_path / "b.ply"), scene, camera), shown_there) < 40
 
 
 def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path):
