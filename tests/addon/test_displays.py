@@ -70,6 +70,23 @@ def test_the_display_can_be_changed_and_leaves_nothing_behind(blender, scene_pat
     assert {kind: len(getattr(blender.data, kind)) for kind in before} == before
 
 
+def test_one_undo_takes_a_display_back_and_redo_brings_it(blender, scene_path):
+    def display():
+        collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+        clouds = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]
+        return collection.r5dgs.display, {len(cloud.modifiers) for cloud in clouds}, len(blender.data.node_groups)
+
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    blender.ops.ed.undo_push(message="Load Scene")
+    blender.ops.r5dgs.set_display(display="ELLIPSOIDS")
+    blender.ops.ed.undo_push(message="Set Display")
+    assert display() == ("ELLIPSOIDS", {1}, 1)
+    blender.ops.ed.undo()
+    assert display() == ("POINTS", {0}, 0)
+    blender.ops.ed.redo()
+    assert display() == ("ELLIPSOIDS", {1}, 1)
+
+
 def test_without_a_scene_there_is_no_display_to_set(blender):
     with pytest.raises(RuntimeError, match="Load an R5DGS scene first"):
         blender.ops.r5dgs.set_display(display="POINTS")

@@ -1,8 +1,10 @@
 """The life of a session: files that move, scenes that are appended, linked, loaded twice, or loaded in odd places."""
 
 import importlib
+import inspect
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -254,7 +256,7 @@ def test_a_linked_scene_is_not_loaded_into(blender, scene_path, tmp_path):
 
 
 def traces(bpy):
-    """What the extension has hung up in Blender: classes, properties, handlers, menus, keymaps."""
+    """What the extension has hung up in Blender: classes, properties, handlers, timers, menus, keymaps."""
     found = {name for name in dir(bpy.types) if "R5DGS" in name.upper()}
     for owner in ("Object", "Collection", "Scene", "WindowManager", "Material", "Camera", "PointCloud"):
         properties = getattr(bpy.types, owner).bl_rna.properties
@@ -263,6 +265,10 @@ def traces(bpy):
         listening = getattr(bpy.app.handlers, name)
         if isinstance(listening, list):
             found |= {f"{name}: {f}" for f in listening if getattr(f, "__module__", "").startswith("r5dgs.")}
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("r5dgs.r5dgs_addon", "r5dgs.operators")):
+            functions = [value for value in vars(module).values() if inspect.isfunction(value)]
+            found |= {f"timer: {f}" for f in functions if bpy.app.timers.is_registered(f)}
     for name in dir(bpy.types):
         drawn = getattr(getattr(getattr(bpy.types, name), "draw", None), "_draw_funcs", ())
         found |= {f"{name}: {f}" for f in drawn if f.__module__.startswith("r5dgs.")}
