@@ -1,5 +1,8 @@
 """The F-curves of an anchor as the user left them, and how to write anew what comes after a frame.
 
+Frames are those of the action. Where a strip of the NLA plays it at another time or pace, it does so for what is
+written, too.
+
 A curve up to that frame stays as it is: keys, handles, easing. Where no key lies at it, the segment across it is cut
 there without changing its shape.
 """
@@ -28,13 +31,11 @@ class Place:
         action: Their action, or None where there is none yet.
         slot: Its slot, where actions have some.
         strip: The strip of the NLA that plays it, or None for the active action.
-        shift: Frames that the scene is ahead of the action.
     """
 
     action: bpy.types.Action | None
     slot: object
     strip: bpy.types.NlaStrip | None = None
-    shift: float = 0.0
 
     def curves(self) -> dict[tuple[str, int], bpy.types.FCurve]:
         """Its curves of location and rotation by path and component."""
@@ -71,12 +72,11 @@ def place(anchor: bpy.types.Object) -> Place:
         if not strips:
             return Place(None, None)
         strip = strips[0]
-        if len(strips) > 1 or strip.scale != 1.0 or strip.repeat != 1.0 or strip.use_reverse:
+        if len(strips) > 1:
             raise errors.ConfigError(
-                f"{name}: its motion is several NLA strips, or a scaled, repeated or reversed one; keep one plain "
-                "strip, or make its action the active one again"
+                f"{name}: its motion is {len(strips)} NLA strips; keep one, or make its action the active one again"
             )
-        found = Place(strip.action, compat.slot_of(strip), strip, strip.frame_start - strip.action_frame_start)
+        found = Place(strip.action, compat.slot_of(strip), strip)
     if found.action is not None and found.action.library is not None:
         raise errors.ConfigError(f"{name}: its action comes from another .blend file; make it local first")
     return found
@@ -96,9 +96,7 @@ def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.nd
         values.append(
             np.array(
                 [
-                    _value(anchor.name, curves[path, index], frame - where.shift)
-                    if (path, index) in curves
-                    else still[index]
+                    _value(anchor.name, curves[path, index], frame) if (path, index) in curves else still[index]
                     for index in range(count)
                 ],
                 np.float64,
@@ -170,8 +168,8 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
     Args:
         anchor: The anchor.
         where: Where its curves lie, from `place`.
-        frame: The frame, of the scene.
-        tails: By path, keys over frames of the scene; the first lies at ``frame`` and joins what is there. Paths that
+        frame: The frame.
+        tails: By path, keys over frames; the first lies at ``frame`` and joins what is there. Paths that
             are not named hold from ``frame`` on what they are there.
     """
     curves = where.curves()
@@ -185,22 +183,22 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
             for index in range(count):
                 if (path, index) not in curves:
                     curves[path, index] = owned.new(path, index=index)
-                    _start(curves[path, index], frame - where.shift, float(getattr(anchor, path)[index]))
+                    _start(curves[path, index], frame, float(getattr(anchor, path)[index]))
         for index in range(count):
             if (path, index) in curves:
-                component = None if not changes else _component(tail, index, where.shift)
-                _replace(anchor.name, curves[path, index], frame - where.shift, component)
+                component = None if not changes else _component(tail, index)
+                _replace(anchor.name, curves[path, index], frame, component)
     if where.strip is not None:
         _stretch(where.strip)
 
 
-def _component(keys: Keys, index: int, shift: float) -> Keys | None:
-    """One component of keys, over frames of the action; None where it does not change."""
+def _component(keys: Keys, index: int) -> Keys | None:
+    """One component of keys; None where it does not change."""
     column = slice(index, index + 1)
     values = keys.values[:, column]
     if not keyframes.varies(values):
         return None
-    return Keys(keys.times - shift, values, keys.left_slopes[:, column], keys.right_slopes[:, column])
+    return Keys(keys.times, values, keys.left_slopes[:, column], keys.right_slopes[:, column])
 
 
 def _start(curve: bpy.types.FCurve, frame: float, value: float) -> None:
@@ -303,9 +301,9 @@ def _stretch(strip: bpy.types.NlaStrip) -> None:
          for point in list(curve.keyframe_points)[-1:]),
         default=strip.action_frame_end,
     )  # fmt: skip
-    shift = strip.frame_start - strip.action_frame_start
     strip.action_frame_end = max(last, strip.action_frame_start + 1)
-    strip.frame_end = strip.action_frame_end + shift
+    length = (strip.action_frame_end - strip.action_frame_start) * strip.scale * strip.repeat
+    strip.frame_end = strip.frame_start + length
 
 
 def make_own(anchor: bpy.types.Object) -> None:
@@ -327,7 +325,7 @@ def digest(where: Place, frame: float) -> str:
     found = hashlib.sha1(usedforsecurity=False)
     for (path, index), curve in sorted(where.curves().items(), key=lambda item: item[0]):
         points = _Points(curve)
-        later = slice(points.last(frame - where.shift) + 1, None)
+        later = slice(points.last(frame) + 1, None)
         if len(points.co[later]):
             found.update(f"{path}{index}".encode())
             for part in (points.co, points.left, points.right):

@@ -214,8 +214,9 @@ def replacement(target: bpy.types.Object, source: bpy.types.Object, frame: float
         ConfigError: One of them has curves that cannot be read or written.
     """
     here, there = motion_curves.place(target), motion_curves.place(source)
-    if here.strip is not None:
-        raise errors.ConfigError(f"{target.name}: its motion lies in the NLA; make its action active again first")
+    for obj, where in ((target, here), (source, there)):
+        if where.strip is not None:
+            raise errors.ConfigError(f"{obj.name}: its motion lies in the NLA; make its action active again first")
     if source.r5dgs_motion.leader is not None:
         raise errors.ConfigError(
             f"{source.name}: follows '{source.r5dgs_motion.leader.name}'; choose that one, or one that follows nobody"
@@ -230,14 +231,13 @@ def replacement(target: bpy.types.Object, source: bpy.types.Object, frame: float
     written: dict[tuple[str, int], Curve] = {}
     for index in range(3):
         if ("location", index) in curves:
-            written["location", index] = _moved(_read(curves["location", index], there.shift), moves[index])
+            written["location", index] = _moved(_read(curves["location", index]), moves[index])
     turning = {
         index: curves["rotation_quaternion", index] for index in range(4) if ("rotation_quaternion", index) in curves
     }
     if turning:
         parts = [
-            _read(turning[i], there.shift) if i in turning else _constant(frame, source.rotation_quaternion[i])
-            for i in range(4)
+            _read(turning[i]) if i in turning else _constant(frame, source.rotation_quaternion[i]) for i in range(4)
         ]
         parts = parts if np.allclose(turn, [1, 0, 0, 0], atol=1e-7) else _mixed(source.name, parts, mix)
         written.update({("rotation_quaternion", index): part for index, part in enumerate(parts)})
@@ -259,13 +259,13 @@ def replace(plan: Replacement) -> None:
     motion_confidence.refresh(target, plan.times)
 
 
-def _read(curve: bpy.types.FCurve, shift: float) -> Curve:
+def _read(curve: bpy.types.FCurve) -> Curve:
     points = curve.keyframe_points
     handles, enums = [], []
     for field in ("co", "handle_left", "handle_right"):
         values = np.empty(2 * len(points), np.float32)
         points.foreach_get(field, values)
-        handles.append(values.reshape(-1, 2) + np.float32([shift, 0.0]))
+        handles.append(values.reshape(-1, 2))
     for field in _ENUMS:
         values = np.empty(len(points), np.int32)
         points.foreach_get(field, values)

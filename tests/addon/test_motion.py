@@ -257,8 +257,7 @@ def push_down(bpy, anchor):
 
 
 def test_an_action_in_the_nla_is_written_where_it_lies(blender, loaded, mug):
-    strip = push_down(blender, mug)
-    strip.frame_start, strip.frame_end = strip.frame_start + 0, strip.frame_end + 0
+    push_down(blender, mug)
     state = mug.r5dgs_motion
     state.kind, state.velocity, state.acceleration = "translation", (per_second(blender, 1.0), 0, 0), (0, 0, 0)
     assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
@@ -270,10 +269,37 @@ def test_an_action_in_the_nla_is_written_where_it_lies(blender, loaded, mug):
     np.testing.assert_allclose(motions.matrix(blender, mug)[:3, 3] - start, [0.7, 0, 0], atol=1e-5)
 
 
-def test_a_scaled_strip_of_the_nla_is_refused(blender, loaded, mug):
+def test_a_strip_that_was_moved_and_slowed_down_plays_the_new_motion_so_too(blender, loaded, mug):
     strip = push_down(blender, mug)
     strip.scale = 2.0
-    with pytest.raises(RuntimeError, match="NLA"):
+    strip.frame_start, strip.frame_end = 11, 11 + 2 * 60
+    before = {name: rows for name, rows in strip_keys(strip, LAST).items()}
+    state = mug.r5dgs_motion
+    state.kind, state.velocity, state.acceleration = "translation", (per_second(blender, 1.0), 0, 0), (0, 0, 0)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    assert strip_keys(strip, LAST) == before
+    places = []
+    for frame in (LAST, LAST + 9):
+        blender.context.scene.frame_set(int(11 + 2 * (frame - 1)))
+        places.append(motions.matrix(blender, mug)[:3, 3])
+    np.testing.assert_allclose(places[1] - places[0], [9 / 60, 0, 0], atol=1e-5)
+
+
+def strip_keys(strip, until):
+    """Keys of the action of a strip up to a frame."""
+    found = motions.addon("motion_curves").Place(strip.action, getattr(strip, "action_slot", None)).curves()
+    return {
+        name: [(tuple(p.co), tuple(p.handle_left)) for p in curve.keyframe_points if p.co[0] <= until + 1e-3]
+        for name, curve in found.items()
+    }
+
+
+def test_several_strips_of_the_nla_are_refused(blender, loaded, mug):
+    strip = push_down(blender, mug)
+    again = mug.animation_data.nla_tracks.new().strips.new("again", 100, strip.action)
+    if hasattr(strip, "action_slot"):
+        again.action_slot = strip.action_slot
+    with pytest.raises(RuntimeError, match="2 NLA strips"):
         blender.ops.r5dgs.re_extrapolate()
 
 
@@ -373,6 +399,7 @@ def snapshot(bpy):
         lambda ops: ops.reset_motion(),
         lambda ops: ops.reset_motion(observed=True),
         lambda ops: ops.extrapolate_until(t_end=1.6),
+        lambda ops: ops.simplify_keys(),
         lambda ops: ops.replace_motion(),
         lambda ops: ops.duplicate_object(),
         lambda ops: ops.delete_object(),
