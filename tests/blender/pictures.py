@@ -1,0 +1,210 @@
+"""Take the pictures of docs/blender.md in a real Blender with a window.
+
+    xvfb-run -a -s "-screen 0 1600x1400x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1600 1400 \\
+        --python tests/blender/pictures.py -- SCENE.r5dgs FOLDER [PICTURE ...]
+
+Needs ImageMagick's ``import`` (Blender's own screenshots are black under software rendering) and a worker's Python
+(`R5DGS_PYTHON`). Each picture is a function that sets the window up and is followed by a while in which Blender draws;
+a function may be a generator, whose values are seconds to wait in between.
+"""
+
+import argparse
+import importlib.util
+import inspect
+import subprocess
+import sys
+import traceback
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTLE_S = 2.5  # for the window to draw what was set up
+SIDEBAR = "R5DGS"
+
+
+def register_extension() -> None:
+    """Register the extension from this repository, where it is not enabled already."""
+    if hasattr(bpy.types, "R5DGS_PT_scene"):
+        return
+    spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["r5dgs"] = module
+    spec.loader.exec_module(module)
+    module.register()
+
+
+class Window:
+    """Blender's window: its areas, and operators called in them."""
+
+    @property
+    def window(self):
+        return bpy.context.window_manager.windows[0]
+
+    def area(self, kind: str):
+        """The largest area of a kind."""
+        areas = [area for area in self.window.screen.areas if area.type == kind]
+        return max(areas, key=lambda area: area.width * area.height)
+
+    def region(self, area, kind: str):
+        return next(region for region in area.regions if region.type == kind)
+
+    def inside(self, kind: str = "VIEW_3D"):
+        """A context in the largest area of a kind."""
+        area = self.area(kind)
+        region = self.region(area, "WINDOW")
+        return bpy.context.temp_override(window=self.window, screen=self.window.screen, area=area, region=region)
+
+    def scrub(self, t: float) -> None:
+        """Go to a scene time."""
+        state = collection().r5dgs
+        frame = state.frame_zero + t * state.frames_per_unit
+        bpy.context.scene.frame_set(round(frame))
+
+
+def collection():
+    """The loaded scene."""
+    return next(c for c in bpy.data.collections if c.r5dgs.is_scene)
+
+
+def load(path: Path, window: Window) -> None:
+    """A scene in an otherwise empty file, seen by a camera of its data set."""
+    for obj in list(bpy.data.objects):
+        bpy.data.objects.remove(obj)
+    with window.inside():
+        bpy.ops.r5dgs.load_scene(filepath=str(path))
+    scene = bpy.context.scene
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    low, high = bounds()
+    middle, size = (low + high) / 2, (high - low).length
+    camera.location = middle + Vector((0.25, -0.85, 0.55)).normalized() * 0.75 * size
+    camera.rotation_mode = "QUATERNION"
+    camera.rotation_quaternion = (middle - camera.location).to_track_quat("-Z", "Y")
+    scene.render.resolution_x, scene.render.resolution_y = 800, 600
+    area = window.area("VIEW_3D")
+    space = area.spaces.active
+    space.show_region_ui = True
+    space.overlay.show_relationship_lines = False
+    space.shading.type = "MATERIAL"
+    space.region_3d.view_perspective = "CAMERA"
+
+
+def bounds() -> tuple[Vector, Vector]:
+    """Box about the named objects, Blender's world."""
+    import numpy as np
+
+    points = []
+    for obj in collection().all_objects:
+        if obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id > 0:
+            places = np.empty(3 * len(obj.data.points), np.float32)
+            obj.data.attributes["position"].data.foreach_get("vector", places)
+            matrix = np.array(obj.matrix_world)
+            points.append(places.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
+    low, high = np.quantile(np.concatenate(points), [0.02, 0.98], axis=0)
+    return Vector(low), Vector(high)
+
+
+def loaded(window: Window):
+    """The sidebar with a loaded scene, at an extrapolated frame."""
+    window.scrub(0.9)
+
+
+def prompt(window: Window):
+    """Answers to a prompt, and the selection that they make."""
+    with window.inside():
+        bpy.ops.r5dgs.select_by_prompt(text="mug and the apple")
+
+
+def nothing(window: Window):
+    """A prompt that finds nothing, and what it suggests."""
+    with window.inside():
+        bpy.ops.r5dgs.select_by_prompt(text="muk up")
+
+
+def physics(window: Window):
+    """The motion of one object as physics, with its path and confidence."""
+    with window.inside():
+        bpy.ops.r5dgs.select_by_prompt(text="mug")
+        bpy.ops.r5dgs.show_confidence()
+
+
+def viewport(window: Window):
+    """Rendered viewport shading by the engine."""
+    with window.inside():
+        if any(obj.name.endswith("confidence") for obj in bpy.data.objects):
+            bpy.ops.r5dgs.show_confidence()
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.r5dgs.use_engine()
+    window.area("VIEW_3D").spaces.active.shading.type = "RENDERED"
+    yield 60.0  # the rasterizer may have to be compiled first
+
+
+def preview(window: Window):
+    """The preview image beside the view."""
+    window.area("VIEW_3D").spaces.active.shading.type = "MATERIAL"
+    with window.inside():
+        bpy.ops.r5dgs.preview("INVOKE_DEFAULT")
+    yield 15.0
+    with window.inside():
+        bpy.ops.screen.area_split(direction="VERTICAL", factor=0.45)
+    area = min((area for area in window.window.screen.areas if area.type == "VIEW_3D"), key=lambda area: area.x)
+    area.type = "IMAGE_EDITOR"
+    area.spaces.active.image = bpy.data.images["R5DGS Preview"]
+    yield 1.0
+    with window.inside("IMAGE_EDITOR"):
+        bpy.ops.image.view_all(fit_view=True)
+
+
+SHOTS = (loaded, prompt, nothing, physics, viewport, preview)
+
+
+def run(path: Path, folder: Path, shots: list):
+    """Set up, wait, take, one picture after the other; yields the seconds to wait."""
+    window = Window()
+    load(path, window)
+    yield 2.0
+    for shot in shots:
+        waits = shot(window)
+        if inspect.isgenerator(waits):
+            yield from waits
+        window.region(window.area("VIEW_3D"), "UI").active_panel_category = SIDEBAR
+        yield SETTLE_S
+        with window.inside():
+            bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+        yield 0.5
+        target = folder / f"{shot.__name__}.png"
+        subprocess.run(["import", "-window", "root", "-depth", "8", str(target)], check=True)
+        print(f"written: {target}", flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Take the pictures, then quit Blender."""
+    parser = argparse.ArgumentParser(description="Take the pictures of docs/blender.md.")
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("pictures", nargs="*", choices=[[], *(shot.__name__ for shot in SHOTS)])
+    options = parser.parse_args(arguments)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    bpy.context.preferences.view.show_splash = False
+    register_extension()
+    chosen = [shot for shot in SHOTS if not options.pictures or shot.__name__ in options.pictures]
+    going = run(options.scene.resolve(), options.folder.resolve(), chosen)
+
+    def step():
+        try:
+            return next(going)
+        except StopIteration:
+            pass
+        except BaseException:
+            traceback.print_exc()
+        bpy.ops.wm.quit_blender()
+        return None
+
+    bpy.app.timers.register(step, first_interval=1.0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1 :])
