@@ -26,7 +26,6 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
-sys.dont_write_bytecode = True
 
 from tests import scenes  # noqa: E402  (the line before finds it)
 from tests.blender import check_playback  # noqa: E402

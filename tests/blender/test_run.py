@@ -1,0 +1,33 @@
+"""`run.py` says what failed, in its words, its file and its exit code."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+pytestmark = pytest.mark.blender
+
+SCRIPT = Path(__file__).with_name("run.py")
+PASSING = "def test_it():\n    import bpy\n    assert bpy.data.objects is not None\n"
+
+
+def run(*arguments):
+    command = [sys.executable, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600)
+
+
+def test_tests_that_pass_fail_or_want_torch_are_told_apart(tmp_path):
+    passing, failing, wanting = (tmp_path / f"test_{name}.py" for name in ("passing", "failing", "wanting"))
+    passing.write_text(PASSING)
+    failing.write_text("def test_it():\n    assert False\n")
+    wanting.write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')\n")
+    done = run("--no-figures", passing, wanting)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "tests: passed; left out for want of torch: test_wanting.py" in done.stdout
+    done = run("--no-figures", "--json", tmp_path / "result.json", passing, failing)
+    assert done.returncode == 1 and done.stdout.rstrip().endswith("FAILED: tests")
+    assert json.loads((tmp_path / "result.json").read_text())["tests"] == "FAILED with code 1"
