@@ -53,8 +53,7 @@ def place(anchor: bpy.types.Object) -> Place:
         ConfigError: They cannot be written; the message says why and what to do.
     """
     name = anchor.name
-    if anchor.library is not None or anchor.override_library is not None:
-        raise errors.ConfigError(f"{name}: comes from another .blend file; edit its motion there")
+    check_local(anchor)
     if anchor.rotation_mode != "QUATERNION":
         raise errors.ConfigError(
             f"{name}: expected the rotation mode Quaternion (WXYZ), found {anchor.rotation_mode}; switch it back under "
@@ -80,6 +79,21 @@ def place(anchor: bpy.types.Object) -> Place:
     if found.action is not None and found.action.library is not None:
         raise errors.ConfigError(f"{name}: its action comes from another .blend file; make it local first")
     return found
+
+
+def refusal(anchor: bpy.types.Object) -> str:
+    """Why `place` refuses an anchor, "" where it does not."""
+    try:
+        place(anchor)
+    except errors.ConfigError as error:
+        return str(error)
+    return ""
+
+
+def check_local(anchor: bpy.types.Object) -> None:
+    """Refuse, with a ConfigError, an anchor that belongs to another .blend file."""
+    if anchor.library is not None or anchor.override_library is not None:
+        raise errors.ConfigError(f"{anchor.name}: comes from another .blend file; open that one, or append it here")
 
 
 def _moves(strip: bpy.types.NlaStrip) -> bool:

@@ -64,8 +64,10 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
 
     Raises:
         SceneFileError: The file cannot be read.
-        ConfigError: Nothing in it bends.
+        ConfigError: Nothing in it bends, or its points lie in another .blend file.
     """
+    if collection.library is not None or any(c.data.library for c in objects.members(collection, "CLOUD")):
+        raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
     bending = residuals_of(collection)
     if len(bending.rows) == 0:
         raise errors.ConfigError(f"{collection.name}: every object moves as a whole; there is nothing more to play")
@@ -100,7 +102,7 @@ def apply(collection: bpy.types.Collection, frame: float) -> None:
     found = bending.at(timeline.of_collection(collection).time(frame))
     done = set()
     for cloud in objects.members(collection, "CLOUD"):
-        if cloud.data in done:
+        if cloud.data in done or cloud.data.library is not None:
             continue
         done.add(cloud.data)
         points, part = _bending_points(cloud.data, bending)

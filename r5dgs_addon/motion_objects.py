@@ -63,8 +63,13 @@ def duplicate(
 
     Returns:
         The new anchors, in the order of ``anchors``, those of the shadows after them.
+
+    Raises:
+        ConfigError: One of them belongs to another .blend file.
     """
     everyone = [*anchors, *(motion_extrapolate.followers(anchors) if shadows else ())]
+    for anchor in everyone:
+        motion_curves.check_local(anchor)
     homes = {anchor: motion_extrapolate.scene_of(anchor) for anchor in everyone}
     copies: dict[bpy.types.Object, bpy.types.Object] = {}
     with objects.nothing_left_after_error():
@@ -123,8 +128,13 @@ def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows:
 
     Returns:
         Number of objects that were removed, and the names of the anchors.
+
+    Raises:
+        ConfigError: One of them belongs to another .blend file; nothing was removed.
     """
     everyone = [*anchors, *(motion_extrapolate.followers(anchors) if shadows else ())]
+    for anchor in everyone:
+        motion_curves.check_local(anchor)
     names = [anchor.name for anchor in everyone]
     removed = [obj for anchor in everyone for obj in (anchor, *clouds_of(anchor))]
     collections = {home for obj in removed for home in obj.users_collection}

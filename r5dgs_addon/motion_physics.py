@@ -5,14 +5,17 @@ not touched keep the precision of the file: a rate counts as edited where it dif
 Vectors are along the axes of the anchor's parent, those of its location.
 """
 
+import contextlib
+import hashlib
 import json
 import math
 from dataclasses import replace
 
 import bpy
 import numpy as np
-from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
 
+from ..r5dgs_core import errors
 from ..r5dgs_core.motion import confidence, models, rotations, top
 from ..r5dgs_core.motion.models import MotionModel
 from ..r5dgs_core.scene import posing
@@ -50,6 +53,14 @@ def units_per_second(state: bpy.types.PropertyGroup) -> float:
     return render.fps / render.fps_base / state.frames_per_unit
 
 
+def _write_at_once(state, _):
+    if state.at_once:
+        from . import motion_extrapolate  # which stands on this module
+
+        with contextlib.suppress(errors.R5dgsError):  # the panel says why
+            motion_extrapolate.re_extrapolate([state.id_data])
+
+
 def _vector(name: str):
     """Getter and setter of a vector in Blender's units."""
     power = _POWERS.get(name, 0)
@@ -62,7 +73,7 @@ def _vector(name: str):
         factor = units_per_second(state) ** power
         setattr(state, f"stored_{name}", [value / factor for value in values])
 
-    return {"get": read, "set": write, "size": 3, "options": set()}
+    return {"get": read, "set": write, "size": 3, "update": _write_at_once, "options": set()}
 
 
 def _read_swing(state):
@@ -84,7 +95,13 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     taken: StringProperty(name="Taken Motion", description="That of the object it was taken from", options={"HIDDEN"})
     written: StringProperty(name="Written Keys", description="Digest of the keys written last", options={"HIDDEN"})
     frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
-    kind: EnumProperty(name="Motion", description="How the object moves on", items=KINDS, options=set())
+    written_motion: StringProperty(name="Written Motion", description="Digest of its motion", options={"HIDDEN"})
+    at_once: BoolProperty(
+        name="Write at Once", description="Re-extrapolate whenever a number is changed here", options=set()
+    )
+    kind: EnumProperty(
+        name="Motion", description="How the object moves on", items=KINDS, update=_write_at_once, options=set()
+    )
     stored_velocity: _stored()
     stored_acceleration: _stored()
     stored_angular_velocity: _stored()
@@ -129,6 +146,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         description="How often a second the motion swings to and fro; 0 moves steadily",
         get=_read_swing,
         set=_write_swing,
+        update=_write_at_once,
         options=set(),
     )
     learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
@@ -176,9 +194,23 @@ def remember(
 
 
 def sign(anchor: bpy.types.Object, times: timeline.Times) -> None:
-    """Remember what the keys past t_max are, so that `hand_edited` can tell when somebody edits them."""
+    """Remember what the keys past t_max are and what motion they have, for `hand_edited` and `is_written`."""
     place = motion_curves.place(anchor)
     anchor.r5dgs_motion.written = motion_curves.digest(place, times.frame(times.t_max))
+    anchor.r5dgs_motion.written_motion = _digest(anchor)
+
+
+def is_written(anchor: bpy.types.Object) -> bool:
+    """Whether the keys past t_max were written from the motion that the fields describe now."""
+    return anchor.r5dgs_motion.written_motion == _digest(anchor)
+
+
+def _digest(anchor: bpy.types.Object) -> str:
+    state = anchor.r5dgs_motion
+    fields = [list(getattr(state, f"stored_{name}")) for name in RATES]
+    leader = state.leader.name if follow_matrix(state) is not None else ""
+    text = json.dumps([state.taken, state.kind, *fields, state.stored_frequency, leader])
+    return hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
 
 
 def hand_edited(anchor: bpy.types.Object, times: timeline.Times) -> bool:

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import motion_confidence, motion_objects, motion_physics, objects
+from .. import motion_confidence, motion_curves, motion_objects, motion_physics, objects
 from . import sidebar
 
 
@@ -36,6 +36,9 @@ def _physics(layout, anchor) -> None:
     """The fields of the motion."""
     state = anchor.r5dgs_motion
     layout.label(text=anchor.name, icon="EMPTY_ARROWS")
+    refused = motion_curves.refusal(anchor)
+    if refused:
+        layout.label(text=refused, icon="ERROR")
     layout.prop(state, "leader")
     if motion_physics.follow_matrix(state) is not None:
         layout.label(text="Moves with what it follows", icon="LINKED")
@@ -43,9 +46,11 @@ def _physics(layout, anchor) -> None:
     layout.prop(state, "kind")
     for name in motion_physics.FIELDS[state.kind]:
         layout.prop(state, name)
-    changed = motion_physics.edited(state)
-    if changed:
-        layout.label(text="Edited; Re-Extrapolate writes the keys", icon="GREASEPENCIL")
+    layout.prop(state, "at_once")
+    if not motion_physics.is_written(anchor):
+        layout.label(text="Re-Extrapolate writes this to the keys", icon="ERROR")
+    elif motion_physics.edited(state):
+        layout.label(text="Edited", icon="GREASEPENCIL")
     else:
         layout.label(text="As learned", icon="CHECKMARK")
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_HALVINGS = 80  # of the parameter's range: down to rounding
+_HALVINGS = 54  # of the parameter's range: down to rounding
 
 
 def within(segment: np.ndarray) -> np.ndarray:

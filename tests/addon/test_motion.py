@@ -491,7 +491,48 @@ def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, lo
         said = layouts.draw(blender, panel)
         assert set(fields) <= set(said) and "r5dgs.re_extrapolate" in said
         assert ("As learned" in said) == (kind == "ballistic_spin")
+        assert ("Re-Extrapolate writes this to the keys" in said) == (kind != "ballistic_spin")
+    blender.ops.r5dgs.re_extrapolate()
+    assert "Edited" in layouts.draw(blender, panel)
+    mug.rotation_mode = "XYZ"
+    assert any("expected the rotation mode" in text for text in layouts.draw(blender, panel))
     motions.choose(blender, blender.data.objects["mug shadow anchor"])
     assert "Moves with what it follows" in layouts.draw(blender, panel)
     motions.choose(blender, loaded.r5dgs.root)
     assert "Select an object to see its motion" in layouts.draw(blender, panel)
+
+
+def test_numbers_are_written_at_once_when_that_is_wanted(blender, loaded, mug):
+    observed, before = motions.keys(mug, LAST), motions.keys(mug)
+    state = mug.r5dgs_motion
+    state.kind = "translation"
+    assert motions.keys(mug) == before
+    state.at_once = True
+    state.acceleration = (0.0, 0.0, 0.0)
+    state.velocity = (per_second(blender, 2.0), 0.0, 0.0)
+    assert motions.keys(mug, LAST) == observed
+    places = []
+    for t in (T_MAX, 1.0):
+        motions.go_to(blender, loaded, t)
+        places.append(motions.matrix(blender, mug)[:3, 3])
+    np.testing.assert_allclose(places[1] - places[0], [0.5, 0, 0], atol=1e-5)
+    mug.rotation_mode = "XYZ"
+    state.velocity = (0.0, 0.0, 0.0)  # cannot be written: no error out of a slider
+    assert not motions.addon("motion_physics").is_written(mug)
+
+
+def test_what_lies_in_another_blend_file_is_refused(blender, loaded, tmp_path):
+    blend = tmp_path / "library.blend"
+    blender.ops.wm.save_as_mainfile(filepath=str(blend))
+    blender.ops.wm.read_homefile(app_template="")
+    with blender.data.libraries.load(str(blend), link=True) as (there, here):
+        here.collections = ["R5DGS synthetic"]
+    blender.context.scene.collection.children.link(here.collections[0])
+    blender.context.view_layer.update()
+    mug = blender.data.objects["mug anchor"]
+    count = len(blender.data.objects)
+    motions.choose(blender, mug)
+    for name in ("re_extrapolate", "reset_motion", "duplicate_object", "delete_object", "show_confidence"):
+        with pytest.raises(RuntimeError, match="mug anchor: comes from another .blend file"):
+            getattr(blender.ops.r5dgs, name)()
+    assert len(blender.data.objects) == count
