@@ -1,5 +1,6 @@
 """Exports run step by step: beside the window with progress and Esc, at once for scripts and in `blender -b`."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -41,6 +42,7 @@ FRAMES = (
     ("CURRENT", "This Frame", "The frame that is shown"),
     ("RANGE", "Frame Range", "Every frame of the scene's range, numbered"),
 )
+BLINK_S = 0.2  # between two looks at the window, which is drawn anew then
 Steps = Iterator[Step]  # a generator that returns an `Outcome`
 
 
@@ -95,11 +97,13 @@ class Exporter:
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        finished = {"CANCELLED"}
+        failed, finished, until = True, None, time.monotonic() + BLINK_S
         try:
-            finished = self._step(context)
+            while finished is None and time.monotonic() < until:
+                finished = self._step(context)
+            failed = False
         finally:  # the timer and the progress bar go, and the error is shown
-            if finished is not None:
+            if failed or finished is not None:
                 self._end(context)
         return finished or {"RUNNING_MODAL"}
 
