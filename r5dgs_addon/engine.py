@@ -69,7 +69,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         answer = self._ask(picture.steps(seen, want, sky))
         if answer is None:
             return
-        result, arrays = picture.finished(seen, answer)
+        result, arrays = answer
         for one in passes[1:]:
             self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
         rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name)

@@ -81,31 +81,21 @@ def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[d
     Raises:
         R5dgsError: What the worker reports.
     """
-    return finished(seen, worker.run(steps(seen, want, sky)))
+    return worker.run(steps(seen, want, sky))
 
 
 def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
-    """The worker's requests for a picture, as `worker.start` takes them; give the last one's answer to `finished`."""
+    """The worker's requests for a picture, as `worker.start` takes them; the job's answer is what `render` returns."""
     picture = {
         "camera": seen.view.request(),
         "instances": [instance.request() for instance in seen.instances],
         "sky": {"scene": 0, "matrix": seen.worlds[0].tolist()} if sky and seen.scenes else None,
         "near": seen.view.near,
+        "distance": seen.view.distance,
         "want": list(want),
     }
     paths = [str(scene_path(collection)) for collection in seen.scenes]
     return [("loading the scenes", "load", {"paths": paths}), ("rendering", "render", picture)]
-
-
-def finished(
-    seen: Shown, answer: tuple[dict[str, Any], dict[str, np.ndarray]]
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The worker's answer to `steps` as `render` returns it."""
-    result, arrays = answer
-    if "depth" in arrays and seen.view.distance:
-        depth = arrays["depth"].astype(np.float64) - seen.view.distance
-        arrays = {**arrays, "depth": np.where(arrays["depth"] > 0, depth, 0).astype(np.float32)}
-    return result, arrays
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from . import clouds, objects
+from . import clouds, objects, timeline
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class Instance:
         matrix: Bind state to Blender's world. [4, 4]
         world: The scene's world to Blender's. [4, 4]
         tint: Factors on red, green and blue.
+        t: Scene time that bends what has residuals, where the scene plays exactly; else None.
         object: The cloud; of an instance, the one that is instanced.
         collection: The loaded scene.
         parent: The object that makes the instance, or None.
@@ -41,6 +42,7 @@ class Instance:
     object: bpy.types.Object
     collection: bpy.types.Collection
     parent: bpy.types.Object | None = None
+    t: float | None = None
 
     def request(self) -> dict[str, Any]:
         """What the worker reads."""
@@ -51,7 +53,11 @@ class Instance:
             "matrix": self.matrix.tolist(),
             "world": self.world.tolist(),
         }
-        return entry if self.tint == (1.0, 1.0, 1.0) else {**entry, "tint": list(self.tint)}
+        if self.tint != (1.0, 1.0, 1.0):
+            entry["tint"] = list(self.tint)
+        if self.t is not None:
+            entry["t"] = self.t
+        return entry
 
 
 def instances(
@@ -80,9 +86,13 @@ def instances(
         if parent is not None:  # what the instancer does to the cloud, it does to its world
             own = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
             world = matrix @ np.linalg.solve(own, world)
-        tint = tuple(obj.r5dgs_look.tint)
+        tint, t = tuple(obj.r5dgs_look.tint), None
+        if collection.r5dgs_exact.enabled:
+            t = timeline.of_collection(collection).time(depsgraph.scene.frame_current_final)
         for start, count in rows_of(obj):
-            found.append(Instance(scenes.index(collection), start, count, matrix, world, tint, obj, collection, parent))
+            found.append(
+                Instance(scenes.index(collection), start, count, matrix, world, tint, obj, collection, parent, t)
+            )
     return tuple(scenes), tuple(found)
 
 

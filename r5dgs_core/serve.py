@@ -37,6 +37,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from . import __version__, errors
+from . import serve_requests as asked
 from .scene import lookup, playback, quality, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
@@ -101,6 +102,7 @@ class Server:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
         self._stage = None  # of the scenes, from the first picture on
+        self._numbers: list[int] = []  # which of them each path of the last load is
         self._errors: list[quality.Quality] = []  # what is known of theirs
         self._players: dict[int, playback.Player] = {}  # of each scene, from the first time that is asked for
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
@@ -135,41 +137,36 @@ class Server:
 
     def _load(self, request: dict[str, Any]) -> Answer:
         """``paths``: read scene files, in this order; what is loaded already is kept, what is not named is let go."""
-        paths = _need(request, "paths", list)
-        stamps = list(dict.fromkeys(_stamp(path) for path in paths))
+        paths = asked.need(request, "paths", list)
+        named = [asked.stamp_of(path) for path in paths]
+        stamps = list(dict.fromkeys(named))  # a file that is named twice is read once
         if stamps != list(self._scenes):
-            known, self._scenes, self._stage, self._players = self._scenes, {}, None, {}
+            known, self._scenes, self._numbers, self._stage, self._players = self._scenes, {}, [], None, {}
             known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # before others need room
             found = {stamp: known.get(stamp) or scene_file.read(Path(stamp[0])) for stamp in stamps}
             self._errors = [quality.of(scene, Path(stamp[0])) for stamp, scene in found.items()]
             self._scenes = found
-        places = list(self._scenes)
-        return {
-            "scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in self._scenes.values()],
-            "numbers": [places.index(_stamp(path)) for path in paths],
-        }, {}
+        self._numbers = [stamps.index(stamp) for stamp in named]
+        scenes = [list(self._scenes.values())[number] for number in self._numbers]
+        return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
 
     def _render(self, request: dict[str, Any]) -> Answer:
         """Rasterize the loaded scenes.
 
         ``camera``: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture. What is seen is
-        either ``instances``, a list of ``scene start count matrix world tint``: a range of a scene's Gaussians, the
+        either ``instances``, a list of ``scene start count matrix world tint t``: a range of a scene's Gaussians, the
         [4, 4] map of its bind state into that world, that of the scene's own world (with which its light turns; the
-        same where left out), and factors on its colours; or ``t``, playback of ``scene`` in its own world. ``sky``:
-        null for black, or ``scene matrix``; with ``t``, that scene's where left out. ``near``: nearest depth that is
-        drawn, the scenes' own where left out. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for
-        ``owners``: the instance, or object, with the largest share of each pixel, -1 for none.
+        same where left out), factors on its colours, and the scene time that bends what has residuals; or ``t``,
+        playback of ``scene`` in its own world. ``sky``: null for black, or ``scene matrix``; with ``t``, that scene's
+        where left out. ``near``: nearest depth that is drawn, the scenes' own where left out. ``distance``: how far
+        before the camera depths count from. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for ``owners``:
+        the instance, or object, with the largest share of each pixel, -1 for none.
         """
         scenes = self._loaded()
-        camera = _camera(_need(request, "camera", dict))
+        camera = asked.camera_of(asked.need(request, "camera", dict))
         moved = "instances" in request
-        known, want = ("alpha", "depth", "owners" if moved else "ids"), request.get("want", [])
-        unknown = set(want) - set(known)
-        if unknown:
-            raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are {', '.join(known)}")
-        near = request.get("near")
-        if near is not None and not (isinstance(near, int | float) and near > 0):
-            raise errors.ConfigError(f"worker: 'near' has to be a depth > 0, found {near!r}")
+        want = asked.wanted(request, ("alpha", "depth", "owners" if moved else "ids"))
+        near = asked.near_of(request)
         scene_render = self._rasterizer()
         started = time.perf_counter()
         if moved:
@@ -186,7 +183,8 @@ class Server:
 
     def _known(self, request: dict[str, Any]) -> list[dict[str, Any]]:
         """What is known of each scene's error, and how many of its Gaussians bend and are shown unbent."""
-        bent = {entry.get("scene", 0) for entry in request.get("instances", ()) if "t" in entry}
+        shown = request.get("instances", ())
+        bent = {self._numbers[entry.get("scene", 0)] for entry in shown if entry.get("t") is not None}
         return [
             {"name": scene.name, "error": known.text(), "unbent": 0 if "t" in request or k in bent else known.bending}
             for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
@@ -195,22 +193,24 @@ class Server:
     def _instances(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
         from .raster import stage
 
-        instances = [_instance(entry, len(scenes)) for entry in request["instances"]]
+        instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
         sky = request.get("sky")
         if sky is not None:
             if not isinstance(sky, dict):
                 raise errors.ConfigError(f"worker: 'sky' has to be null or scene and matrix, found {sky!r}")
-            sky = stage.Sky(_number(sky, len(scenes)), _matrix(sky.get("matrix"), 4, "the matrix of the sky"))
+            sky = stage.Sky(
+                asked.number_of(sky, self._numbers), asked.matrix_of(sky.get("matrix"), 4, "the matrix of the sky")
+            )
         if self._stage is None:
             self._stage = stage.Stage(scenes)
-        output = self._stage.render(instances, camera, sky=sky, near=near)
+        output = self._stage.render(instances, camera, sky=sky, near=near, distance=asked.distance_of(request))
         return output, self._stage.ms_motion, sum(instance.count for instance in instances)
 
     def _playback(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
         from .raster import RasterSettings, scene_render
 
         started = time.perf_counter()
-        number, t = _number(request, len(scenes)), float(_need(request, "t", (int, float)))
+        number, t = asked.number_of(request, self._numbers), float(asked.need(request, "t", (int, float)))
         scene = scenes[number]
         if number not in self._players:
             self._players[number] = playback.Player(scene)
@@ -247,7 +247,7 @@ class Server:
     def _query(self, request: dict[str, Any]) -> Answer:
         """``text``: ranked objects of a loaded ``scene``, the first one where left out."""
         scenes = self._loaded()
-        found = lookup.search(scenes[_number(request, len(scenes))], _need(request, "text", str))
+        found = lookup.search(scenes[asked.number_of(request, self._numbers)], asked.need(request, "text", str))
         return {"matches": [{"object_id": m.object_id, "score": m.score, "why": m.why} for m in found]}, {}
 
     def _loaded(self) -> list[Scene]:
@@ -271,67 +271,6 @@ def _rasterizer():
             f"worker: {sys.executable} lacks '{error.name}'; install the core there ('pip install r5dgs')"
         ) from error
     return scene_render
-
-
-def _need(request: dict[str, Any], key: str, kind: type | tuple[type, ...]) -> Any:
-    value = request.get(key)
-    if not isinstance(value, kind):
-        raise errors.ConfigError(f"worker: '{request.get('command')}' needs '{key}', found {value!r}")
-    return value
-
-
-def _stamp(path: Any) -> tuple[str, int, int]:
-    """What tells a scene file from another, and from itself after a change."""
-    if not isinstance(path, str):
-        raise errors.ConfigError(f"worker: 'load' needs paths, found {path!r}")
-    try:
-        status = Path(path).stat()
-    except OSError as error:
-        raise errors.SceneFileError(
-            f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
-            "'Scene File' in the R5DGS tab"
-        ) from error
-    return path, status.st_mtime_ns, status.st_size
-
-
-def _number(value: dict[str, Any], count: int) -> int:
-    """Which of the loaded scenes is meant; the first one where nothing is said."""
-    number = value.get("scene", 0)
-    if not isinstance(number, int) or not 0 <= number < count:
-        raise errors.ConfigError(f"worker: 'scene' has to be a number below {count}, found {number!r}")
-    return number
-
-
-def _matrix(value: Any, size: int, what: str) -> np.ndarray:
-    try:
-        matrix = np.asarray(value, np.float64).reshape(size, size)
-    except (TypeError, ValueError):
-        raise errors.ConfigError(f"worker: {what} has to hold {size} x {size} numbers") from None
-    if not np.isfinite(matrix).all():
-        raise errors.ConfigError(f"worker: {what} holds values that are not finite")
-    return matrix
-
-
-def _camera(value: dict[str, Any]) -> Camera:
-    width, height = value.get("width"), value.get("height")
-    if not (isinstance(width, int) and isinstance(height, int) and 0 < width <= 32768 and 0 < height <= 32768):
-        raise errors.ConfigError(f"worker: a camera needs width and height from 1 to 32768, found {width} x {height}")
-    intrinsics = _matrix(value.get("intrinsics"), 3, "the camera's intrinsics")
-    return Camera(width, height, intrinsics, _matrix(value.get("T_cam_world"), 4, "the camera's T_cam_world"))
-
-
-def _instance(value: dict[str, Any], scenes: int):
-    try:
-        start, count = int(value["start"]), int(value["count"])
-    except (KeyError, TypeError, ValueError):
-        raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {value!r}") from None
-    world, tint = value.get("world"), value.get("tint")
-    if world is not None:
-        world = _matrix(world, 4, f"the world of rows {start}")
-    if tint is not None and not (isinstance(tint, list) and len(tint) == 3):
-        raise errors.ConfigError(f"worker: a tint has to hold three factors, found {tint!r}")
-    matrix = _matrix(value.get("matrix"), 4, f"the matrix of rows {start}")
-    return _rasterizer().Instance(start, count, matrix, _number(value, scenes), world, tint)
 
 
 def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:

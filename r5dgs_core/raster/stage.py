@@ -8,6 +8,7 @@ shown or behind it, everything is drawn; from the next frame on, the instances t
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import time
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ import torch
 
 from ..scene.cameras import Camera
 from ..scene.scene import NEAR_PLANE, Scene
-from . import rasterize, scene_render, splatting
+from . import posed_scene, rasterize, scene_render, splatting
 from .scene_render import Instance
 from .settings import RasterSettings, RenderOutput
 
@@ -65,6 +66,7 @@ class Stage:
         *,
         sky: Sky | None = Sky(),
         near: float | None = None,
+        distance: float = 0.0,
     ) -> RenderOutput:
         """Render ranges of the scenes' Gaussians, each moved by a matrix of its own.
 
@@ -74,6 +76,8 @@ class Stage:
             sky: The sky behind everything; None for black.
             near: Gaussians whose centre lies nearer than this depth are not drawn; where None, the scenes' own near
                 plane, of those that have an instance the smallest one in this world.
+            distance: How far before the camera the plane lies that the depths of the result are counted from. A camera
+                that stands very far away has its depths as sharp as one that does not.
 
         Returns:
             Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance that has the largest share of each
@@ -84,39 +88,53 @@ class Stage:
         """
         with self._lock:
             try:
-                return self._render(instances, camera, sky, near)
+                return self._render(instances, camera, sky, near, distance)
             except ValueError:
                 self._shown = None
                 scene_render.pose_instances(self._gathered, instances)  # numbers the bad one as the caller does
                 raise
 
     def _render(
-        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None
+        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None, distance: float
     ) -> RenderOutput:
         self.ms_motion = 0.0
         settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
-        view = (camera.width, camera.height, camera.intrinsics.tobytes(), camera.T_cam_world.tobytes(), settings)
+        view = (
+            camera.width,
+            camera.height,
+            camera.intrinsics.tobytes(),
+            camera.T_cam_world.tobytes(),
+            settings,
+            distance,
+        )
         behind = None if sky is None else (sky.scene, np.asarray(sky.matrix, np.float64).tobytes())
         shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
         if shown != self._shown:
             self._shown, self._backdrop, self._moving = shown, None, set()
-            self._places = [_place(instance) for instance in instances]
-            return self._render_all(instances, camera, sky, settings)
-        left = {i for i, one in enumerate(instances) if not np.array_equal(_place(one), self._places[i])}
+            self._places = [self._place(instance) for instance in instances]
+            return self._render_all(instances, camera, sky, settings, distance)
+        left = {i for i, one in enumerate(instances) if not np.array_equal(self._place(one), self._places[i])}
         if not left <= self._moving:
             self._moving |= left
             self._backdrop = None
         moving = [i for i in range(len(instances)) if i in self._moving]
         still = [i for i in range(len(instances)) if i not in self._moving]
         if not self._has_backdrop(instances, still, moving):
-            return self._render_all(instances, camera, sky, settings)
+            return self._render_all(instances, camera, sky, settings, distance)
         if self._backdrop is None:
-            self._backdrop = self._make_backdrop(instances, still, camera, sky, settings)
-        means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera)
+            self._backdrop = self._make_backdrop(instances, still, camera, sky, settings, distance)
+        means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera, distance)
         picture = self._backdrop.draw(
             means, quats, scales, opacities, colors, labels=labels, ranks=_ranks(instances, moving)
         )
-        return RenderOutput(picture.image, picture.alpha, picture.depth, None, picture.ids)
+        depth = _mean(picture.image[..., 3], picture.alpha) if distance else picture.depth
+        return RenderOutput(picture.image[..., :3], picture.alpha, depth, None, picture.ids)
+
+    def _place(self, instance: Instance) -> np.ndarray:
+        """What of an instance changes as it moves: its matrix, that of its world, and its time where it bends. [33]"""
+        world = np.eye(4) if instance.world is None else instance.world
+        t = np.array([instance.t if posed_scene.bends(self._gathered, instance) else np.inf], np.float64)
+        return np.concatenate([np.ravel(instance.matrix), np.ravel(world), t]).astype(np.float64)
 
     def _near(self, instances: Sequence[Instance]) -> float:
         """The near plane of the scenes that have an instance, in the world of the picture."""
@@ -142,38 +160,60 @@ class Stage:
         return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)
 
     def _make_backdrop(
-        self, instances: Sequence[Instance], still: list[int], camera: Camera, sky: Sky | None, settings: RasterSettings
+        self,
+        instances: Sequence[Instance],
+        still: list[int],
+        camera: Camera,
+        sky: Sky | None,
+        settings: RasterSettings,
+        distance: float,
     ):
         from .backdrop import Backdrop
 
-        means, quats, scales, opacities, colors, labels = self._splats(instances, still, camera)
+        means, quats, scales, opacities, channels, labels = self._splats(instances, still, camera, distance)
+        background = self._sky(sky, camera)
+        if background is not None and distance:
+            background = torch.cat([background, torch.zeros_like(background[..., :1])], -1)
         return Backdrop(
-            means, quats, scales, opacities, colors, camera, self._sky(sky, camera),
+            means, quats, scales, opacities, channels, camera, background,
             labels=labels, ranks=_ranks(instances, still), settings=settings,
         )  # fmt: skip
 
-    def _splats(self, instances: Sequence[Instance], part: list[int], camera: Camera) -> tuple[torch.Tensor, ...]:
-        """Means, quats, scales, opacities, colours and owners of some instances."""
+    def _splats(
+        self, instances: Sequence[Instance], part: list[int], camera: Camera, distance: float
+    ) -> tuple[torch.Tensor, ...]:
+        """Means, quats, scales, opacities, channels and owners of some instances; channels are colours, and depths."""
         posed = self._pose([instances[i] for i in part])
         gaussians = scene_render.PosedGaussians(posed)
-        colors = scene_render.tensor(scene_render.colors(posed, camera))
+        channels = scene_render.tensor(scene_render.colors(posed, camera))
+        if distance:
+            channels = torch.cat([channels, _depths(posed, camera, distance)], 1)
         labels = torch.from_numpy(_owners(instances, part))
-        return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, labels
+        return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, channels, labels
 
     def _render_all(
-        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, settings: RasterSettings
+        self,
+        instances: Sequence[Instance],
+        camera: Camera,
+        sky: Sky | None,
+        settings: RasterSettings,
+        distance: float,
     ) -> RenderOutput:
         posed = self._pose(instances)
         gaussians = scene_render.PosedGaussians(posed)
         gaussians.object_ids = torch.from_numpy(_owners(instances, range(len(instances))))
         with torch.no_grad():
-            return rasterize(
+            found = rasterize(
                 gaussians,
                 camera,
+                _depths(posed, camera, distance) if distance else None,
                 background=self._sky(sky, camera),
                 colors=scene_render.tensor(scene_render.colors(posed, camera)),
                 settings=settings,
             )
+        if found.features is None or not distance:
+            return found
+        return dataclasses.replace(found, depth=_mean(found.features[..., 0], found.alpha), features=None)
 
     def _pose(self, instances: Sequence[Instance]) -> scene_render.PosedScene:
         start = time.perf_counter()
@@ -182,10 +222,15 @@ class Stage:
         return posed
 
 
-def _place(instance: Instance) -> np.ndarray:
-    """What of an instance changes as it moves: its matrix and that of its world. [8, 4]"""
-    world = np.eye(4) if instance.world is None else instance.world
-    return np.concatenate([np.asarray(instance.matrix, np.float64), np.asarray(world, np.float64)])
+def _depths(posed: scene_render.PosedScene, camera: Camera, distance: float) -> torch.Tensor:
+    """Depths of centres beyond a distance, computed in float64. [N, 1] float32"""
+    depths = (posed.means + posed.origin) @ camera.T_cam_world[2, :3] + (camera.T_cam_world[2, 3] - distance)
+    return scene_render.tensor(depths[:, None])
+
+
+def _mean(blended: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+    """What was blended without a background, per alpha; 0 where that is 0. [H, W]"""
+    return torch.where(alpha > 0, blended / torch.where(alpha > 0, alpha, 1), 0)
 
 
 def _look(instance: Instance) -> tuple | None:

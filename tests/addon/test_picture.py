@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.raster import scene_render, stage
-from r5dgs_core.scene import cameras, scene_file
-from tests import scenes
+from r5dgs_core.scene import cameras, playback, scene_file
+from tests import datasets, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -90,6 +90,33 @@ def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, lo
     assert psnr(arrays["color"], expected) > 45
     owners = {seen.instances[i].collection for i in np.unique(arrays["owners"]) if i >= 0}
     assert owners == {first, second}
+
+
+def test_a_scene_that_is_loaded_twice_is_seen_twice(blender, picture, kitchen):
+    first, scene = kitchen
+    assert blender.ops.r5dgs.load_scene(filepath=str(picture.scene_path(first))) == {"FINISHED"}
+    second = next(c for c in blender.data.collections if c.r5dgs.is_scene and c != first)
+    second.r5dgs.root.location = (0.4, 0.0, 0.1)
+    go_to(blender, scene.t_max)
+    seen, arrays = drawn(blender, picture)
+    both = [everything(scene, affine(W)), everything(scene, affine(W, (0.4, 0.0, 0.1)))]
+    assert seen.scenes == (first, second)
+    assert psnr(arrays["color"], core_color(scene, both, seen.camera, stage.Sky(0, affine(W)))) > 45
+
+
+def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path):
+    made = datasets.breathing(datasets.make_truth(), 0.4)
+    path = scene_file.write(made, tmp_path / "balloon.r5dgs")
+    assert blender.ops.r5dgs.load_scene(filepath=str(path)) == {"FINISHED"}
+    collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+    place_camera(blender, collection, made.cameras[0], made.world_convention)
+    scene, t = scene_file.read(path), 0.2
+    blender.context.scene.frame_set(int(1 + scene.frames_per_unit * t))
+    expected = scene_render.render_frame(scene, playback.frame(scene, t), scene.cameras[0]).color.numpy()
+    stiff = drawn(blender, picture)[1]["color"]
+    collection.r5dgs_exact.enabled = True
+    exact = drawn(blender, picture)[1]["color"]
+    assert psnr(exact, expected) > 45 and psnr(stiff, expected) < 40
 
 
 def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture, kitchen):

@@ -44,14 +44,14 @@ def loaded(blender, worker, scene_path):
     return collection
 
 
-def place_camera(bpy, collection, camera):
+def place_camera(bpy, collection, camera, convention="colmap"):
     data = bpy.data.cameras.new("view")
     data.sensor_fit = "HORIZONTAL"
     data.lens = camera.intrinsics[0, 0] * data.sensor_width / camera.width
     obj = bpy.data.objects.new("view", data)
     bpy.context.scene.collection.objects.link(obj)
     world = np.eye(4)
-    world[:3, :3] = cameras.WORLD_TO_BLENDER["colmap"]
+    world[:3, :3] = cameras.WORLD_TO_BLENDER[convention]
     obj.matrix_world = Matrix((world @ cameras.cam_world_to_opengl(camera.T_cam_world)).tolist())
     render = bpy.context.scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = camera.width, camera.height, 100

@@ -8,8 +8,10 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba", reason="a stage keeps what stands still where the cpu backend draws")
 
+from r5dgs_core.motion import rotations  # noqa: E402
 from r5dgs_core.raster import RasterSettings, backdrop, rasterize_splats, scene_render, stage  # noqa: E402
 from r5dgs_core.raster.scene_render import Instance  # noqa: E402
+from r5dgs_core.scene import playback  # noqa: E402
 from tests import scenes  # noqa: E402
 from tests.core.test_scene_render import group_instances, matrix  # noqa: E402
 
@@ -229,3 +231,71 @@ def test_no_scene_at_all_leaves_black():
 def test_impossible_instances_of_several_scenes_are_refused(pair, instance, message):
     with pytest.raises(ValueError, match=f"instance 0: .*{message}"):
         stage.Stage(pair[:2]).render([instance], CAMERA)
+
+
+def bent_instances(scene, t):
+    return [dataclasses.replace(one, t=t) for one in group_instances(scene, t)]
+
+
+@pytest.fixture(scope="module", params=[0, 2])
+def bending(request):
+    scene, rng = scenes.make_scene(n=600, sh_degree=request.param, seed=5), np.random.default_rng(1)
+    rows = np.arange(0, 600, 3, dtype=np.int32)
+    fade = (scenes.T_MAX - scenes.TIMES)[None, :, None]
+    offsets, turns, growths = (size * rng.normal(size=(len(rows), 1, 3)) * fade for size in (0.3, 2.0, 0.5))
+    return dataclasses.replace(
+        scene,
+        residual_rows=rows,
+        residual_offsets=offsets.astype(np.float32),
+        residual_quats=rotations.rotvecs_to_quats(turns).astype(np.float32),
+        residual_log_scales=growths.astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("t", [-0.1, 0.13, 0.4, scenes.T_MAX, 0.9])
+def test_what_bends_is_bent_as_in_playback(bending, t):
+    found = stage.Stage(bending).render(bent_instances(bending, t), CAMERA)
+    expected = scene_render.render_frame(bending, playback.frame(bending, t), CAMERA)
+    np.testing.assert_allclose(found.color.numpy(), expected.color.numpy(), atol=5e-3)  # a cut-off may fall differently
+    if 0 < t < scenes.T_MAX:
+        stiff = stage.Stage(bending).render(group_instances(bending, t), CAMERA)
+        assert (stiff.color - expected.color).abs().max() > 0.05
+
+
+def test_what_bends_in_a_moved_world_is_the_same_picture(bending):
+    world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
+    shown = [
+        Instance(one.start, one.count, world @ one.matrix, 0, world, t=0.2) for one in bent_instances(bending, 0.2)
+    ]
+    eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ np.linalg.inv(world))
+    found = stage.Stage(bending).render(shown, eye, sky=stage.Sky(0, world))
+    expected = stage.Stage(bending).render(bent_instances(bending, 0.2), CAMERA)
+    np.testing.assert_allclose(found.color.numpy(), expected.color.numpy(), atol=5e-3)
+
+
+def test_what_bends_moves_and_the_rest_is_kept(bending, made):
+    theatre = stage.Stage(bending)
+    for t in (0.1, 0.2, 0.3):
+        shown = [dataclasses.replace(one, matrix=np.eye(4)) for one in bent_instances(bending, t)]
+        found = theatre.render(shown, CAMERA)
+        anew = stage.Stage(bending).render(shown, CAMERA)
+        assert torch.equal(found.color, anew.color) and torch.equal(found.ids, anew.ids)
+
+
+def test_depths_may_count_from_before_a_far_camera(pair):
+    lit = pair[0]
+    far = 1e4
+    eye = dataclasses.replace(CAMERA, intrinsics=CAMERA.intrinsics @ np.diag([far / 4, far / 4, 1.0]))
+    eye = dataclasses.replace(eye, T_cam_world=CAMERA.T_cam_world + np.array([0, 0, 0, far]) * np.eye(4)[2][:, None])
+    parts = [Instance(0, 400, np.eye(4)), Instance(400, 100, np.eye(4))]
+    theatre = stage.Stage(lit)
+    for shift in (0.0, 0.1, 0.2):
+        parts[1].matrix[0, 3] = shift
+        found = theatre.render(parts, eye, distance=far)
+        plain = stage.Stage(lit).render(parts, eye)
+        assert torch.equal(found.color, plain.color) and torch.equal(found.ids, plain.ids)
+        seen = found.alpha > 0
+        np.testing.assert_allclose(found.depth[seen], plain.depth[seen] - far, atol=0.02)  # float32 at 1e4
+        assert (found.depth[~seen] == 0).all() and seen.any()
+        depths = scene_render.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
+        assert depths.min() - 1e-4 < found.depth[seen].min() and found.depth[seen].max() < depths.max() + 1e-4

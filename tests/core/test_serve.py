@@ -1,5 +1,6 @@
 """The worker's protocol, in process and as a process."""
 
+import dataclasses
 import io
 import json
 import subprocess
@@ -109,6 +110,18 @@ def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
     assert {0, 1} <= set(arrays["owners"].ravel().tolist())
 
 
+def test_a_file_that_is_named_twice_is_two_scenes(path):
+    moved = matrix(translation=(0.3, 0, 0)).tolist()
+    one, other = {**ROWS, "count": 200}, {**ROWS, "count": 200, "matrix": moved}
+    render = {"command": "render", "camera": CAMERA_JSON, "want": ["owners"]}
+    once = talk(load(path), {**render, "instances": [one, other]})[1]
+    twice = {"command": "load", "paths": [str(path)] * 2}
+    (loaded, _), found = talk(twice, {**render, "instances": [one, {**other, "scene": 1}]})
+    assert len(loaded["result"]["scenes"]) == 2 and found[0]["ok"]
+    for name in ("color", "owners"):
+        np.testing.assert_array_equal(found[1][name], once[1][name])
+
+
 def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, monkeypatch):
     copy = tmp_path / "copy.r5dgs"
     copy.write_bytes(path.read_bytes())
@@ -117,7 +130,7 @@ def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, 
     server = serve.Server()
     for paths in ([path], [path, copy], [copy, path, copy], [copy], [path]):
         result, _ = server.answer({"command": "load", "paths": [str(p) for p in paths]})
-        assert [result["scenes"][number]["gaussians"] for number in result["numbers"]] == [200] * len(paths)
+        assert [one["gaussians"] for one in result["scenes"]] == [200] * len(paths)
     assert read == ["scene.r5dgs", "copy.r5dgs", "scene.r5dgs"]
 
 
@@ -137,6 +150,8 @@ def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, 
         ({"command": "render", "camera": CAMERA_JSON, "instances": [], "sky": True}, "ConfigError", "'sky'"),
         ({"command": "render", "camera": CAMERA_JSON, "instances": [], "near": 0}, "ConfigError", "'near'"),
         ({"command": "load", "paths": ["/nowhere/at all.r5dgs"]}, "SceneFileError", "at all.r5dgs"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [ROWS | {"t": "now"}]}, "ConfigError", "time"),
+        ({"command": "render", "camera": CAMERA_JSON, "instances": [], "distance": "far"}, "ConfigError", "'distance'"),
         ({"command": "load", "paths": [3]}, "ConfigError", "paths"),
         ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "'paths'"),
     ],
@@ -196,6 +211,39 @@ def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkey
         {"event": "failed", "text": "OSError: no space left"},
     ]
     assert events == (announced if compiled else [])
+
+
+def test_what_is_known_of_the_error_comes_with_the_picture(path, tmp_path):
+    scene = scene_file.read(path)
+    rows = np.arange(20, 40, dtype=np.int32)
+    shape = (len(rows), len(scene.track_times))
+    offsets = np.full((*shape, 3), 0.1, np.float32)
+    offsets[:, -1] = 0
+    bent = dataclasses.replace(
+        scene,
+        name="bent",
+        residual_rows=rows,
+        residual_offsets=offsets,
+        residual_quats=np.tile(np.float32([1, 0, 0, 0]), (*shape, 1)),
+        residual_log_scales=np.zeros((*shape, 3), np.float32),
+    )
+    other = scene_file.write(bent, tmp_path / "bent.r5dgs")
+    loads = {"command": "load", "paths": [str(path), str(other)]}
+    shown = [{**ROWS, "scene": 1}, ROWS]
+    request = {"command": "render", "camera": CAMERA_JSON, "instances": shown}
+    exact = {**request, "instances": [{**shown[0], "t": 0.1}, ROWS]}
+    _, (stiff, _), (exactly, _) = talk(loads, request, exact)
+    assert [one["name"] for one in stiff["result"]["scenes"]] == [scene.name, "bent"]
+    assert [one["unbent"] for one in stiff["result"]["scenes"]] == [0, 20]
+    assert [one["unbent"] for one in exactly["result"]["scenes"]] == [0, 0]
+    assert all(one["error"] for one in stiff["result"]["scenes"])
+
+
+def test_a_check_tells_versions_device_and_speed():
+    ((header, _),) = talk({"command": "check"})
+    found = header["result"]
+    assert header["ok"] and set(found["versions"]) == {"Python", "R5DGS", "torch", "numba"}
+    assert found["milliseconds"] > 0 and found["gaussians"] > 0 and "CPU" in found["device"]
 
 
 def test_words_find_objects(path):

@@ -1,0 +1,195 @@
+"""Who asks the worker, in which turn, and which Python it runs."""
+
+import importlib
+import os
+import signal
+import stat
+import sys
+import threading
+import time
+
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.scene import scene_file
+from tests import scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+PYTHON = sys.executable
+HELLO = [("greeting", "hello", {})]
+
+
+@pytest.fixture
+def worker(blender, monkeypatch):
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    return importlib.import_module("r5dgs.r5dgs_addon.worker")
+
+
+@pytest.fixture
+def pythons(blender):
+    return importlib.import_module("r5dgs.r5dgs_addon.pythons")
+
+
+@pytest.fixture
+def preferences(blender, monkeypatch):
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    module = importlib.import_module("r5dgs.r5dgs_addon.preferences")
+    monkeypatch.setattr(module, "_found", None)
+    return module
+
+
+@pytest.fixture
+def held(worker):
+    """A worker that is at work on a job and does not go on."""
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    job = worker.start(HELLO)
+    while job.doing != "greeting":
+        time.sleep(0.005)
+    yield running, job
+    if running.alive:
+        os.kill(running.pid, signal.SIGCONT)
+    job.join()
+
+
+def test_the_latest_request_of_a_key_wins_and_other_keys_keep_their_turn(worker, held):
+    running, first = held
+    other = worker.submit("other", HELLO)
+    waiting = [worker.submit("view", HELLO) for _ in range(3)]
+    assert [job.dropped for job in waiting] == [True, True, False] and not other.dropped
+    assert worker.busy() and worker.busy("view") and worker.busy("other") and not worker.busy("third")
+    with pytest.raises(errors.BackendError, match="taken back"):
+        waiting[0].answer()
+    os.kill(running.pid, signal.SIGCONT)
+    for job in (first, other, waiting[2]):
+        assert job.answer()[0]["pid"] == running.pid
+    assert not worker.busy()
+
+
+def test_what_runs_already_is_not_dropped_for_what_comes_later(worker):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    first = worker.submit("view", HELLO)
+    while first.doing != "greeting":
+        time.sleep(0.005)
+    second = worker.submit("view", HELLO)
+    os.kill(running.pid, signal.SIGCONT)
+    assert first.answer()[0]["pid"] == second.answer()[0]["pid"] == running.pid
+
+
+def test_a_request_in_place_waits_for_its_turn(worker, held):
+    running, first = held
+    threading.Timer(0.1, os.kill, (running.pid, signal.SIGCONT)).start()
+    assert worker.request("hello")[0]["pid"] == running.pid and first.done
+
+
+def test_giving_up_what_waits_leaves_the_worker_alone_and_what_runs_ends_it(worker, held):
+    running, first = held
+    waiting = worker.submit("view", HELLO)
+    waiting.cancel()
+    assert waiting.dropped and waiting.done and running.alive and not first.done
+    next_one = worker.submit("view", HELLO)
+    first.cancel()
+    with pytest.raises(errors.BackendError, match="ended unexpectedly"):
+        first.answer()
+    assert not running.alive and next_one.answer()[0]["pid"] != running.pid
+
+
+def test_stopping_ends_all_that_runs_and_waits(worker, held):
+    running, first = held
+    waiting = [worker.submit(key, HELLO) for key in ("a", "b")]
+    worker.stop()
+    assert first.done and all(job.dropped for job in waiting) and not running.alive and not worker.busy()
+
+
+def test_a_worker_that_is_killed_in_the_middle_of_a_picture_is_survived(worker, tmp_path):
+    path = scene_file.write(scenes.make_scene(n=2000, objects=3, seed=4), tmp_path / "scene.r5dgs")
+    camera = scenes.orbit_camera(0.2, 4000, 4000)
+    view = {"width": 4000, "height": 4000, "intrinsics": camera.intrinsics.tolist()}
+    render = {"camera": {**view, "T_cam_world": camera.T_cam_world.tolist()}, "t": 0.3}
+    steps = [("loading", "load", {"paths": [str(path)]}), ("rendering", "render", render)]
+    running = worker.current()
+    job = worker.start(steps)
+    while job.doing != "rendering" and not job.done:
+        time.sleep(0.001)
+    os.kill(running.pid, signal.SIGKILL)
+    with pytest.raises(errors.BackendError, match="ended unexpectedly.*starts it again"):
+        job.answer()
+    small = {**render, "camera": {**render["camera"], "width": 8, "height": 6}}
+    _, arrays = worker.run([steps[0], ("rendering", "render", small)])
+    assert arrays["color"].shape == (6, 8, 3)
+
+
+def fake_python(path, reason=""):
+    """An executable that says that it can run the worker, or why not."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!{PYTHON}\nraise SystemExit({reason!r} or 0)\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return str(path)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch, tmp_path):
+    """No Python in sight but those that a test makes: a home folder and a PATH."""
+    for name in ("VIRTUAL_ENV", "CONDA_PREFIX"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "executable", "")
+    monkeypatch.setenv("PATH", str(tmp_path / "path"))
+    return tmp_path
+
+
+def test_pythons_are_looked_for_beside_the_extension_at_home_and_on_the_path(pythons, elsewhere, monkeypatch):
+    own, home = elsewhere / "own", elsewhere / "home"
+    expected = [
+        fake_python(elsewhere / "active" / "bin" / "python"),
+        fake_python(own / ".venv" / "bin" / "python"),
+        fake_python(home / ".virtualenvs" / "r5dgs" / "bin" / "python"),
+        fake_python(home / "miniconda3" / "envs" / "r5dgs" / "bin" / "python"),
+        fake_python(elsewhere / "tools" / "bin" / "python"),
+        fake_python(elsewhere / "path" / "python3"),
+    ]
+    monkeypatch.setenv("VIRTUAL_ENV", str(elsewhere / "active"))
+    command = elsewhere / "path" / "r5dgs"
+    command.write_text(f"#!{expected[4]}\n")
+    command.chmod(0o755)
+    (own / "venv" / "bin").mkdir(parents=True)
+    (own / "venv" / "bin" / "python").write_text("not executable")
+    assert list(pythons.candidates([own], home)) == expected
+
+
+def test_the_first_python_that_has_what_is_needed_is_taken(pythons, elsewhere):
+    own, home = elsewhere / "own", elsewhere / "home"
+    lacking = fake_python(own / ".venv" / "bin" / "python", "lacks torch")
+    assert pythons.lacking(lacking) == "lacks torch" and pythons.find([own], home) is None
+    able = fake_python(home / "r5dgs" / "bin" / "python")
+    assert pythons.find([own], home) == able
+
+
+def test_this_python_can_run_the_worker_and_others_say_why_not(pythons, tmp_path):
+    assert pythons.lacking(sys.executable) is None
+    assert pythons.lacking(str(tmp_path / "none")) is not None
+    dull = tmp_path / "dull"
+    dull.write_text("no program")
+    dull.chmod(0o755)
+    assert pythons.lacking(str(dull)) is not None
+
+
+def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences, pythons, elsewhere, monkeypatch):
+    looked = []
+    places = [fake_python(elsewhere / "one"), fake_python(elsewhere / "two")]
+    monkeypatch.setattr(
+        pythons, "find", lambda beside: looked.append(1) or next(p for p in places if os.path.exists(p))
+    )
+    assert preferences.worker_python() == preferences.worker_python() == places[0] and len(looked) == 1
+    os.remove(places[0])
+    assert preferences.worker_python() == places[1] and len(looked) == 2
+    preferences.forget()
+    assert preferences.worker_python() == places[1] and len(looked) == 3
+    monkeypatch.setenv("R5DGS_PYTHON", "/chosen/python")
+    assert preferences.worker_python() == "/chosen/python" and len(looked) == 3
+
+
+def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, pythons, monkeypatch):
+    monkeypatch.setattr(pythons, "find", lambda beside: None)
+    assert preferences.worker_python() == sys.executable
