@@ -1,0 +1,71 @@
+"""How much of each pixel belongs to whom: soft masks, the largest shares first, as Cryptomatte keeps them.
+
+Every group of Gaussians is a channel that is 1 on its own and 0 elsewhere; blended, it is the part of a pixel that the
+group covers before the eye, and all groups together are the pixel's alpha.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from ..scene.cameras import Camera
+from . import rasterize, scene_render
+from .settings import RasterSettings
+
+CHANNELS = 11  # groups in one pass: three as colour, the others as features, so that memory stays small
+
+
+def shares(
+    posed: scene_render.PosedScene,
+    groups: np.ndarray,  # [N]
+    camera: Camera,
+    *,
+    ranks: int,
+    settings: RasterSettings,
+    backend: str = "auto",
+) -> tuple[np.ndarray, np.ndarray]:
+    """The groups that cover each pixel most, and how much of it.
+
+    Args:
+        posed: Gaussians in the world.
+        groups: Group of each Gaussian, -1 for one that covers others without being of interest. [N] int
+        camera: The camera.
+        ranks: How many groups to keep for each pixel, >= 1.
+        settings: Of the rasterizer.
+        backend: Rasterizer, as for `rasterize`.
+
+    Returns:
+        Groups, -1 where there are fewer [H, W, ranks] int32, and their shares in falling order, of at most alpha in
+        all [H, W, ranks] float32.
+    """
+    size = (camera.height, camera.width, ranks)
+    best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
+    groups = np.asarray(groups, np.int64)
+    gaussians, seen = scene_render.PosedGaussians(posed), _seen_from(camera, posed.origin)
+    present = np.unique(groups[groups >= 0])
+    for first in range(0, len(present), CHANNELS):
+        chosen = present[first : first + CHANNELS]
+        channels = torch.zeros((len(groups), max(len(chosen), 3)))
+        channels[:, : len(chosen)] = torch.from_numpy((groups[:, None] == chosen).astype(np.float32))
+        with torch.no_grad():
+            output = rasterize(
+                gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
+            )
+        image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
+        values = scene_render.to_numpy(image, np.float32)
+        names = np.broadcast_to(chosen.astype(np.int32), values.shape)
+        both, all_names = np.concatenate([best, values], -1), np.concatenate([found, names], -1)
+        order = np.argsort(-both, axis=-1, kind="stable")[..., :ranks]
+        best = np.take_along_axis(both, order, -1)
+        found = np.take_along_axis(all_names, order, -1)
+    return np.where(best > 0, found, -1), best
+
+
+def _seen_from(camera: Camera, origin: np.ndarray) -> Camera:
+    """The camera of a world whose origin is a point of ours."""
+    T_cam_world = camera.T_cam_world.copy()
+    T_cam_world[:3, 3] += T_cam_world[:3, :3] @ origin
+    return dataclasses.replace(camera, T_cam_world=T_cam_world)
