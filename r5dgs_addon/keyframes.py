@@ -6,13 +6,15 @@ are taken from the motion model under the same tolerance; they are of another ke
 kink.
 """
 
+import math
+
 import bpy
 import numpy as np
 
 from ..r5dgs_core.motion import keyframes as reduction
 from ..r5dgs_core.motion import rotations
 from ..r5dgs_core.motion.keyframes import Curves, Keys
-from ..r5dgs_core.scene import playback
+from ..r5dgs_core.scene import playback, posing
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, timeline
 
@@ -22,7 +24,12 @@ OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 
 
 def animate(
-    anchor: bpy.types.Object, scene: Scene, motion_id: int, times: timeline.Times, tolerance: float = TOLERANCE
+    anchor: bpy.types.Object,
+    scene: Scene,
+    motion_id: int,
+    times: timeline.Times,
+    tolerance: float = TOLERANCE,
+    reach: float | None = None,
 ) -> None:
     """Key an anchor with the motion of its group; a group that stays put gets no keys.
 
@@ -32,10 +39,11 @@ def animate(
         motion_id: The motion group.
         times: Scene times and their frames.
         tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+        reach: Of the group, from `reaches`; None to look for it.
     """
     if motion_id == 0:
         return
-    motion = curves(scene, motion_id, times.t_end, tolerance)
+    motion = curves(scene, motion_id, times.t_end, tolerance, reach)
     location, rotation = motion.location, motion.rotation
     moves, turns = varies(location.values), varies(rotation.values)
     if not (moves or turns):
@@ -49,7 +57,7 @@ def animate(
         write(fcurves, "rotation_quaternion", rotation, times)
 
 
-def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float) -> Curves:
+def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: float | None = None) -> Curves:
     """Keys of a motion group from the first knot to ``t_end``, over scene time.
 
     Args:
@@ -57,19 +65,31 @@ def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float) -> Curv
         motion_id: The motion group.
         t_end: Last time; nothing is extrapolated where it is not past t_max.
         tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+        reach: Of the group, from `reaches`; None to look for it.
 
     Returns:
         Displacement of the pivot and rotation, with a key at t_max unless they never change.
     """
-    members = scene.means[scene.motion_ids == motion_id].astype(np.float64)
-    pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
-    radius = float(np.linalg.norm(members - pivot, axis=-1).max(initial=0.0))
+    radius = float(reaches(scene)[motion_id]) if reach is None else reach
     allowed = tolerance * scene.extent
     observed = _observed(scene, motion_id, allowed, radius)
     if t_end <= scene.t_max:
         return observed
     future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius)
     return reduction.join(observed, future)
+
+
+def reaches(scene: Scene) -> np.ndarray:
+    """Largest distance of a member from the pivot of each motion group. [G] float64"""
+    result = np.zeros(len(scene.groups))
+    for start, stop, g in posing.runs(scene.motion_ids):
+        pivot = np.asarray(scene.groups[g].pivot, np.float64)
+        squares = np.zeros(stop - start)
+        for axis in range(3):  # a column at a time: numpy is slow at rows of three
+            arms = scene.means[start:stop, axis] - pivot[axis]
+            squares += arms * arms
+        result[g] = max(result[g], math.sqrt(float(squares.max())))
+    return result
 
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:

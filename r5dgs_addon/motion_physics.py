@@ -18,7 +18,6 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ..r5dgs_core import errors
 from ..r5dgs_core.motion import confidence, models, rotations, top
 from ..r5dgs_core.motion.models import MotionModel
-from ..r5dgs_core.scene import posing
 from ..r5dgs_core.scene.scene import Scene
 from . import motion_curves, timeline
 
@@ -164,7 +163,11 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
 
 
 def remember(
-    anchors: dict[tuple[int, int], bpy.types.Object], scene: Scene, times: timeline.Times, tolerance: float
+    anchors: dict[tuple[int, int], bpy.types.Object],
+    scene: Scene,
+    times: timeline.Times,
+    tolerance: float,
+    reaches: np.ndarray,
 ) -> None:
     """Keep the learned motions of a scene on its anchors, so that editing them needs no scene file.
 
@@ -173,8 +176,9 @@ def remember(
         scene: The scene.
         times: Its times.
         tolerance: Error of the keys, fraction of the scene's size.
+        reaches: Of its motion groups, from `keyframes.reaches`. [G]
     """
-    reaches, extent = group_reaches(scene), scene.extent
+    extent = scene.extent
     for (_, motion_id), anchor in anchors.items():
         group = scene.groups[motion_id]
         leader = anchors.get((0, group.follows)) if group.follows else None
@@ -221,15 +225,6 @@ def hand_edited(anchor: bpy.types.Object, times: timeline.Times) -> bool:
     """
     place = motion_curves.place(anchor)
     return motion_curves.digest(place, times.frame(times.t_max)) != anchor.r5dgs_motion.written
-
-
-def group_reaches(scene: Scene) -> np.ndarray:
-    """Largest distance of a member from the pivot of each motion group. [G] float64"""
-    reaches = np.zeros(len(scene.groups))
-    for start, stop, g in posing.runs(scene.motion_ids):
-        arms = scene.means[start:stop] - np.asarray(scene.groups[g].pivot, np.float64)
-        reaches[g] = max(reaches[g], math.sqrt(float(np.einsum("nc,nc->n", arms, arms).max())))
-    return reaches
 
 
 def has_motion(anchor: bpy.types.Object) -> bool:

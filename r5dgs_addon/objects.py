@@ -122,9 +122,10 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
             data.materials.append(material)
             _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, parts, data)
         displays.show(collection, options.display)
+        reaches = keyframes.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
-            keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance)
-        motion_physics.remember(anchors, scene, times, options.key_tolerance)
+            keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance, float(reaches[motion_id]))
+        motion_physics.remember(anchors, scene, times, options.key_tolerance, reaches)
         table.remember(collection, meanings=scene.vocabulary_embeddings is not None)
         if options.fit_timeline:
             timeline.fit(context.scene, times)
