@@ -8,9 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from ..motion import rotations
 from ..scene.harmonics import (
     C0,
     C1,
@@ -22,11 +19,11 @@ from ..scene.harmonics import (
     C3_2,
     C3_2_DIFFERENCE,
     C3_3,
-    DIRECTIONS,
     MAX_DEGREE,
     basis,
     degree_of,
-)  # fmt: skip
+)
+from ..scene.harmonics import turned as rotate
 
 Array = Any  # np.ndarray or torch.Tensor
 
@@ -34,8 +31,6 @@ __all__ = (
     "C0", "C1", "C2_XX_YY", "C2_XY", "C2_ZZ", "C3_0", "C3_1", "C3_2", "C3_2_DIFFERENCE", "C3_3", "MAX_DEGREE", "basis",
     "dc_to_rgb", "degree_of", "evaluate", "rgb_to_dc", "rotate", "to_rgb",
 )  # fmt: skip
-
-_ROTATED_AT_ONCE = 4096
 
 
 def evaluate(sh: Array, directions: Array) -> Array:
@@ -67,28 +62,3 @@ def rgb_to_dc(rgb: Array) -> Array:
 def dc_to_rgb(dc: Array) -> Array:
     """Inverse of `rgb_to_dc`: the colour averaged over all directions. [..., 3] -> [..., 3]"""
     return 0.5 + C0 * dc
-
-
-def rotate(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Coefficients of colours that turn with their body: the result seen along d is ``sh`` seen along R^T d.
-
-    Bands do not mix, so the change of basis is exact; it is solved from more directions than there are functions.
-
-    Args:
-        sh: Coefficients. [N, K, C]
-        quats: Rotations R, unit wxyz, one for all or one for each. [4] or [N, 4]
-
-    Returns:
-        Coefficients in the turned frame, float64. [N, K, C]
-    """
-    degree = degree_of(sh.shape[-2])
-    if degree == 0 or len(sh) == 0:
-        return sh.astype(np.float64)
-    inverse = np.linalg.pinv(basis(DIRECTIONS, degree))  # [K, P]
-    result = np.empty(sh.shape, np.float64)
-    for start in range(0, len(sh), _ROTATED_AT_ONCE):
-        rows = slice(start, start + _ROTATED_AT_ONCE)
-        back = rotations.conjugate(quats if quats.ndim == 1 else quats[rows, None])
-        change = inverse @ basis(rotations.rotate(back, DIRECTIONS), degree)
-        result[rows] = change @ sh[rows]
-    return result

@@ -6,15 +6,44 @@ What others draw without knowing our scenes: nothing is left to be turned, tinte
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..motion import rotations
 from . import harmonics, posing, tints
 from .ply import Splats
+from .residuals import Residuals
 from .scene import Scene
 
 SIMILARITY_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Gaussians that leave the motion of their group.
+
+    Attributes:
+        rows: Which ones of a scene. [n]
+        offsets: Added to their centres, bind frame. [n, 3]
+        turns: Rotations applied to theirs, unit wxyz. [n, 4]
+        growths: Added to their log scales. [n, 3]
+    """
+
+    rows: np.ndarray
+    offsets: np.ndarray
+    turns: np.ndarray
+    growths: np.ndarray
+
+
+def bend_of(residuals: Residuals, t: float, start: int, count: int) -> Bend | None:
+    """What the residuals of a scene do at a time to a range of its Gaussians; None where that is nothing."""
+    part = slice(*np.searchsorted(residuals.rows, (start, start + count)))
+    found = residuals.at(t) if part.start < part.stop else None
+    if found is None:
+        return None
+    offsets, turns, growths = (values[:, part].T for values in found)
+    return Bend(residuals.rows[part], offsets, turns, growths)
 
 
 def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
@@ -52,6 +81,7 @@ def place(
     *,
     world: np.ndarray | None = None,
     tint: np.ndarray | None = None,
+    bend: Bend | None = None,
 ) -> Splats:
     """A range of a scene's Gaussians, carried from the bind state, with the shading of the pose it brings them to.
 
@@ -63,6 +93,7 @@ def place(
         world: Map from the scene's own world, in which its light stands, to the wanted one; None where they are the
             same. Shading turns with the rotation nearest to ``matrix``, seen from there. [4, 4]
         tint: Factor on the display-referred colour, or None. [3]
+        bend: What single Gaussians do in the bind state before they are carried, or None.
 
     Returns:
         The Gaussians.
@@ -75,10 +106,13 @@ def place(
     rows, turn = slice(start, start + count), nearest_rotation(affine(matrix)[0])
     if world is not None:
         turn = nearest_rotation(affine(world)[0]).T @ turn
-    factor = shading_factors(scene, rows, turn)
+    splats, factor = bind_state(scene, rows), shading_factors(scene, rows, turn)
+    if bend is not None:
+        splats = _bent(scene, start, splats, bend)
+        _relight(scene, start, factor, turn, bend)
     if tint is not None:
         factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
-    return carry(bind_state(scene, rows), matrix, factor)
+    return carry(splats, matrix, factor)
 
 
 def bind_state(scene: Scene, rows: slice) -> Splats:
@@ -93,6 +127,31 @@ def bind_state(scene: Scene, rows: slice) -> Splats:
         None if identities is None else identities[rows].astype(np.float32),
         scene.object_ids[rows],
     )
+
+
+def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
+    """A range of the bind state that begins at a row, bent."""
+    at = bend.rows - start
+    means, quats, log_scales = (values.copy() for values in (splats.means, splats.quats, splats.log_scales))
+    means[at] += bend.offsets
+    quats[at] = rotations.multiply(bend.turns, quats[at].astype(np.float64))
+    log_scales[at] += bend.growths
+    sh = splats.sh
+    if scene.harmonics_turn and sh.shape[1] > 1:
+        sh = sh.copy()
+        sh[at] = harmonics.turned(sh[at], bend.turns)
+    return replace(splats, means=means, quats=quats, log_scales=log_scales, sh=sh)
+
+
+def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
+    """Write the shading of bent Gaussians that have then turned by a rotation. factor [n, 1], turn [3, 3]"""
+    if factor is None or scene.shading is None or scene.light_direction is None:
+        return
+    light = np.asarray(scene.light_direction, np.float64)
+    whole = rotations.multiply(rotations.rotmats_to_quats(turn), bend.turns)
+    change = rotations.rotate(rotations.conjugate(whole), light) - light
+    lit = posing.rest_factors(scene)[bend.rows] + (scene.shading[bend.rows] * change).sum(-1)
+    factor[bend.rows - start, 0] = np.maximum(lit, 0)
 
 
 def join(parts: Sequence[Splats]) -> Splats:

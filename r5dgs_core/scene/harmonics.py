@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from ..motion import rotations
+
 Array = Any  # np.ndarray or torch.Tensor
 
 MAX_DEGREE = 3
+_TURNED_AT_ONCE = 4096
 _TURN = np.pi * (1 + 5**0.5) * (np.arange(48) + 0.5)
 _HEIGHT = 1 - (2 * np.arange(48) + 1) / 48
 # Directions spread evenly over the sphere. [48, 3]
-DIRECTIONS = np.stack(
+_DIRECTIONS = np.stack(
     [np.sqrt(1 - _HEIGHT**2) * np.cos(_TURN), np.sqrt(1 - _HEIGHT**2) * np.sin(_TURN), _HEIGHT], axis=-1
 )
 
@@ -94,9 +97,9 @@ def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
     Returns:
         The matrix. [K, K] float64
     """
-    back = DIRECTIONS @ np.linalg.inv(np.asarray(linear, np.float64)).T
+    back = _DIRECTIONS @ np.linalg.inv(np.asarray(linear, np.float64)).T
     back /= np.linalg.norm(back, axis=-1, keepdims=True)
-    return np.linalg.pinv(basis(DIRECTIONS, degree)) @ basis(back, degree)
+    return np.linalg.pinv(basis(_DIRECTIONS, degree)) @ basis(back, degree)
 
 
 def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -117,6 +120,31 @@ def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
     columns = np.moveaxis(sh, 1, 0).reshape(sh.shape[1], -1)
     turned = (change @ columns).reshape(sh.shape[1], sh.shape[0], sh.shape[2])
     return np.ascontiguousarray(np.moveaxis(turned, 0, 1), sh.dtype)
+
+
+def turned(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Coefficients of colours that turn with their body: the result seen along d is ``sh`` seen along R^T d.
+
+    Bands do not mix, so the change of basis is exact; it is solved from more directions than there are functions.
+
+    Args:
+        sh: Coefficients. [N, K, C]
+        quats: Rotations R, unit wxyz, one for all or one for each. [4] or [N, 4]
+
+    Returns:
+        Coefficients in the turned frame, float64. [N, K, C]
+    """
+    degree = degree_of(sh.shape[-2])
+    if degree == 0 or len(sh) == 0:
+        return sh.astype(np.float64)
+    inverse = np.linalg.pinv(basis(_DIRECTIONS, degree))  # [K, P]
+    result = np.empty(sh.shape, np.float64)
+    for start in range(0, len(sh), _TURNED_AT_ONCE):
+        rows = slice(start, start + _TURNED_AT_ONCE)
+        back = rotations.conjugate(quats if quats.ndim == 1 else quats[rows, None])
+        change = inverse @ basis(rotations.rotate(back, _DIRECTIONS), degree)
+        result[rows] = change @ sh[rows]
+    return result
 
 
 def _library(array: Array):

@@ -1,5 +1,7 @@
 """Gaussians carried by a map look as the renderer draws them under that map."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,8 +9,8 @@ from hypothesis import strategies as st
 
 from r5dgs_core.model import spherical_harmonics
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import carried, harmonics, playback
+from r5dgs_core.raster import posed_scene, scene_render
+from r5dgs_core.scene import carried, harmonics, playback, residuals
 from r5dgs_core.scene.ply import Splats
 from tests.scenes import make_scene
 
@@ -118,6 +120,33 @@ def test_the_light_turns_with_the_world():
     placed = carried.place(scene, 60, 120, world @ matrix, world=world)
     np.testing.assert_allclose(placed.sh, carried.place(scene, 60, 120, matrix).sh, atol=1e-6)
     assert np.abs(placed.sh - carried.place(scene, 60, 120, world @ matrix).sh).max() > 1e-2
+
+
+@pytest.mark.parametrize("t", [0.02, 0.4, 0.75])
+@pytest.mark.parametrize("turns_harmonics", [True, False])
+def test_what_bends_is_bent_as_the_renderer_bends_it(t, turns_harmonics):
+    scene, random = make_scene(n=200, sh_degree=3, shading=True), np.random.default_rng(1)
+    rows, knots = np.array([70, 71, 120, 190]), len(scene.track_times)
+    offsets, growths = random.normal(scale=0.1, size=(2, 4, knots, 3)).astype(np.float32)
+    turns = rotations.rotvecs_to_quats(0.5 * random.normal(size=offsets.shape)).astype(np.float32)
+    offsets[:, -1], growths[:, -1], turns[:, -1] = 0, 0, (1, 0, 0, 0)
+    scene = dataclasses.replace(
+        scene, residual_rows=rows.astype(np.int32), residual_offsets=offsets, residual_quats=turns,
+        residual_log_scales=growths, harmonics_turn=turns_harmonics,
+    )  # fmt: skip
+    matrix, start, count = matrix_of(0.6 * TURN), 60, 120
+    bend = carried.bend_of(residuals.Residuals(scene), t, start, count)
+    assert (bend is None) == (t == 0.75)
+    placed = carried.place(scene, start, count, matrix, bend=bend)
+    posed = posed_scene.pose_instances(scene, [posed_scene.Instance(start, count, matrix, t=t)])
+    for name in ("means", "log_scales"):
+        np.testing.assert_allclose(getattr(placed, name), getattr(posed, name), atol=2e-6, err_msg=name)
+    np.testing.assert_allclose(np.abs((placed.quats * posed.quats).sum(-1)), 1, atol=1e-6)
+    towards = placed.means - scene.cameras[0].center
+    seen = spherical_harmonics.to_rgb(
+        placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    )
+    np.testing.assert_allclose(np.maximum(seen, 0), scene_render.colors(posed, scene.cameras[0]), atol=3e-5)
 
 
 def test_joining_keeps_order_and_fills_lower_degrees_with_nothing():
