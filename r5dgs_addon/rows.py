@@ -13,7 +13,7 @@ GREY = (0.5, 0.5, 0.5)
 
 def label(entry: bpy.types.PropertyGroup) -> str:
     """The object's name."""
-    return table.names(entry.id_data).get(entry.object_id, entry.name)
+    return table.name_of(entry)
 
 
 def set_label(entry: bpy.types.PropertyGroup, name: str) -> None:

@@ -17,6 +17,7 @@ NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole char
 NOBODY = -2  # no object of any table; -1 are the unassigned Gaussians
 _NUMBER = re.compile(r"\.\d{3,}$")  # what Blender adds to a name that is taken
 _ANCHOR = " anchor"
+KINDS = ("COLLECTION", "ANCHOR", "CLOUD")  # what bears an object's name, the most telling first
 
 
 class R5DGS_PG_named(bpy.types.PropertyGroup):
@@ -68,6 +69,21 @@ def names(collection: bpy.types.Collection) -> dict[int, str]:
         result[object_id] = _unique(renamed[object_id], taken)
         taken.add(result[object_id])
     return result
+
+
+def name_of(entry: bpy.types.PropertyGroup) -> str:
+    """What one object is called now: as `names`, without looking at all others where nothing of it was renamed."""
+    collection = entry.id_data
+    home = collection.children.get(entry.name)
+    cloud = home.objects.get(entry.name) if home is not None else None
+    if cloud is not None:
+        bearers = [home, cloud]
+        if cloud.parent is not None and cloud.parent.r5dgs_named.object_id == entry.object_id:
+            bearers.append(cloud.parent)
+        marks = [(bearer.name, bearer.r5dgs_named) for bearer in bearers]
+        if all(mark.object_id == entry.object_id and mark.given == name for name, mark in marks):
+            return entry.name
+    return names(collection).get(entry.object_id, entry.name)
 
 
 def labels(collection: bpy.types.Collection) -> list[lookup.Label]:
@@ -145,27 +161,27 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
 
 
 def _bearers(collection: bpy.types.Collection) -> dict[int, dict[str, list]]:
-    """What was named after each object: its collections, anchors and clouds, most telling kind first."""
+    """What was named after each object: its collections, anchors and clouds."""
     result: dict[int, dict[str, list]] = {}
-    for child in collection.children_recursive:
-        if child.r5dgs_named.given:
-            result.setdefault(child.r5dgs_named.object_id, {}).setdefault("COLLECTION", []).append(child)
-    for kind in ("ANCHOR", "CLOUD"):
-        for obj in collection.all_objects:
-            if obj.r5dgs.role == kind and obj.r5dgs_named.given:
-                result.setdefault(obj.r5dgs_named.object_id, {}).setdefault(kind, []).append(obj)
+    for bearer in (*collection.children_recursive, *collection.all_objects):
+        named = bearer.r5dgs_named
+        if named.given:
+            kind = "COLLECTION" if isinstance(bearer, bpy.types.Collection) else bearer.r5dgs.role
+            result.setdefault(named.object_id, {}).setdefault(kind, []).append(bearer)
     return result
 
 
 def _bears_given(bearer) -> bool:
     """Whether it has the name that it was given; copies of it that Blender numbered have it too."""
-    return _NUMBER.sub("", bearer.name) == _NUMBER.sub("", bearer.r5dgs_named.given)
+    name, given = bearer.name, bearer.r5dgs_named.given
+    return name == given or _NUMBER.sub("", name) == _NUMBER.sub("", given)
 
 
 def _new_name(bearers: dict[str, list]) -> str:
     """The name that the user gave: of the first kind of which none bears the one given before; "" without any."""
-    for kind, named in bearers.items():
-        if any(_bears_given(bearer) for bearer in named):
+    for kind in KINDS:
+        named = bearers.get(kind, ())
+        if not named or any(_bears_given(bearer) for bearer in named):
             continue
         name = named[0].name
         plain = _NUMBER.sub("", name)

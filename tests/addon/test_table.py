@@ -125,6 +125,20 @@ def test_rows_of_the_list_rename_and_are_renamed(blender, loaded, table):
     assert entry.label == "urn"
 
 
+def test_one_name_alone_is_the_one_of_the_whole_table(blender, loaded, path, table):
+    def agree():
+        scenes = [c for c in blender.data.collections if c.r5dgs.is_scene]
+        return all(table.name_of(e) == table.names(c)[e.object_id] for c in scenes for e in c.r5dgs.table)
+
+    assert agree()
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    assert agree()
+    blender.data.objects["mug anchor"].name = "red apple"
+    assert agree() and table.names(loaded)[MUG] == "red apple 2"
+    blender.data.collections["toy car"].name = "mug"
+    assert agree()
+
+
 def test_names_survive_saving_and_reloading(blender, loaded, table, tmp_path):
     blender.data.objects["mug"].name = "teapot"
     table.rename(loaded, APPLE, "plum")
