@@ -156,6 +156,14 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
         np.testing.assert_array_equal(ids, np.arange(rows.start, rows.stop))
 
 
+def test_what_points_are_made_with_is_gone_afterwards(blender, scene_path):
+    before = len(blender.data.objects), len(blender.data.pointclouds)
+    collection = load(blender, scene_path)
+    assert len(blender.data.scenes) == 1 and not blender.data.node_groups
+    assert len(blender.data.objects) == before[0] + len(collection.all_objects)
+    assert len(blender.data.pointclouds) == before[1] + len(clouds(collection))
+
+
 @pytest.mark.parametrize("degree, kept", [("0", 0), ("1", 3), ("2", 8), ("3", 15), ("ALL", 15)])
 def test_only_the_wanted_harmonics_are_stored(blender, tmp_path, degree, kept):
     scene = scenes.make_scene(n=5000, objects=2, sh_degree=3)
