@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, FloatVectorProperty, PointerProperty
 from . import clouds
 
 NONE = (1.0, 1.0, 1.0)
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}  # so that a library override of a linked scene keeps its own
 
 
 def _follow(look: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
@@ -31,10 +32,17 @@ class R5DGS_PG_look(bpy.types.PropertyGroup):
         max=8.0,
         update=_follow,
         options=set(),
+        override=OVERRIDABLE,
     )
-    shown: BoolProperty(name="Shown", description="Whether the viewport colour is the tint's", options=set())
+    shown: BoolProperty(
+        name="Shown", description="Whether the viewport colour is the tint's", options=set(), override=OVERRIDABLE
+    )
     plain: FloatVectorProperty(
-        name="Plain Colour", description="Viewport colour of the object without tint", size=4, options=set()
+        name="Plain Colour",
+        description="Viewport colour of the object without tint",
+        size=4,
+        options=set(),
+        override=OVERRIDABLE,
     )
 
 
@@ -93,7 +101,7 @@ def _shares_points(cloud: bpy.types.Object) -> bool:
 def register():
     """Register the group and hang it on objects."""
     bpy.utils.register_class(R5DGS_PG_look)
-    bpy.types.Object.r5dgs_look = PointerProperty(type=R5DGS_PG_look)
+    bpy.types.Object.r5dgs_look = PointerProperty(type=R5DGS_PG_look, override=OVERRIDABLE)
 
 
 def unregister():

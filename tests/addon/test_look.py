@@ -73,3 +73,20 @@ def test_a_tint_survives_saving_and_reloading(blender, mug, tmp_path):
     np.testing.assert_array_equal(shown(again), expected)
     again.r5dgs_look.tint = (1.0, 1.0, 1.0)
     assert not np.allclose(shown(again), expected)
+
+
+def test_an_override_of_a_linked_scene_keeps_a_tint_of_its_own(blender, mug, tmp_path):
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "overriding.blend"))
+    with blender.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    override = target.collections[0].override_hierarchy_create(
+        blender.context.scene, blender.context.view_layer, do_fully_editable=True
+    )
+    override.all_objects["mug"].r5dgs_look.tint = TINT
+    blender.ops.wm.save_mainfile()
+    blender.ops.wm.open_mainfile(filepath=str(tmp_path / "overriding.blend"))
+    again = next(obj for obj in blender.data.objects if obj.name == "mug" and obj.library is None)
+    assert tuple(again.r5dgs_look.tint) == TINT
+    np.testing.assert_allclose(again.color[:3], linear(TINT), atol=1e-6)

@@ -2,12 +2,13 @@
 
 import dataclasses
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
+from tests import layouts, scenes
 
 
 @pytest.fixture
@@ -153,6 +154,27 @@ def test_prompts_that_found_something_are_kept_with_the_file(blender, loaded, tm
     kept = history()
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "saved.blend"))
     assert history() == kept
+
+
+def test_the_panel_offers_earlier_prompts_and_what_was_meant(blender, loaded):
+    panel = importlib.import_module("r5dgs.r5dgs_addon.panels.prompt")
+
+    def earlier():
+        said = []
+        panel.R5DGS_MT_prompts.draw(SimpleNamespace(layout=layouts.Layout(blender, said)), blender.context)
+        return [text for text in said if text != "r5dgs.select_by_prompt"]
+
+    assert earlier() == ["None yet"]
+    ask(blender, "globe")
+    ask(blender, "mug")
+    ask(blender, "bug")
+    assert earlier() == ["mug", "globe"]
+    said = layouts.draw(blender, *panel.CLASSES)
+    assert {"Nothing matches 'bug'", "Did you mean", "mug", "R5DGS_MT_prompts", "threshold"} <= set(said)
+    assert "all_scenes" not in said
+    loaded.all_objects["globe"].name = "planet"
+    ask(blender, "earth")
+    assert "planet" in layouts.draw(blender, *panel.CLASSES)
 
 
 def test_a_click_on_a_match_selects_that_one(blender, loaded):
