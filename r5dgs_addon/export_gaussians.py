@@ -8,6 +8,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, scene_file
+from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
 from . import export_running, look, picture, visible
 from .export_running import Outcome, Step, Steps
@@ -34,6 +35,7 @@ class Sources:
 
     notes: list[str] = field(default_factory=list)
     _scenes: dict[int, Scene | None] = field(default_factory=dict)
+    _bending: dict[int, Residuals] = field(default_factory=dict)
 
     def scene(self, collection: bpy.types.Collection | None) -> Scene | None:
         """The scene file of a loaded scene, or None where it is gone or damaged."""
@@ -46,6 +48,15 @@ class Sources:
                 self._scenes[collection.session_uid] = None
                 self.note(f"Taken from the points in Blender, without shading: {error}")
         return self._scenes[collection.session_uid]
+
+    def bending(self, collection: bpy.types.Collection) -> Residuals:
+        """How single Gaussians of a loaded scene leave their group; its file has to be there."""
+        known = self._bending.get(collection.session_uid)
+        if known is None:
+            scene = self.scene(collection)
+            assert scene is not None
+            known = self._bending[collection.session_uid] = Residuals(scene)
+        return known
 
     def note(self, text: str) -> None:
         """Remember what has to be said in the end."""
@@ -102,7 +113,12 @@ def splats_of(
         matrix, names = turn @ one.matrix, [*names, one.object.name]
         if scene is not None and one.start + one.count <= len(scene.means):
             tint = None if one.tint == look.NONE else np.array(one.tint)
-            parts.append(carried.place(scene, one.start, one.count, matrix, world=turn @ one.world, tint=tint))
+            bend = (
+                None if one.t is None else carried.bend_of(sources.bending(one.collection), one.t, one.start, one.count)
+            )
+            parts.append(
+                carried.place(scene, one.start, one.count, matrix, world=turn @ one.world, tint=tint, bend=bend)
+            )
         elif (one.object, one.parent) not in from_blender:  # all its stretches of rows at once
             from_blender.add((one.object, one.parent))
             points = from_points(one.object.data, one.object.r5dgs.object_id)

@@ -149,6 +149,24 @@ def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path)
     assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
 
 
+def test_what_bends_is_exported_bent_in_exact_mode(blender, scene, tmp_path):
+    rows, knots = np.array([120, 260], np.int32), len(scene.track_times)
+    offsets = np.full((2, knots, 3), 0.5, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
+    bent = dataclasses.replace(
+        scene, residual_rows=rows, residual_offsets=offsets, residual_log_scales=0 * offsets,
+        residual_quats=np.tile(np.float32([1, 0, 0, 0]), (2, knots, 1)),
+    )  # fmt: skip
+    scene_file.write(bent, tmp_path / "bent.r5dgs")
+    blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "bent.r5dgs"))
+    blender.context.scene.frame_set(13)
+    straight = export(blender, tmp_path / "a.ply", axes="FILE")
+    assert blender.ops.r5dgs.exact_mode() == {"FINISHED"}
+    found = export(blender, tmp_path / "b.ply", axes="FILE")
+    assert (np.abs(found.means - straight.means).max(-1) > 1e-3).sum() == 2
+    wanted = playback.frame(scene_file.read(tmp_path / "bent.r5dgs"), 12 / 60).means
+    np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
+
+
 def test_a_tint_is_baked_into_the_colours(blender, loaded, tmp_path):
     before = export(blender, tmp_path / "a.ply")
     mug = cloud(loaded, "mug")
