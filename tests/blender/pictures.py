@@ -158,7 +158,55 @@ def preview(window: Window):
         bpy.ops.image.view_all(fit_view=True)
 
 
-SHOTS = (loaded, prompt, nothing, physics, viewport, preview)
+def merge(window: Window):
+    """A mesh by Cycles among the Gaussians, merged by depth in the compositor."""
+    gaussians = bpy.context.scene
+    gaussians.view_layers[0].use_pass_z = True
+    meshes = bpy.data.scenes.new("Meshes")
+    low, high = bounds()
+    middle, size = (low + high) / 2, (high - low).length
+    bpy.ops.mesh.primitive_monkey_add(size=0.22 * size, location=middle + Vector((0.02, -0.05, 0.12)) * size)
+    monkey = bpy.context.object
+    for holder in list(monkey.users_collection):
+        holder.objects.unlink(monkey)
+    light = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    light.data.energy, light.rotation_euler = 4.0, (0.6, 0.3, 0.0)
+    for obj in (monkey, light, gaussians.camera):
+        meshes.collection.objects.link(obj)
+    meshes.camera, meshes.render.engine = gaussians.camera, "CYCLES"
+    meshes.cycles.samples, meshes.cycles.use_denoising = 32, False
+    meshes.view_layers[0].use_pass_z = True
+    meshes.view_settings.view_transform = "Standard"
+    for scene in (gaussians, meshes):
+        scene.render.resolution_percentage = 60
+    for name in ("resolution_x", "resolution_y"):
+        setattr(meshes.render, name, getattr(gaussians.render, name))
+    gaussians.use_nodes = True
+    tree = gaussians.node_tree
+    tree.nodes.clear()
+    combine, output = tree.nodes.new("CompositorNodeZcombine"), tree.nodes.new("CompositorNodeComposite")
+    combine.location, output.location = (60, 0), (280, 0)
+    for index, source in enumerate((gaussians, meshes)):
+        layers = tree.nodes.new("CompositorNodeRLayers")
+        layers.scene, layers.location = source, (-260, 250 - 420 * index)
+        tree.links.new(layers.outputs["Image"], combine.inputs[2 * index])
+        tree.links.new(layers.outputs["Depth"], combine.inputs[2 * index + 1])
+    tree.links.new(combine.outputs["Image"], output.inputs["Image"])
+    bpy.ops.render.render()
+    window.window.workspace = bpy.data.workspaces["Compositing"]
+    yield 1.0
+    with window.inside("NODE_EDITOR"):
+        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.5)
+    area = max((area for area in window.window.screen.areas if area.type == "NODE_EDITOR"), key=lambda area: area.y)
+    area.type = "IMAGE_EDITOR"
+    area.spaces.active.image = bpy.data.images["Render Result"]
+    yield 1.0
+    for kind, fit in (("NODE_EDITOR", bpy.ops.node.view_all), ("IMAGE_EDITOR", bpy.ops.image.view_all)):
+        with window.inside(kind):
+            fit()
+
+
+SHOTS = (loaded, prompt, nothing, physics, viewport, preview, merge)
 
 
 def run(path: Path, folder: Path, shots: list):
@@ -170,9 +218,11 @@ def run(path: Path, folder: Path, shots: list):
         waits = shot(window)
         if inspect.isgenerator(waits):
             yield from waits
-        window.region(window.area("VIEW_3D"), "UI").active_panel_category = SIDEBAR
+        views = [area for area in window.window.screen.areas if area.type == "VIEW_3D"]
+        for area in views:
+            window.region(area, "UI").active_panel_category = SIDEBAR
         yield SETTLE_S
-        with window.inside():
+        with window.inside(window.window.screen.areas[0].type):
             bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
         yield 0.5
         target = folder / f"{shot.__name__}.png"
