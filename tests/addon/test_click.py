@@ -48,6 +48,7 @@ def test_shift_adds_anchors_makes_them_active_and_takes_the_active_one_out(blend
     assert shift_click("toy car") == (both, "toy car anchor")
     assert shift_click("mug") == (both, "mug anchor")
     assert shift_click("mug") == ({"toy car anchor"}, "mug anchor")
+    assert shift_click("mug") == (both, "mug anchor")
 
 
 @pytest.mark.parametrize("name", ["Cube", "mug anchor"])
