@@ -19,6 +19,9 @@ from ..r5dgs_core.scene import scene_file
 from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
 
 
+LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
+
+
 @dataclass(frozen=True)
 class Plan:
     """What will be written for one anchor: everything that can fail is done.
@@ -156,9 +159,15 @@ def extrapolate_until(
         The anchors that were written, and those that were left alone.
 
     Raises:
-        ConfigError: An anchor cannot be written; nothing was.
+        ConfigError: The end is too far, or an anchor cannot be written; nothing was.
     """
     times = timeline.of_collection(collection)
+    longest = times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit)
+    if not t_end <= longest:
+        raise errors.ConfigError(
+            f"{collection.name}: expected an end up to {longest:.4g}, {LONGEST:g} times as long as was observed, found "
+            f"{t_end:.4g}"
+        )
     anchors = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
     kept = [anchor for anchor in anchors if motion_physics.hand_edited(anchor, times)]
     plans = [_plan(anchor, t_end) for anchor in anchors if anchor not in kept]

@@ -288,6 +288,9 @@ def model(anchor: bpy.types.Object) -> MotionModel:
     A learned motion blends from the last observed pose, which is noisy, onto the path that was fitted to all of them.
     An edited one starts with exactly the rates that are shown. Edited rates count as certain: the covariance speaks of
     the others.
+
+    Raises:
+        ConfigError: A field is no number that a motion can have.
     """
     state = anchor.r5dgs_motion
     base, changed = basis(state), edited(state)
@@ -298,7 +301,10 @@ def model(anchor: bpy.types.Object) -> MotionModel:
         values.update(offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
     if "kind" in changed:
         values.update(kind=state.kind, inertia=inertia(anchor) if state.kind == "free_top" else None)
-    return confidence.without(replace(base, **values), changed)
+    try:
+        return confidence.without(replace(base, **values), changed)
+    except ValueError as error:
+        raise errors.ConfigError(f"{anchor.name}: {error}") from error
 
 
 def inertia(anchor: bpy.types.Object) -> np.ndarray:

@@ -536,3 +536,29 @@ def test_what_lies_in_another_blend_file_is_refused(blender, loaded, tmp_path):
         with pytest.raises(RuntimeError, match="mug anchor: comes from another .blend file"):
             getattr(blender.ops.r5dgs, name)()
     assert len(blender.data.objects) == count
+
+
+@pytest.mark.parametrize("speed", [1e9, 1e30, math.inf])
+def test_speeds_beyond_all_measure_do_no_harm(blender, loaded, mug, speed):
+    before = motions.keys(mug, LAST)
+    mug.r5dgs_motion.velocity = (speed, 0.0, 0.0)
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    assert motions.keys(mug, LAST) == before
+    blender.ops.r5dgs.reset_motion()
+    assert not motions.addon("motion_physics").edited(mug.r5dgs_motion)
+
+
+def test_what_is_no_number_is_refused_by_name(blender, mug):
+    before = motions.keys(mug)
+    mug.r5dgs_motion.velocity = (math.nan, 0.0, 0.0)
+    with pytest.raises(RuntimeError, match="mug anchor: velocity: expected three finite numbers"):
+        blender.ops.r5dgs.re_extrapolate()
+    assert motions.keys(mug) == before
+
+
+def test_an_end_beyond_all_measure_is_refused_and_nothing_changes(blender, loaded, mug):
+    before = motions.keys(mug)
+    for t_end in (20.0, math.inf, math.nan):
+        with pytest.raises(RuntimeError, match="expected an end up to 15.75"):
+            blender.ops.r5dgs.extrapolate_until(t_end=t_end)
+    assert motions.keys(mug) == before and loaded.r5dgs.t_end == 1.0
