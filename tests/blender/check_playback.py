@@ -1,4 +1,4 @@
-"""Check a scene inside Blender against the core: every point at every kind of time, and the preview.
+"""Check a scene inside Blender against the core: every point at every kind of time, the preview, and rendered images.
 
     blender -b --python-exit-code 1 --python tests/blender/check_playback.py -- SCENE.r5dgs
 
@@ -24,7 +24,7 @@ from mathutils import Matrix
 
 ROOT = Path(__file__).resolve().parents[2]
 POSITION_TOLERANCE = 1e-5  # of the scene's size
-PREVIEW_PSNR_DB = 45.0
+PICTURE_PSNR_DB = 45.0
 
 REFERENCE = """
 import json, sys
@@ -121,11 +121,35 @@ def previews(collection, times: list[float]) -> np.ndarray:
         set_time(collection, t)
         if bpy.ops.r5dgs.preview() != {"FINISHED"}:
             raise SystemExit(f"the preview at t = {t:.4f} did not finish")
-        image = bpy.data.images["R5DGS Preview"]
-        pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
-        image.pixels.foreach_get(pixels)
-        pictures.append(pixels.reshape(image.size[1], image.size[0], 4)[::-1, :, :3])
+        pictures.append(pixels_of(bpy.data.images["R5DGS Preview"]))
     return np.stack(pictures)
+
+
+def renders(collection, times: list[float]) -> np.ndarray:
+    """What the engine R5DGS renders and Blender saves at each time, top row first. [T, H, W, 3]"""
+    bpy.ops.r5dgs.use_engine()
+    settings, pictures = bpy.context.scene.render, []
+    if hasattr(settings.image_settings, "media_type"):  # 5.0 on
+        settings.image_settings.media_type = "IMAGE"
+    settings.image_settings.file_format, settings.image_settings.color_mode = "PNG", "RGB"
+    settings.dither_intensity = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        for number, t in enumerate(times):
+            set_time(collection, t)
+            settings.filepath = str(Path(folder) / f"{number}.png")
+            if bpy.ops.render.render(write_still=True) != {"FINISHED"}:
+                raise SystemExit(f"the render at t = {t:.4f} did not finish")
+            image = bpy.data.images.load(settings.filepath)
+            pictures.append(pixels_of(image))
+            bpy.data.images.remove(image)
+    return np.stack(pictures)
+
+
+def pixels_of(image: bpy.types.Image) -> np.ndarray:
+    """Stored values of an image of 8 bits per channel, / 255, top row first. [H, W, 3]"""
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
 
 
 def references(path: Path, times: list[float], python: str, package_root: Path) -> np.ndarray:
@@ -144,7 +168,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description="Check a scene inside Blender against the core.")
     parser.add_argument("scene", type=Path)
     parser.add_argument("--worker", help="Python with torch for preview and reference; else the add-on's choice")
-    parser.add_argument("--no-preview", action="store_true", help="check positions only")
+    parser.add_argument("--no-preview", action="store_true", help="check positions only, no pictures")
     options = parser.parse_args(arguments)
     if options.worker:
         os.environ["R5DGS_PYTHON"] = options.worker
@@ -174,10 +198,11 @@ def main(arguments: list[str]) -> int:
         chosen = times_to_check(scene)
         chosen = [chosen[1], chosen[len(chosen) // 2], chosen[-2]]
         expected = np.clip(references(path, chosen, worker, core_root), 0, 1)
-        for t, shown, wanted in zip(chosen, previews(collection, chosen), expected, strict=True):
-            psnr = -10 * np.log10(max(float(np.square(shown.astype(np.float64) - wanted).mean()), 1e-12))
-            failed |= not psnr > PREVIEW_PSNR_DB
-            print(f"  t {t:8.5f} preview against core {psnr:.1f} dB (over {PREVIEW_PSNR_DB:g})")
+        for kind, pictures in (("preview", previews(collection, chosen)), ("render", renders(collection, chosen))):
+            for t, shown, wanted in zip(chosen, pictures, expected, strict=True):
+                psnr = -10 * np.log10(max(float(np.square(shown.astype(np.float64) - wanted).mean()), 1e-12))
+                failed |= not psnr > PICTURE_PSNR_DB
+                print(f"  t {t:8.5f} {kind} against core {psnr:.1f} dB (over {PICTURE_PSNR_DB:g})")
     print("FAILED" if failed else "OK")
     return int(failed)
 

@@ -28,6 +28,7 @@ def test_a_synthetic_scene_plays_and_previews_like_the_core(tmp_path):
     done = check(scene_file.write(scene, tmp_path / "scene.r5dgs"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "OK" in done.stdout and done.stdout.count("preview against core") == 3
+    assert done.stdout.count("render against core") == 3
 
 
 def test_a_damaged_scene_fails_the_check(tmp_path):
