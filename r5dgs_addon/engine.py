@@ -8,7 +8,7 @@ import time
 import bpy
 
 from ..r5dgs_core import errors
-from . import compat, engine_color, engine_passes, engine_settings, picture, viewport, worker
+from . import compat, engine_color, engine_cryptomatte, engine_passes, engine_settings, picture, viewport, worker
 
 ENGINE = "R5DGS"
 LOOK_S = 0.005  # between two looks at the worker, and at whether the user wants to stop
@@ -66,7 +66,10 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         seen = picture.shown(depsgraph)
         want = engine_passes.wanted(passes, transparent)
         sky = engine_settings.of(scene).sky and not transparent
-        answer = self._ask(picture.steps(seen, want, sky))
+        steps, mattes = picture.steps(seen, want, sky), engine_cryptomatte.pass_names(layer)
+        if mattes:
+            steps[-1][-1]["coverage"] = engine_cryptomatte.request(seen, len(mattes))
+        answer = self._ask(steps)
         if answer is None:
             return
         result, arrays = answer
@@ -76,6 +79,8 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         filled = {one.name: engine_passes.pixels(one, arrays, seen, transparent) for one in passes}
         engine_passes.fill(rendered.layers[0], filled)
         self.end_result(rendered)
+        if mattes:
+            engine_cryptomatte.write_names(self.get_result(), layer, seen)
         milliseconds = result["ms_motion"] + result["ms_raster"]
         self._say(f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms")
         self.update_progress(1.0)

@@ -3,6 +3,8 @@
 Each pass holds two ranks of a pixel as identity and coverage; the names lie in the metadata of the render result.
 """
 
+from typing import Any
+
 import bpy
 import numpy as np
 
@@ -26,18 +28,18 @@ def names_of(seen: picture.Shown) -> list[str]:
     return list(dict.fromkeys(instance.object.name for instance in seen.instances))
 
 
-def request(seen: picture.Shown, passes: int) -> dict:
+def request(seen: picture.Shown, passes: int) -> dict[str, Any]:
     """What the worker is asked for beside the picture: the name of each instance by number, and how many ranks."""
     names = names_of(seen)
     return {"groups": [names.index(one.object.name) for one in seen.instances], "ranks": RANKS * passes}
 
 
-def pixels(arrays: dict[str, np.ndarray], seen: picture.Shown) -> list[np.ndarray]:
-    """The passes of the worker's answer, rows from the top. [H, W, 4] float32 each"""
+def pixels(arrays: dict[str, np.ndarray], seen: picture.Shown, number: int) -> np.ndarray:
+    """What a pass of a number holds, of the worker's answer; rows from the top. [H, W, 4] float32"""
+    ranks = slice(RANKS * number, RANKS * (number + 1))
     values = np.array([*(cryptomatte.value_of(name) for name in names_of(seen)), 0], np.float32)
-    identities, shares = values[arrays["coverage_groups"]], arrays["coverage"]  # none is -1, the last
-    both = np.stack([identities, shares], axis=-1).reshape(*shares.shape[:2], -1, 2 * RANKS)
-    return [both[..., number, :] for number in range(both.shape[2])]
+    identities, shares = values[arrays["coverage_groups"][..., ranks]], arrays["coverage"][..., ranks]  # none is last
+    return np.stack([identities, shares], axis=-1).reshape(*shares.shape[:2], 2 * RANKS)
 
 
 def write_names(result: bpy.types.RenderResult, view_layer: bpy.types.ViewLayer, seen: picture.Shown) -> None:

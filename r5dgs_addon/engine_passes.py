@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from . import compat, engine_color, picture, visible
+from . import compat, engine_color, engine_cryptomatte, picture, visible
 
 NOTHING = 1e10  # depth where there is nothing, as Blender's own engines write it
 SOLID = 0.5  # alpha from which on a pixel has a depth and an object
@@ -41,7 +41,8 @@ def of_layer(view_layer: bpy.types.ViewLayer) -> list[Pass]:
         found.append(DEPTH)
     if view_layer.use_pass_object_index:
         found.append(INDEX)
-    return found
+    names = engine_cryptomatte.pass_names(view_layer)
+    return found + [Pass(name, engine_cryptomatte.CHANNELS, "COLOR") for name in names]
 
 
 def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
@@ -66,6 +67,8 @@ def pixels(one: Pass, arrays: dict[str, np.ndarray], seen: picture.Shown, transp
         return engine_color.scene_linear(arrays["color"], arrays["alpha"] if transparent else None)
     if one == DEPTH:
         return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING))[..., None].astype(np.float32)
+    if one.name.startswith(engine_cryptomatte.LAYER):
+        return engine_cryptomatte.pixels(arrays, seen, int(one.name[len(engine_cryptomatte.LAYER) :]))
     indices = np.array([*(index_of(instance) for instance in seen.instances), 0], np.float32)
     return indices[arrays["owners"]][..., None]  # none is -1, the last
 

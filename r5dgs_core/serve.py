@@ -160,7 +160,9 @@ class Server:
         playback of ``scene`` in its own world. ``sky``: null for black, or ``scene matrix``; with ``t``, that scene's
         where left out. ``near``: nearest depth that is drawn, the scenes' own where left out. ``distance``: how far
         before the camera depths count from. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for ``owners``:
-        the instance, or object, with the largest share of each pixel, -1 for none.
+        the instance, or object, with the largest share of each pixel, -1 for none. With ``coverage``, of ``groups`` (a
+        number for each instance, -1 for none) and ``ranks``, the groups that cover each pixel most come as
+        ``coverage_groups`` and ``coverage``.
         """
         scenes = self._loaded()
         camera = asked.camera_of(asked.need(request, "camera", dict))
@@ -178,8 +180,16 @@ class Server:
         for name in want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
+        if moved and request.get("coverage") is not None:
+            arrays |= self._coverage(request, camera, near)
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}
         return result, arrays
+
+    def _coverage(self, request: dict[str, Any], camera: Camera, near: float | None) -> dict[str, np.ndarray]:
+        groups, ranks = asked.coverage_of(request)
+        instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
+        found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
+        return {"coverage_groups": found, "coverage": shares}
 
     def _known(self, request: dict[str, Any]) -> list[dict[str, Any]]:
         """What is known of each scene's error, and how many of its Gaussians bend and are shown unbent."""

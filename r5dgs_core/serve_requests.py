@@ -108,3 +108,15 @@ def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
     if unknown:
         raise errors.ConfigError(f"worker: cannot render {sorted(unknown)}; known are {', '.join(known)}")
     return want
+
+
+def coverage_of(request: dict[str, Any]) -> tuple[list[int], int]:
+    """The group of each instance, and how many of them each pixel keeps."""
+    asked, count = request["coverage"], len(request["instances"])
+    groups = asked.get("groups") if isinstance(asked, dict) else None
+    if not isinstance(groups, list) or len(groups) != count or not all(isinstance(one, int) for one in groups):
+        raise errors.ConfigError(f"worker: 'coverage' needs 'groups', a number for each of {count} instances")
+    ranks = asked.get("ranks")
+    if not isinstance(ranks, int) or not 0 < ranks <= 64:
+        raise errors.ConfigError(f"worker: 'coverage' needs 'ranks' from 1 to 64, found {ranks!r}")
+    return groups, ranks

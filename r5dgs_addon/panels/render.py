@@ -58,6 +58,11 @@ class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):
         column = layout.column(heading="Data")
         column.prop(context.view_layer, "use_pass_z", text="Depth")
         column.prop(context.view_layer, "use_pass_object_index", text="Object Index")
+        column = layout.column(heading="Cryptomatte")
+        column.prop(context.view_layer, "use_pass_cryptomatte_object", text="Object")
+        row = column.row()
+        row.active = context.view_layer.use_pass_cryptomatte_object
+        row.prop(context.view_layer, "pass_cryptomatte_depth", text="Levels")
 
 
 CLASSES = (R5DGS_PT_render, R5DGS_PT_passes)

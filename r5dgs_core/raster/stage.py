@@ -19,7 +19,7 @@ import torch
 
 from ..scene.cameras import Camera
 from ..scene.scene import NEAR_PLANE, Scene
-from . import posed_scene, rasterize, scene_render, splatting
+from . import coverage, posed_scene, rasterize, scene_render, splatting
 from .scene_render import Instance
 from .settings import RasterSettings, RenderOutput
 
@@ -93,6 +93,32 @@ class Stage:
                 self._shown = None
                 scene_render.pose_instances(self._gathered, instances)  # numbers the bad one as the caller does
                 raise
+
+    def coverage(
+        self,
+        instances: Sequence[Instance],
+        groups: Sequence[int],
+        camera: Camera,
+        *,
+        ranks: int,
+        near: float | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How much of each pixel belongs to whom.
+
+        Args:
+            instances: As for `render`.
+            groups: Group of each instance, -1 for none.
+            camera: The camera, in the world of the picture.
+            ranks: How many groups to keep for each pixel.
+            near: As for `render`.
+
+        Returns:
+            Groups and shares, of `coverage.shares`. [H, W, ranks] each
+        """
+        with self._lock:
+            settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
+            labels = np.repeat(np.asarray(groups, np.int64), [instance.count for instance in instances])
+            return coverage.shares(self._pose(instances), labels, camera, ranks=ranks, settings=settings)
 
     def _render(
         self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None, distance: float

@@ -1,6 +1,7 @@
 """The engine R5DGS renders the core's own pictures, with the passes, films and borders that Blender asks for."""
 
 import importlib
+import json
 import os
 import signal
 import types
@@ -94,6 +95,12 @@ def read_exr(path):
     return found
 
 
+def metadata_of(path):
+    """The header of an EXR."""
+    OpenImageIO = pytest.importorskip("OpenImageIO")
+    return {one.name: one.value for one in OpenImageIO.ImageInput.open(str(path)).spec().extra_attribs}
+
+
 def core(scene, t, background="scene", camera=None):
     """The core's own picture."""
     pose = playback.frame(scene, t)
@@ -141,6 +148,27 @@ def test_the_passes_are_linear_colour_depth_along_the_axis_and_the_object_in_fro
     assert set(np.unique(passes.index)) <= wanted and 77 in passes.index
     loaded.all_objects["mug"].hide_render = True
     assert 77 not in render_passes(blender, tmp_path).index
+
+
+def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene, tmp_path):
+    cryptomatte = importlib.import_module("r5dgs_core.scene.cryptomatte")
+    layer = blender.context.view_layer
+    layer.use_pass_cryptomatte_object, layer.pass_cryptomatte_depth = True, 4
+    go_to(blender, 0.3)
+    passes = render_passes(blender, tmp_path)
+    assert {name for name in passes.names if name.startswith("Crypto")} == {"CryptoObject00", "CryptoObject01"}
+    ranks = [(f"CryptoObject0{k}.{name}", f"CryptoObject0{k}.{part}") for k in (0, 1) for name, part in ("rg", "ba")]
+    mug = sum(np.where(passes.found[i] == cryptomatte.value_of("mug"), passes.found[c], 0) for i, c in ranks)
+    pose = playback.frame(scene, 0.3)
+    one_hot = ((scene.object_ids == 1) & (scene.motion_ids == 1)).astype(np.float32)[:, None]
+    expected = scene_render.render_frame(scene, pose, scene.cameras[0], features=one_hot).features.numpy()[..., 0]
+    assert_almost_all_close(mug, expected, 1e-3)
+    alpha = core(scene, 0.3).alpha.numpy()
+    assert np.abs(sum(passes.found[c] for _, c in ranks) - alpha).mean() < 0.01  # what four levels leave out
+    header = metadata_of(tmp_path / "out.exr")
+    (start,) = {key.rsplit("/", 1)[0] for key in header if key.startswith("cryptomatte/")}
+    assert header[f"{start}/name"] == f"{layer.name}.CryptoObject"
+    assert json.loads(header[f"{start}/manifest"])["mug"] == f"{cryptomatte.hash_of('mug'):08x}"
 
 
 def test_passes_that_nobody_asked_for_are_not_there(blender, loaded, tmp_path):

@@ -110,6 +110,20 @@ def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
     assert {0, 1} <= set(arrays["owners"].ravel().tolist())
 
 
+def test_coverage_comes_beside_the_picture(path):
+    entries = [{**ROWS, "count": 90}, {**ROWS, "start": 90, "count": 110}]
+    request = {"command": "render", "camera": CAMERA_JSON, "instances": entries, "want": ["alpha"], "sky": None}
+    _, (header, arrays) = talk(load(path), {**request, "coverage": {"groups": [5, 3], "ranks": 3}})
+    assert header["ok"] and arrays["coverage"].shape == (CAMERA.height, CAMERA.width, 3)
+    np.testing.assert_allclose(arrays["coverage"].sum(-1), arrays["alpha"], atol=1e-5)
+    assert set(np.unique(arrays["coverage_groups"])) == {-1, 3, 5}
+    for wrong in (True, {"groups": [1], "ranks": 2}, {"groups": [1, 2], "ranks": 0}, {"groups": [1, "a"], "ranks": 2}):
+        _, (header, _) = talk(load(path), {**request, "coverage": wrong})
+        assert (
+            not header["ok"] and header["error"]["kind"] == "ConfigError" and "coverage" in header["error"]["message"]
+        )
+
+
 def test_a_file_that_is_named_twice_is_two_scenes(path):
     moved = matrix(translation=(0.3, 0, 0)).tolist()
     one, other = {**ROWS, "count": 200}, {**ROWS, "count": 200, "matrix": moved}
