@@ -18,7 +18,6 @@ from ..r5dgs_core.motion.keyframes import Keys
 from ..r5dgs_core.scene import scene_file
 from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
 
-
 LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
 
 
