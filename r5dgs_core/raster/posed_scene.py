@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import columns, rotations
-from ..scene import playback
+from ..scene import carried, playback
 from ..scene.residuals import Residuals
 from ..scene.scene import Scene
-
-SIMILARITY_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -184,9 +182,10 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         linear, offset = affine(instance.matrix, index)
         part, to = slice(*ranges[index]), slice(filled, filled + instance.count)
         playback.move_points(given.means[part], linear, offset, means[to])
-        rotation = _map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
+        carried.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
+        rotation = carried.nearest_rotation(linear)
         if instance.world is not None:
-            rotation = _nearest_rotation(affine(instance.world, index)[0]).T @ rotation
+            rotation = carried.nearest_rotation(affine(instance.world, index)[0]).T @ rotation
         shading[to] = _shading(given, part, rotation, given.lights[instance.scene])
         pose_ids[to] = poses
         maps = np.linalg.inv(linear)[None]
@@ -195,7 +194,7 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
             rows, at = bent.rows, filled + bent.rows - part.start
             means[at] = (given.means[rows] + bent.offsets) @ linear.T + offset
             shapes = np.empty((len(at), 4), np.float32), np.empty((len(at), 3), np.float32)
-            _map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
+            carried.map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
             quats[at], log_scales[at] = shapes
             turns = rotations.quats_to_rotmats(bent.turns)
             shading[at] = _relit(given, rows, rotation @ turns, given.lights[instance.scene])
@@ -254,13 +253,10 @@ def _bent(given: Gathered, instance: Instance, rows: tuple[int, int]) -> _Bent |
 
 def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Linear part and translation of a [4, 4] matrix that can be undone."""
-    matrix = np.asarray(matrix, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"instance {index}: expected a finite matrix [4, 4], got {matrix!r}")
-    singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    if singular[-1] <= 1e-9 * max(singular[0], 1e-30):
-        raise ValueError(f"instance {index}: the matrix flattens space (scale 0); hide the object instead")
-    return matrix[:3, :3], matrix[:3, 3]
+    try:
+        return carried.affine(matrix)
+    except ValueError as error:
+        raise ValueError(f"instance {index}: {error}; hide the object instead") from error
 
 
 def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
@@ -290,30 +286,6 @@ def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
     if all(before == after for before, after in zip(edges[::2], edges[1::2], strict=True)):
         return array
     return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
-
-
-def _map_shapes(
-    linear: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, new_quats: np.ndarray, new_log_scales: np.ndarray
-) -> np.ndarray:
-    """Write the shapes of ellipsoids under a linear map; returns the rotation nearest to the map. [3, 3]"""
-    singular = np.linalg.svd(linear, compute_uv=False)
-    nearest = _nearest_rotation(linear)
-    uniform = singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0]
-    if uniform and np.linalg.det(linear) > 0:
-        playback.turn_quats(quats, rotations.rotmats_to_quats(nearest), new_quats)
-        np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
-        return nearest
-    axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
-    u, singular, _ = np.linalg.svd(axes)
-    u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
-    new_quats[:], new_log_scales[:] = rotations.rotmats_to_quats(u), np.log(np.maximum(singular, 1e-30))
-    return nearest
-
-
-def _nearest_rotation(linear: np.ndarray) -> np.ndarray:
-    """The rotation that is nearest to a linear map. [3, 3] -> [3, 3]"""
-    u, _, vt = np.linalg.svd(linear)
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def _shading(given: Gathered, rows: slice, rotation: np.ndarray, light: np.ndarray | None) -> np.ndarray:

@@ -64,9 +64,9 @@ def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) 
         ValueError: The matrix flattens space or is not finite.
     """
     linear, offset = affine(matrix)
-    means = np.empty(splats.means.shape, np.float32)
+    means, quats, log_scales = (np.empty((len(splats.means), width), np.float32) for width in (3, 4, 3))
     posing.move_points(splats.means, linear, offset, means)
-    quats, log_scales = map_shapes(linear, splats.quats, splats.log_scales)
+    map_shapes(linear, splats.quats, splats.log_scales, quats, log_scales)
     sh = harmonics.carried(splats.sh, linear)
     if factor is not None:
         sh = tints.tint_sh(sh, factor)
@@ -202,19 +202,19 @@ def map_shapes(
     linear: np.ndarray,  # [3, 3]
     quats: np.ndarray,  # [N, 4]
     log_scales: np.ndarray,  # [N, 3]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and log scales of ellipsoids under a linear map, exact for any. [N, 4] and [N, 3] float32"""
-    linear = np.asarray(linear, np.float64)
+    new_quats: np.ndarray,  # [N, 4]
+    new_log_scales: np.ndarray,  # [N, 3]
+) -> None:
+    """Write the shapes of ellipsoids under a linear map, exact for any, to the last two, which are float32."""
     singular = np.linalg.svd(linear, compute_uv=False)
     if is_similarity(linear) and np.linalg.det(linear) > 0:
-        new_quats = np.empty(quats.shape, np.float32)
         posing.turn_quats(quats, rotations.rotmats_to_quats(nearest_rotation(linear)), new_quats)
-        return new_quats, log_scales + np.float32(np.log(singular.mean()))
+        np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
+        return
     axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
     u, singular, _ = np.linalg.svd(axes)
     u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
-    turned = rotations.rotmats_to_quats(u).astype(np.float32)
-    return turned, np.log(np.maximum(singular, 1e-30)).astype(np.float32)
+    new_quats[:], new_log_scales[:] = rotations.rotmats_to_quats(u), np.log(np.maximum(singular, 1e-30))
 
 
 def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
