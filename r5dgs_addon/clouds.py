@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 
+from ..r5dgs_core.scene import harmonics
 from ..r5dgs_core.scene.scene import Scene
 from . import compat
 
@@ -12,7 +13,6 @@ ROW = "gaussian"
 # Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
 DISPLAY_SIGMAS = 1.2
 LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
-C0 = 0.28209479177387814  # spherical harmonic of degree 0
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     log_scales = scene.log_scales[rows]
     opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
-    shown = srgb_to_linear(0.5 + C0 * sh[:, 0].astype(np.float64))
+    shown = srgb_to_linear(0.5 + harmonics.C0 * sh[:, 0].astype(np.float64))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
     radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
     _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows])
@@ -75,7 +75,7 @@ def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
     base = np.empty(4 * len(cloud.points), np.float32)
     stored.data.foreach_get("color", base)
     colors = base.reshape(-1, 4).astype(np.float64)
-    colors[:, :3] = srgb_to_linear(tint * (0.5 + C0 * colors[:, :3]))
+    colors[:, :3] = srgb_to_linear(tint * (0.5 + harmonics.C0 * colors[:, :3]))
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", colors)
     cloud.update_tag()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-C0 = 0.28209479177387814  # spherical harmonic of degree 0
+from . import harmonics
 
 
 def tint_sh(sh: np.ndarray, tint: np.ndarray) -> np.ndarray:
@@ -23,5 +23,5 @@ def tint_sh(sh: np.ndarray, tint: np.ndarray) -> np.ndarray:
         return sh
     factor = np.asarray(tint, np.float64)[..., None, :]
     tinted = factor * sh.astype(np.float64)
-    tinted[..., :1, :] += 0.5 * (factor - 1.0) / C0
+    tinted[..., :1, :] += 0.5 * (factor - 1.0) / harmonics.C0
     return tinted.astype(sh.dtype)
