@@ -112,9 +112,9 @@ class Exporter:
         try:
             step = next(self._running)
         except StopIteration as end:
-            for warning in end.value.warnings:
-                self.report({"WARNING"}, warning)
             self.report({"INFO"}, end.value.text)
+            for warning in end.value.warnings:  # the last report is what the status bar shows
+                self.report({"WARNING"}, warning)
             return {"FINISHED"}
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
