@@ -15,6 +15,8 @@ import numpy as np
 from ..r5dgs_core import errors
 from . import clouds, objects, timeline
 
+FLAT = 1e-6  # smallest scale of a map over its largest
+
 
 @dataclass(frozen=True)
 class Instance:
@@ -70,40 +72,47 @@ def instances(
         space: A 3D view whose local view hides the rest.
 
     Returns:
-        Collections, the scenes of the outermost instances included; and the clouds, of the same collections.
+        Collections of the clouds, or, where no cloud is visible, all that are not excluded; and the clouds.
 
     Raises:
         ConfigError: A cloud has lost points, and nothing tells which.
     """
-    homes, scenes, found = _homes(), _scenes(depsgraph), []
-    for obj, matrix, parent in _clouds(depsgraph, space):
-        collection = homes.get(obj) or _by_root(obj)
-        if collection is None or np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) < 3:  # scaled to nothing
-            continue
-        if collection not in scenes:
-            scenes.append(collection)
-        world = world_of(collection, depsgraph)
+    homes, scenes = _homes(), _scenes(depsgraph)
+    seen = [(obj, matrix, parent, homes.get(obj) or _by_root(obj)) for obj, matrix, parent in _clouds(depsgraph, space)]
+    seen = [one for one, flat in zip(seen, _flat([one[1] for one in seen]), strict=True) if one[3] and not flat]
+    there = {one[3] for one in seen}
+    scenes = [one for one in scenes if one in there or not there]
+    scenes += [one for one in dict.fromkeys(one[3] for one in seen) if one not in scenes]
+    worlds = {one: world_of(one, depsgraph) for one in scenes}
+    frame, found = depsgraph.scene.frame_current_final, []
+    for obj, matrix, parent, collection in seen:
+        world = worlds[collection]
         if parent is not None:  # what the instancer does to the cloud, it does to its world
             own = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
             world = matrix @ np.linalg.solve(own, world)
-        tint, t = tuple(obj.r5dgs_look.tint), None
-        if collection.r5dgs_exact.enabled:
-            t = timeline.of_collection(collection).time(depsgraph.scene.frame_current_final)
+        tint, number = tuple(obj.r5dgs_look.tint), scenes.index(collection)
+        t = timeline.of_collection(collection).time(frame) if collection.r5dgs_exact.enabled else None
         for start, count in rows_of(obj):
-            found.append(
-                Instance(scenes.index(collection), start, count, matrix, world, tint, obj, collection, parent, t)
-            )
+            found.append(Instance(number, start, count, matrix, world, tint, obj, collection, parent, t))
     return tuple(scenes), tuple(found)
 
 
 def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
-    """Map of a loaded scene's world to Blender's; that of the file where its root is gone. [4, 4] float64"""
+    """Map of a loaded scene's world to Blender's; that of the file where its root is gone or flat. [4, 4] float64"""
     root = collection.r5dgs.root
     if root is None:
         return np.eye(4)
     evaluated = root if depsgraph is None else root.evaluated_get(depsgraph)
     matrix = np.array(evaluated.matrix_world, np.float64)
-    return matrix if np.linalg.matrix_rank(matrix[:3, :3], tol=1e-9) == 3 else np.eye(4)
+    return np.eye(4) if _flat([matrix])[0] else matrix
+
+
+def _flat(matrices: list[np.ndarray]) -> np.ndarray:
+    """Which maps flatten space, as far as single precision tells: what is scaled to nothing is not seen. [n]"""
+    if not matrices:
+        return np.zeros(0, bool)
+    scales = np.linalg.svd(np.stack(matrices)[:, :3, :3], compute_uv=False)
+    return scales[:, 2] <= FLAT * scales[:, 0]
 
 
 def rows_of(obj: bpy.types.Object) -> list[tuple[int, int]]:

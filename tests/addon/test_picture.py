@@ -119,6 +119,27 @@ def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path)
     assert psnr(exact, expected) > 45 and psnr(stiff, expected) < 40
 
 
+def test_a_scene_of_which_nothing_is_seen_needs_no_file(blender, picture, load, kitchen):
+    first, scene = kitchen
+    hidden, _ = load("shed", n=300, objects=2, seed=7)
+    picture.scene_path(hidden).unlink()
+    with pytest.raises(RuntimeError, match="shed.r5dgs.*Scene File"):
+        blender.ops.r5dgs.preview()
+    for obj in hidden.all_objects:
+        obj.hide_set(True)
+    assert shown(blender, picture).scenes == (first,)
+    assert blender.ops.r5dgs.preview() == {"FINISHED"}
+
+
+def test_a_scene_that_is_hidden_all_of_it_leaves_its_sky(blender, picture, kitchen):
+    collection, scene = kitchen
+    for obj in collection.all_objects:
+        obj.hide_set(True)
+    seen, arrays = drawn(blender, picture)
+    assert seen.instances == () and seen.scenes == (collection,)
+    assert psnr(arrays["color"], core_color(scene, [], seen.camera, stage.Sky(0, affine(W)))) > 60
+
+
 def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture, kitchen):
     collection, scene = kitchen
     instancer = blender.data.objects.new("copy", None)
