@@ -226,3 +226,15 @@ def test_residuals_survive(blender, scene, tmp_path):
     load(blender, tmp_path / "bent.r5dgs")
     save(blender, tmp_path / "again.r5dgs")
     assert (tmp_path / "again.r5dgs").read_bytes() == (tmp_path / "bent.r5dgs").read_bytes()
+
+
+def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loaded, tmp_path):
+    mug, car = cloud(loaded, "mug").parent, cloud(loaded, "toy car").parent
+    blender.ops.object.select_all(action="DESELECT")
+    for anchor in (car, mug):
+        anchor.select_set(True)
+    blender.context.view_layer.objects.active = mug
+    assert blender.ops.r5dgs.replace_motion() == {"FINISHED"}
+    saved = save(blender, tmp_path / "b.r5dgs")
+    assert saved.groups[3].model.kind == scene.groups[1].model.kind
+    assert_same_motion(blender, loaded, load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
