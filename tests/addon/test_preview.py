@@ -175,7 +175,7 @@ def test_the_picture_has_the_size_that_blender_renders(blender, loaded, tmp_path
     picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
     render = blender.context.scene.render
     render.engine = "CYCLES"
-    blender.context.scene.cycles.samples = 1
+    blender.context.scene.cycles.samples, blender.context.scene.cycles.use_denoising = 1, False
     render.filepath = str(tmp_path / "rendered.png")
     for size in [(100, 100, 29), (100, 50, 57), (33, 77, 29), (64, 48, 100)]:
         render.resolution_x, render.resolution_y, render.resolution_percentage = size
