@@ -7,6 +7,8 @@ are weighed with.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from . import models, rotations
@@ -70,7 +72,7 @@ def _solve(
     first = _rates(taus, quats, displacements)
 
     def model_of(x: np.ndarray) -> MotionModel:
-        values = dict(zip(free, np.split(x * units, len(free)), strict=True))
+        values: dict[str, Any] = dict(zip(free, np.split(x * units, len(free)), strict=True))
         return MotionModel(kind, radius=radius, **values)
 
     def errors(x: np.ndarray) -> np.ndarray:
