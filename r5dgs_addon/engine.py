@@ -8,7 +8,17 @@ import time
 import bpy
 
 from ..r5dgs_core import errors
-from . import compat, engine_color, engine_cryptomatte, engine_passes, engine_settings, picture, viewport, worker
+from . import (
+    compat,
+    engine_color,
+    engine_cryptomatte,
+    engine_passes,
+    engine_settings,
+    objects,
+    picture,
+    viewport,
+    worker,
+)
 
 ENGINE = "R5DGS"
 LOOK_S = 0.005  # between two looks at the worker, and at whether the user wants to stop
@@ -55,6 +65,8 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
         scene, layer = depsgraph.scene, depsgraph.view_layer
+        if not objects.scene_collections():
+            raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
         objections = engine_color.objections(scene)
         if objections:
             self.report(
@@ -63,16 +75,19 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
                 "Trained' in the render properties",
             )
         passes, transparent = engine_passes.of_layer(layer), scene.render.film_transparent
+        mattes = engine_cryptomatte.pass_names(layer)
         seen = picture.shown(depsgraph)
-        want = engine_passes.wanted(passes, transparent)
-        sky = engine_settings.of(scene).sky and not transparent
-        steps, mattes = picture.steps(seen, want, sky), engine_cryptomatte.pass_names(layer)
-        if mattes:
-            steps[-1][-1]["coverage"] = engine_cryptomatte.request(seen, len(mattes))
-        answer = self._ask(steps)
-        if answer is None:
+        if seen.scenes:
+            sky = engine_settings.of(scene).sky and not transparent
+            steps = picture.steps(seen, engine_passes.wanted(passes, transparent), sky)
+            if mattes:
+                steps[-1][-1]["coverage"] = engine_cryptomatte.request(seen, len(mattes))
+            arrays = self._ask(steps)
+        else:
+            self.report({"WARNING"}, f"R5DGS: view layer {layer.name} shows no R5DGS scene")
+            arrays = engine_passes.empty(seen.camera, engine_cryptomatte.RANKS * len(mattes))
+        if arrays is None:
             return
-        result, arrays = answer
         for one in passes[1:]:
             self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
         rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name)
@@ -81,18 +96,19 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         self.end_result(rendered)
         if mattes:
             engine_cryptomatte.write_names(self.get_result(), layer, seen)
-        milliseconds = result["ms_motion"] + result["ms_raster"]
-        self._say(f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms")
         self.update_progress(1.0)
 
     def _ask(self, steps):
-        """The worker's answer, or None where the user stops the render."""
+        """The worker's arrays, or None where the user stops the render."""
         job = worker.start(steps)
         while not job.done:
             if self._stopped(job.doing):
                 _leave(job)
                 return None
-        return job.answer()
+        result, arrays = job.answer()
+        milliseconds = result["ms_motion"] + result["ms_raster"]
+        self._say(f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms")
+        return arrays
 
     def _stopped(self, doing: str) -> bool:
         """Say what is waited for, wait a moment, and see whether the user wants to stop."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
+from ..r5dgs_core.scene import cameras
 from . import compat, engine_color, engine_cryptomatte, picture, visible
 
 NOTHING = 1e10  # depth where there is nothing, as Blender's own engines write it
@@ -71,6 +72,19 @@ def pixels(one: Pass, arrays: dict[str, np.ndarray], seen: picture.Shown, transp
         return engine_cryptomatte.pixels(arrays, seen, int(one.name[len(engine_cryptomatte.LAYER) :]))
     indices = np.array([*(index_of(instance) for instance in seen.instances), 0], np.float32)
     return indices[arrays["owners"]][..., None]  # none is -1, the last
+
+
+def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:
+    """The worker's arrays of a picture of nothing, with as many ranks of coverage."""
+    size = (camera.height, camera.width)
+    return {
+        "color": np.zeros((*size, 3), np.float32),
+        "alpha": np.zeros(size, np.float32),
+        "depth": np.zeros(size, np.float32),
+        "owners": np.full(size, -1, np.int32),
+        "coverage": np.zeros((*size, ranks), np.float32),
+        "coverage_groups": np.full((*size, ranks), -1, np.int32),
+    }
 
 
 def index_of(instance: visible.Instance) -> int:

@@ -78,6 +78,7 @@ class Port:
         try:
             self.want(_wish(context, depsgraph))
         except errors.R5dgsError as error:
+            self._wish = self._shown = self._pixels = self._texture = None
             self._message = str(error)
         if self._pixels is not None:
             height, width = self._pixels.shape[:2]
@@ -137,6 +138,8 @@ def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
     """What the viewport that is being drawn should show."""
     scene, settings = depsgraph.scene, engine_settings.of(depsgraph.scene)
     scenes, instances = visible.instances(depsgraph, context.space_data)
+    if not scenes:
+        raise errors.ConfigError("No R5DGS scene is shown; load one from File > Import")
     view = views.of_region(context.region, context.region_data, visible.points(instances))
     seen = picture.Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
     transparent = scene.render.film_transparent

@@ -83,14 +83,14 @@ def render_passes(bpy, folder):
     )
 
 
-def read_exr(path):
-    """Channels of all parts of an EXR by pass and channel. [H, W] each"""
+def read_exr(path, parts=2):
+    """Channels of all images of an EXR by pass and channel, with 3 parts of a name by layer, too. [H, W] each"""
     OpenImageIO = pytest.importorskip("OpenImageIO")
     source, found, part = OpenImageIO.ImageInput.open(str(path)), {}, 0
     while source.seek_subimage(part, 0):
         pixels = source.read_image("float").reshape(source.spec().height, source.spec().width, -1)
         for index, name in enumerate(source.spec().channelnames):
-            found[".".join(name.split(".")[-2:])] = pixels[..., index]
+            found[".".join(name.split(".")[-parts:])] = pixels[..., index]
         part += 1
     return found
 
@@ -223,6 +223,18 @@ def test_percentage_scales_the_picture(blender, loaded, scene, tmp_path):
     assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.2).color.numpy(), 0, 1)) > 45
 
 
+def test_each_view_layer_has_its_own_picture(blender, loaded, tmp_path):
+    blender.context.view_layer.use_pass_z = True
+    other = blender.context.scene.view_layers.new("nothing")
+    other.use_pass_z = other.use_pass_object_index = other.use_pass_cryptomatte_object = True
+    other.layer_collection.children[loaded.name].exclude = True
+    render_passes(blender, tmp_path)
+    layers = read_exr(tmp_path / "out.exr", parts=3)
+    assert (layers["nothing.Depth.Z"] == NOTHING).all() and not layers["nothing.Combined.R"].any()
+    assert layers["ViewLayer.Depth.Z"].min() < 10 and layers["ViewLayer.Combined.R"].any()
+    assert {"nothing.CryptoObject02.a"} <= set(layers) and "ViewLayer.CryptoObject00.r" not in layers
+
+
 def test_two_scenes_are_in_one_picture_and_cover_each_other(blender, loaded, scene, tmp_path):
     other = scenes.make_scene(n=300, objects=1, sh_degree=0, seed=9, world_convention="colmap")
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(other, tmp_path / "other.r5dgs")))
@@ -285,6 +297,14 @@ def test_a_render_that_cannot_be_says_why_and_writes_nothing(blender, loaded, tm
         render_png(blender, tmp_path, "nothing")
     assert not (tmp_path / "nothing.png").exists()
     (tmp_path / "gone.r5dgs").rename(tmp_path / "scene.r5dgs")
+    for collection in list(blender.data.collections):
+        blender.data.collections.remove(collection)
+    with pytest.raises(RuntimeError, match="File > Import"):
+        render_png(blender, tmp_path, "nothing")
+    assert not (tmp_path / "nothing.png").exists()
+
+
+def test_what_no_camera_of_ours_can_see_is_refused(blender, loaded, tmp_path):
     blender.context.scene.camera.data.type = "PANO"
     with pytest.raises(RuntimeError, match="Perspective"):
         render_png(blender, tmp_path, "nothing")
