@@ -183,10 +183,12 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         part, to = slice(*ranges[index]), slice(filled, filled + instance.count)
         playback.move_points(given.means[part], linear, offset, means[to])
         carried.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
-        rotation = carried.nearest_rotation(linear)
-        if instance.world is not None:
-            rotation = carried.nearest_rotation(affine(instance.world, index)[0]).T @ rotation
-        shading[to] = _shading(given, part, rotation, given.lights[instance.scene])
+        light = given.lights[instance.scene]
+        world = None if instance.world is None else affine(instance.world, index)[0]
+        rotation = np.eye(3) if light is None else carried.nearest_rotation(linear)
+        if light is not None and world is not None:
+            rotation = carried.nearest_rotation(world).T @ rotation
+        shading[to] = _shading(given, part, rotation, light)
         pose_ids[to] = poses
         maps = np.linalg.inv(linear)[None]
         bent = _bent(given, instance, ranges[index])
@@ -197,7 +199,7 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
             carried.map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
             quats[at], log_scales[at] = shapes
             turns = rotations.quats_to_rotmats(bent.turns)
-            shading[at] = _relit(given, rows, rotation @ turns, given.lights[instance.scene])
+            shading[at] = _relit(given, rows, rotation @ turns, light)
             if given.harmonics_turn[instance.scene] and given.sh.shape[1] > 1:
                 pose_ids[at] = poses + 1 + np.arange(len(at))
                 maps = np.concatenate([maps, np.swapaxes(turns, -1, -2) @ maps])

@@ -188,13 +188,20 @@ def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_similarity(linear: np.ndarray) -> bool:
     """Whether a linear map only turns, mirrors and scales uniformly. [3, 3]"""
-    singular = np.linalg.svd(linear, compute_uv=False)
-    return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
+    return _even(np.linalg.svd(linear, compute_uv=False))
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
     """The rotation nearest to a linear map, without mirror. [3, 3] -> [3, 3]"""
     u, _, vt = np.linalg.svd(linear)
+    return _unmirrored(u, vt)
+
+
+def _even(singular: np.ndarray) -> bool:
+    return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
+
+
+def _unmirrored(u: np.ndarray, vt: np.ndarray) -> np.ndarray:
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
@@ -206,9 +213,9 @@ def map_shapes(
     new_log_scales: np.ndarray,  # [N, 3]
 ) -> None:
     """Write the shapes of ellipsoids under a linear map, exact for any, to the last two, which are float32."""
-    singular = np.linalg.svd(linear, compute_uv=False)
-    if is_similarity(linear) and np.linalg.det(linear) > 0:
-        posing.turn_quats(quats, rotations.rotmats_to_quats(nearest_rotation(linear)), new_quats)
+    u, singular, vt = np.linalg.svd(linear)
+    if _even(singular) and np.linalg.det(linear) > 0:
+        posing.turn_quats(quats, rotations.rotmats_to_quats(_unmirrored(u, vt)), new_quats)
         np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
         return
     axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
