@@ -1,0 +1,146 @@
+"""Check the engine R5DGS in Blender's window: Rendered viewports at rest and moving, F12, the live preview.
+
+    xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
+        blender --factory-startup --python tests/blender/check_viewport.py -- SCENE.r5dgs
+
+`R5DGS_PYTHON` names the worker's Python where that is not found by itself. Ends with exit code 1 where a picture does not
+come, F12 is not the worker's own, or something goes on after the file is closed.
+"""
+
+import importlib
+import importlib.util
+import os
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Quaternion
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 240.0  # the first picture may have to compile the rasterizer
+STEP_S = 0.02
+
+
+def register() -> str:
+    """Register the extension that this file lies in; returns its package."""
+    spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["r5dgs"] = module
+    spec.loader.exec_module(module)
+    module.register()
+    return "r5dgs"
+
+
+def service(name: str):
+    """A module of the add-on."""
+    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+
+
+def wait(condition, what: str):
+    """Let Blender go on until a condition holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, f"{what}: nothing within {PATIENCE_S:g} s"
+        yield STEP_S
+
+
+def full_picture():
+    """The picture of full size that the one viewport shows, or None."""
+    ports = [port for port in service("viewport")._ports if port._shown is not None and port.next() is None]
+    return ports[0]._shown if ports else None
+
+
+def checks(path: str):
+    """The check, step by step; yields seconds to wait."""
+    window = bpy.context.window_manager.windows[0]
+    area = max((a for a in window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width * a.height)
+    region, space = next(r for r in area.regions if r.type == "WINDOW"), area.spaces[0]
+    region_3d = space.region_3d
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.r5dgs.load_scene(filepath=path)
+        bpy.ops.r5dgs.use_engine()
+    scene = window.scene
+    scene.render.dither_intensity = 0
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 320, 240, 100
+    space.shading.type = "RENDERED"
+    for kind in ("PERSP", "ORTHO", "CAMERA"):
+        region_3d.view_perspective = kind
+        area.tag_redraw()
+        yield 0.5
+        yield from wait(full_picture, kind)
+        wish, smaller = full_picture()
+        assert smaller == 1 and (wish.camera.width, wish.camera.height) == (region.width, region.height), kind
+        print(f"viewport {kind}: {region.width} x {region.height}", flush=True)
+
+    region_3d.view_perspective = "PERSP"
+    sizes, end = set(), time.monotonic() + 5
+    while time.monotonic() < end:
+        region_3d.view_rotation = region_3d.view_rotation @ Quaternion((0, 1, 0), 0.02)
+        yield STEP_S
+        sizes |= {(id(port._shown[0]), port._shown[1]) for port in service("viewport")._ports if port._shown}
+    print(f"moving: {len(sizes)} pictures in 5 s", flush=True)
+    assert len(sizes) > 1
+
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.render.render("INVOKE_DEFAULT")
+    yield 0.2
+    yield from wait(lambda: not bpy.app.is_job_running("RENDER"), "F12")
+    yield 0.5
+    saved = Path(bpy.app.tempdir) / "rendered.png"
+    bpy.data.images["Render Result"].save_render(str(saved))
+    rendered = pixels(bpy.data.images.load(str(saved)))
+    with bpy.context.temp_override(window=window):
+        picture = service("picture")
+        _, arrays = picture.render(picture.shown(bpy.context.evaluated_depsgraph_get()))
+    error = float(np.square(rendered - np.clip(arrays["color"], 0, 1)).mean())
+    print(f"F12: {-10 * np.log10(max(error, 1e-12)):.1f} dB", flush=True)
+    assert error < 10**-4.5
+
+    live = service("live_preview")
+    live.start()
+    asked = []
+    for frame in (10, 20, 30):
+        scene.frame_set(frame)
+        before = live._asked
+        yield from wait(lambda before=before: live._asked is not before and live._job is None, "live preview")
+        asked.append(live._asked)
+    assert asked[0] != asked[1] != asked[2] and live.message() == ""
+    bpy.ops.wm.read_homefile(app_template="")
+    yield 2.0
+    assert not live.running() and not bpy.app.timers.is_registered(service("viewport").look)
+    print("closed: nothing goes on", flush=True)
+
+
+def pixels(image: bpy.types.Image) -> np.ndarray:
+    """Display-referred colours of an image, rows from the top. [H, W, 3]"""
+    values = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+
+
+def main(path: str) -> None:
+    """Run the check from a timer, and end Blender with its outcome."""
+    bpy.context.preferences.view.show_splash = False
+    register()
+    steps = checks(path)
+
+    def step():
+        try:
+            return next(steps)
+        except StopIteration:
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+            code = 1
+        service("worker").stop()
+        sys.stderr.flush()
+        os._exit(code)  # quitting would end with 0
+
+    bpy.app.timers.register(step, first_interval=1.0, persistent=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1])
