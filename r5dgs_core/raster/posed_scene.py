@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from ..motion import columns, rotations
 from ..scene import carried, playback
 from ..scene.residuals import Residuals
 from ..scene.scene import Scene
+
+MANY = 16  # stretches that are worth gathering their rows
 
 
 @dataclass(frozen=True)
@@ -178,9 +181,10 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
     means, quats, log_scales = (np.empty((total, width), np.float32) for width in (3, 4, 3))
     shading, pose_ids = np.ones(total, np.float32), np.empty(total, np.int64)
     view_maps, tints, poses, filled = [np.eye(3)[None]], [np.ones((1, 3))], 1, 0
-    for index, instance in enumerate(instances):
+    for index, part in _parts(instances, ranges):
+        instance = instances[index]
         linear, offset = affine(instance.matrix, index)
-        part, to = slice(*ranges[index]), slice(filled, filled + instance.count)
+        to = slice(filled, filled + (part.stop - part.start if isinstance(part, slice) else len(part)))
         playback.move_points(given.means[part], linear, offset, means[to])
         carried.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
         light = given.lights[instance.scene]
@@ -191,9 +195,9 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
         shading[to] = _shading(given, part, rotation, light)
         pose_ids[to] = poses
         maps = np.linalg.inv(linear)[None]
-        bent = _bent(given, instance, ranges[index])
+        bent = _bent(given, instance, part)
         if bent is not None:
-            rows, at = bent.rows, filled + bent.rows - part.start
+            rows, at = bent.rows, filled + bent.places
             means[at] = (given.means[rows] + bent.offsets) @ linear.T + offset
             shapes = np.empty((len(at), 4), np.float32), np.empty((len(at), 3), np.float32)
             carried.map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
@@ -222,10 +226,12 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
 
 @dataclass(frozen=True)
 class _Bent:
-    """Gaussians that have left their group's motion, in the bind state: rows among those gathered [R], offsets [R, 3],
-    rotations unit wxyz [R, 4], the turns that led there [R, 4], and growths of log scales [R, 3]."""
+    """Gaussians that have left their group's motion, in the bind state: rows among those gathered [R], places among
+    the part's [R], offsets [R, 3], rotations unit wxyz [R, 4], the turns that led there [R, 4], and growths of log
+    scales [R, 3]."""
 
     rows: np.ndarray
+    places: np.ndarray
     offsets: np.ndarray
     quats: np.ndarray
     turns: np.ndarray
@@ -240,17 +246,48 @@ def bends(given: Gathered, instance: Instance) -> bool:
     return bool(np.searchsorted(rows, instance.start) < np.searchsorted(rows, instance.start + instance.count))
 
 
-def _bent(given: Gathered, instance: Instance, rows: tuple[int, int]) -> _Bent | None:
-    if not bends(given, instance):
+def _bent(given: Gathered, instance: Instance, part: slice | np.ndarray) -> _Bent | None:
+    if instance.t is None:
         return None
-    residuals, first = given.residuals[instance.scene](), given.starts[instance.scene]
-    found = residuals.at(float(instance.t or 0.0))
+    residuals = given.residuals[instance.scene]()
+    found, known = residuals.at(float(instance.t)), given.starts[instance.scene] + residuals.rows
     if found is None:
         return None
-    part = slice(*np.searchsorted(residuals.rows, (rows[0] - first, rows[1] - first)))
-    offsets, turns, growths = (values[:, part] for values in found)
-    turned = columns.multiply(turns.astype(np.float32), residuals.bind_quats[:, part])
-    return _Bent(first + residuals.rows[part], offsets.T, np.ascontiguousarray(turned.T), turns.T, growths.T)
+    if isinstance(part, slice):
+        which = np.arange(*np.searchsorted(known, (part.start, part.stop)))
+        places = known[which] - part.start
+    else:
+        near = np.minimum(np.searchsorted(known, part), len(known) - 1)
+        places = np.flatnonzero(known[near] == part)
+        which = near[places]
+    if len(which) == 0:
+        return None
+    offsets, turns, growths = (values[:, which] for values in found)
+    turned = columns.multiply(turns.astype(np.float32), residuals.bind_quats[:, which])
+    return _Bent(known[which], places, offsets.T, np.ascontiguousarray(turned.T), turns.T, growths.T)
+
+
+def _parts(
+    instances: Sequence[Instance], ranges: Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, slice | np.ndarray]]:
+    """What is moved in one go: the first instance of each part, and the part's rows among those gathered.
+
+    A part is one instance, but for many stretches one after the other that share everything else, as they are left of a
+    cloud of which points were deleted.
+    """
+    keys = [(one.scene, np.asarray(one.matrix).tobytes(), _bytes(one.world), one.tint, one.t) for one in instances]
+    index = 0
+    for _, same in itertools.groupby(keys):
+        count = len(list(same))
+        if count < MANY:
+            yield from ((i, slice(*ranges[i])) for i in range(index, index + count))
+        else:
+            yield index, np.concatenate([np.arange(*ranges[i]) for i in range(index, index + count)])
+        index += count
+
+
+def _bytes(matrix: np.ndarray | None) -> bytes:
+    return b"" if matrix is None else np.asarray(matrix).tobytes()
 
 
 def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -290,10 +327,10 @@ def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
     return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
 
 
-def _shading(given: Gathered, rows: slice, rotation: np.ndarray, light: np.ndarray | None) -> np.ndarray:
+def _shading(given: Gathered, rows: slice | np.ndarray, rotation: np.ndarray, light: np.ndarray | None) -> np.ndarray:
     """Shading factor of a range that has turned by a rotation under a light. [n] float32"""
     if given.shading is None or given.shading_rest is None or light is None:
-        return np.ones(rows.stop - rows.start, np.float32)
+        return np.ones(len(given.means[rows]), np.float32)
     change = (rotation.T @ light - light).astype(np.float32)
     return np.maximum(given.shading_rest[rows] + given.shading[rows] @ change, 0)
 

@@ -299,3 +299,17 @@ def test_depths_may_count_from_before_a_far_camera(pair):
         assert (found.depth[~seen] == 0).all() and seen.any()
         depths = scene_render.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
         assert depths.min() - 1e-4 < found.depth[seen].min() and found.depth[seen].max() < depths.max() + 1e-4
+
+
+@pytest.mark.parametrize("t", [None, 0.2])
+def test_many_stretches_are_their_instances(bending, t):
+    world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
+    starts = [*range(0, 300, 7), *range(20, 100, 5)]
+    stretches = [Instance(start, 4, world, 0, world, (0.5, 1.0, 1.0), t) for start in starts]
+    found = scene_render.pose_instances(bending, stretches)
+    parts = [scene_render.pose_instances(bending, [one]) for one in stretches]
+    for name in ("means", "quats", "log_scales", "shading_factor", "sh", "object_ids"):
+        expected = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_allclose(getattr(found, name), expected, atol=1e-6, err_msg=name)
+    expected = np.concatenate([scene_render.colors(part, CAMERA) for part in parts])
+    np.testing.assert_allclose(scene_render.colors(found, CAMERA), expected, atol=1e-5)
