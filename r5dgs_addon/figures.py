@@ -41,7 +41,7 @@ def errors() -> list[str]:
     figures = bpy.context.window_manager.r5dgs_figures
     lines = [figures.error] if figures.error else []
     if figures.unbent:
-        lines.append(f"{figures.unbent:,} Gaussians that bend are shown unbent")
+        lines.append(f"{figures.unbent:,} Gaussians bend while observed, shown unbent; see Exact Mode")
     return lines
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.scene import cameras, playback, quality, scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -88,6 +88,28 @@ def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
     scene = scene_file.read(scene_path)
     go_to(blender, t)
     assert psnr(preview(blender), core_picture(scene, playback.frame(scene, t))) > 45
+
+
+def test_the_error_is_told_beside_the_milliseconds(blender, loaded, scene_path):
+    figures = importlib.import_module("r5dgs.r5dgs_addon.figures")
+    preview(blender)
+    size = " x ".join(map(str, blender.data.images["R5DGS Preview"].size))
+    assert re.fullmatch(rf"{size} in \d+ ms \(motion \d+, raster \d+\)", figures.speed())
+    assert figures.errors() == [quality.of(scene_file.read(scene_path), scene_path).text()]
+    state = blender.context.window_manager.r5dgs_figures
+    figures.remember(
+        blender.data.images["R5DGS Preview"],
+        {
+            "ms_motion": 1.2,
+            "ms_raster": 3.4,
+            "scenes": [
+                {"name": "a", "error": "41.5 dB", "unbent": 1200},
+                {"name": "b", "error": "not known", "unbent": 34},
+            ],
+        },
+    )
+    assert state.ms_raster == pytest.approx(3.4) and figures.speed().endswith("(motion 1, raster 3)")
+    assert figures.errors()[0] == "a: 41.5 dB; b: not known" and figures.errors()[1].startswith("1,234 Gaussians bend")
 
 
 def test_saved_bytes_are_the_pictures_bytes(blender, loaded, scene_path, tmp_path):
