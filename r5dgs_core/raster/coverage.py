@@ -41,7 +41,7 @@ def shares(
         Groups, -1 where there are fewer [H, W, ranks] int32, and their shares in falling order, of at most alpha in
         all [H, W, ranks] float32.
     """
-    size = (camera.height, camera.width, ranks)
+    size = (ranks, camera.height * camera.width)
     best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
     groups = np.asarray(groups, np.int64)
     gaussians, seen = scene_render.PosedGaussians(posed), _seen_from(camera, posed.origin)
@@ -55,13 +55,25 @@ def shares(
                 gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
             )
         image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
-        values = scene_render.to_numpy(image, np.float32)
-        names = np.broadcast_to(chosen.astype(np.int32), values.shape)
-        both, all_names = np.concatenate([best, values], -1), np.concatenate([found, names], -1)
-        order = np.argsort(-both, axis=-1, kind="stable")[..., :ranks]
-        best = np.take_along_axis(both, order, -1)
-        found = np.take_along_axis(all_names, order, -1)
-    return np.where(best > 0, found, -1), best
+        values = scene_render.to_numpy(image, np.float32).reshape(-1, len(chosen))
+        for column, group in enumerate(chosen):
+            _insert(best, found, values[:, column], int(group))
+    shape = (camera.height, camera.width, ranks)
+    return found.T.reshape(shape), best.T.reshape(shape)
+
+
+def _insert(best: np.ndarray, found: np.ndarray, values: np.ndarray, group: int) -> None:
+    """Sort a group's shares [P] into the largest ones so far, [ranks, P] each; most groups are in few pixels."""
+    pixels = np.flatnonzero(values > 0)
+    shares, names = values[pixels], np.full(len(pixels), group, np.int32)
+    for rank in range(len(best)):
+        larger = np.flatnonzero(shares > best[rank, pixels])
+        places = pixels[larger]
+        passed, passed_names = best[rank, places], found[rank, places]
+        best[rank, places], found[rank, places] = shares[larger], names[larger]
+        shares[larger], names[larger] = passed, passed_names
+        left = shares > 0
+        pixels, shares, names = pixels[left], shares[left], names[left]
 
 
 def _seen_from(camera: Camera, origin: np.ndarray) -> Camera:

@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import signal
+import threading
 import types
 
 import numpy as np
@@ -331,6 +332,18 @@ def test_a_render_is_stopped_while_the_worker_hangs_and_the_next_one_works(blend
     steps = picture.steps(picture.shown(blender.context.evaluated_depsgraph_get()))
     assert stopped.engine._ask(steps) is None and stopped.said
     assert not running.alive and not worker.busy()
+    render_png(blender, tmp_path)
+
+
+def test_a_worker_that_is_killed_in_mid_render_is_reported_and_survived(blender, loaded, tmp_path):
+    running = importlib.import_module("r5dgs.r5dgs_addon.worker").current()
+    os.kill(running.pid, signal.SIGSTOP)  # so that the render waits
+    killer = threading.Timer(0.5, os.kill, (running.pid, signal.SIGKILL))
+    killer.start()
+    with pytest.raises(RuntimeError, match="ended unexpectedly"):
+        render_png(blender, tmp_path, "nothing")
+    killer.join()
+    assert not (tmp_path / "nothing.png").exists()
     render_png(blender, tmp_path)
 
 
