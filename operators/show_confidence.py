@@ -31,14 +31,16 @@ class R5DGS_OT_show_confidence(bpy.types.Operator):
 
     def execute(self, context):
         collection = objects.active_collection(context)
-        everyone = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
-        anchors = motion_objects.chosen(context) if context.selected_objects else []
-        anchors = anchors or everyone
-        shown = [anchor for anchor in anchors if motion_confidence.helper_of(anchor) is not None]
+        everyone = objects.members(collection, "ANCHOR")
+        selected = motion_objects.chosen(context) if context.selected_objects else []
+        shown = [anchor for anchor in selected or everyone if motion_confidence.helper_of(anchor) is not None]
         if self.action == "HIDE" or (self.action == "TOGGLE" and shown):
-            count = sum(motion_confidence.hide(anchor) for anchor in anchors)
+            count = sum(motion_confidence.hide(anchor) for anchor in shown)
             self.report({"INFO"}, f"Removed {count} tubes")
             return {"FINISHED"}
+        # Shadows go where their casters go: a tube of their own is shown to who asks for it.
+        leaders = [a for a in everyone if motion_physics.has_motion(a) and a.r5dgs_motion.leader is None]
+        anchors = selected or leaders
         try:
             tubes = [motion_confidence.show(anchor, motion_extrapolate.times_of(anchor)) for anchor in anchors]
         except errors.R5dgsError as error:

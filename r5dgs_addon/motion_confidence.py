@@ -46,7 +46,7 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
         for collection in anchor.users_collection:
             collection.objects.link(tube)
         tube.hide_render = tube.hide_select = True
-        tube.show_in_front = False
+        tube.show_in_front = True  # it begins inside the object
         state.tube = tube
     tube.parent = anchor.parent
     tube.matrix_parent_inverse = anchor.matrix_parent_inverse

@@ -68,9 +68,19 @@ def test_all_that_move_get_one_where_nothing_is_chosen_and_a_second_press_remove
     motions.choose(blender, loaded.r5dgs.root)
     blender.ops.r5dgs.show_confidence()
     with_tubes = {o.name for o in loaded.all_objects if o.r5dgs_motion.tube}
-    assert with_tubes == {f"{n} anchor" for n in ("mug", "red apple", "toy car", "lemon", "mug shadow")}
+    assert with_tubes == {f"{n} anchor" for n in ("mug", "red apple", "toy car", "lemon")}
     blender.ops.r5dgs.show_confidence()
     assert {kind: {d.name for d in getattr(blender.data, kind)} for kind in before} == before
+
+
+def test_a_shadow_gets_one_where_it_is_chosen(blender, loaded):
+    shadow = blender.data.objects["mug shadow anchor"]
+    motions.choose(blender, shadow)
+    assert blender.ops.r5dgs.show_confidence() == {"FINISHED"}
+    assert [o.name for o in loaded.all_objects if o.r5dgs_motion.tube] == [shadow.name]
+    motions.choose(blender, loaded.r5dgs.root)
+    blender.ops.r5dgs.show_confidence(action="HIDE")
+    assert shadow.r5dgs_motion.tube is None
 
 
 def test_it_follows_edits_and_what_was_edited_is_certain(blender, loaded):
