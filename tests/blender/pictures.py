@@ -125,18 +125,30 @@ def nothing(window: Window):
 
 
 def physics(window: Window):
-    """The motion of one object as physics, with its path and confidence."""
+    """The motion of one object as physics, and where all go, as thick as it is unsure."""
+    window.area("VIEW_3D").spaces.active.shading.type = "SOLID"
+    window.area("VIEW_3D").spaces.active.shading.color_type = "OBJECT"
     with window.inside():
-        bpy.ops.r5dgs.select_by_prompt(text="mug")
-        bpy.ops.r5dgs.show_confidence()
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.r5dgs.show_confidence(action="SHOW")
+        bpy.ops.r5dgs.select_by_prompt(text="apple")
+        bpy.ops.r5dgs.extrapolate_until(t_end=1.6)
+
+
+def ellipsoids(window: Window):
+    """The other display of viewports."""
+    window.area("VIEW_3D").spaces.active.shading.type = "MATERIAL"
+    with window.inside():
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.r5dgs.show_confidence(action="HIDE")
+        bpy.ops.r5dgs.set_display(display="ELLIPSOIDS")
+    yield 8.0
 
 
 def viewport(window: Window):
     """Rendered viewport shading by the engine."""
     with window.inside():
-        if any(obj.name.endswith("confidence") for obj in bpy.data.objects):
-            bpy.ops.r5dgs.show_confidence()
-        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.r5dgs.set_display(display="POINTS")
         bpy.ops.r5dgs.use_engine()
     window.area("VIEW_3D").spaces.active.shading.type = "RENDERED"
     yield 60.0  # the rasterizer may have to be compiled first
@@ -165,7 +177,7 @@ def merge(window: Window):
     meshes = bpy.data.scenes.new("Meshes")
     low, high = bounds()
     middle, size = (low + high) / 2, (high - low).length
-    bpy.ops.mesh.primitive_monkey_add(size=0.22 * size, location=middle + Vector((0.02, -0.05, 0.12)) * size)
+    bpy.ops.mesh.primitive_monkey_add(size=0.12 * size, location=middle + Vector((-0.03, -0.08, 0.02)) * size)
     monkey = bpy.context.object
     for holder in list(monkey.users_collection):
         holder.objects.unlink(monkey)
@@ -177,6 +189,7 @@ def merge(window: Window):
     meshes.cycles.samples, meshes.cycles.use_denoising = 32, False
     meshes.view_layers[0].use_pass_z = True
     meshes.view_settings.view_transform = "Standard"
+    meshes.render.film_transparent = True  # else its world would hide the sky, as far away as it is
     for scene in (gaussians, meshes):
         scene.render.resolution_percentage = 60
     for name in ("resolution_x", "resolution_y"):
@@ -185,6 +198,7 @@ def merge(window: Window):
     tree = gaussians.node_tree
     tree.nodes.clear()
     combine, output = tree.nodes.new("CompositorNodeZcombine"), tree.nodes.new("CompositorNodeComposite")
+    combine.use_alpha = True
     combine.location, output.location = (60, 0), (280, 0)
     for index, source in enumerate((gaussians, meshes)):
         layers = tree.nodes.new("CompositorNodeRLayers")
@@ -206,7 +220,7 @@ def merge(window: Window):
             fit()
 
 
-SHOTS = (loaded, prompt, nothing, physics, viewport, preview, merge)
+SHOTS = (loaded, prompt, nothing, physics, ellipsoids, viewport, preview, merge)
 
 
 def run(path: Path, folder: Path, shots: list):
