@@ -186,8 +186,11 @@ class Server:
         return result, arrays
 
     def _coverage(self, request: dict[str, Any], camera: Camera, near: float | None) -> dict[str, np.ndarray]:
+        """Which groups of instances share each pixel, and how much of it each has."""
+        assert self._stage is not None  # the picture was drawn just now
         groups, ranks = asked.coverage_of(request)
         instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
+        assert self._stage is not None  # the picture needed it
         found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
         return {"coverage_groups": found, "coverage": shares}
 
