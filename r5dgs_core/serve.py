@@ -190,7 +190,6 @@ class Server:
         assert self._stage is not None  # the picture was drawn just now
         groups, ranks = asked.coverage_of(request)
         instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
-        assert self._stage is not None  # the picture needed it
         found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
         return {"coverage_groups": found, "coverage": shares}
 
