@@ -73,16 +73,24 @@ def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_render.Insta
         start, count = int(value["start"]), int(value["count"])
     except (KeyError, TypeError, ValueError):
         raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {value!r}") from None
-    world, tint = value.get("world"), value.get("tint")
+    world = value.get("world")
     if world is not None:
         world = matrix_of(world, 4, f"the world of rows {start}")
-    if tint is not None and not (isinstance(tint, list) and len(tint) == 3):
-        raise errors.ConfigError(f"worker: a tint has to hold three factors, found {tint!r}")
     matrix = matrix_of(value.get("matrix"), 4, f"the matrix of rows {start}")
     t = value.get("t")
     if t is not None and not (isinstance(t, int | float) and math.isfinite(t)):
         raise errors.ConfigError(f"worker: the time of an instance has to be a number, found {t!r}")
-    return scene_render.Instance(start, count, matrix, number_of(value, numbers), world, tint, t)
+    return scene_render.Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t)
+
+
+def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
+    tint = value.get("tint")
+    if tint is None:
+        return None
+    if not (isinstance(tint, list) and len(tint) == 3 and all(isinstance(factor, int | float) for factor in tint)):
+        raise errors.ConfigError(f"worker: a tint has to hold three factors, found {tint!r}")
+    red, green, blue = map(float, tint)
+    return red, green, blue
 
 
 def distance_of(request: dict[str, Any]) -> float:

@@ -42,8 +42,9 @@ def run() -> Trial:
         directions / np.linalg.norm(directions, axis=1, keepdims=True) * np.cbrt(random.uniform(size=(GAUSSIANS, 1)))
     )
     scales = 0.015 * np.exp(0.5 * random.normal(size=(GAUSSIANS, 3)))
-    quats, opacities, colors = (random.uniform(0.1, 0.9, (GAUSSIANS, width)) for width in (4, 1, 3))
-    inputs = [torch.from_numpy(array.astype(np.float32)) for array in (means, quats, scales, opacities[:, 0], colors)]
+    quats, colors = (random.uniform(0.1, 0.9, (GAUSSIANS, width)) for width in (4, 3))
+    places, axes, turns, values = (torch.from_numpy(a.astype(np.float32)) for a in (means, scales, quats, colors))
+    opacities = torch.from_numpy(random.uniform(0.1, 0.9, GAUSSIANS).astype(np.float32))
     T_cam_world = np.eye(4)
     T_cam_world[2, 3] = 3.0
     half = SIZE / 2
@@ -54,7 +55,7 @@ def run() -> Trial:
     with torch.no_grad():
         for _ in range(REPEATS):
             start = time.perf_counter()
-            rasterize_splats(*inputs, camera)
+            rasterize_splats(places, turns, axes, opacities, values, camera)
             milliseconds.append(1e3 * (time.perf_counter() - start))
     return Trial(statistics.median(milliseconds), GAUSSIANS, (SIZE, SIZE), _device())
 
