@@ -15,6 +15,7 @@ from r5dgs_core.scene import scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
 
 PYTHON = sys.executable
 HELLO = [("greeting", "hello", {})]

@@ -177,6 +177,8 @@ def _without_torch(pytest, left_out: list[str]):
             if report.outcome == "failed" and "No module named 'torch'" in str(report.longrepr):
                 report.outcome, report.longrepr = "skipped", (str(collector.path), 0, "Skipped: torch is not installed")
                 left_out.append(collector.path.name)
+            elif report.outcome == "skipped" and "torch is not installed" in str(report.longrepr):
+                left_out.append(collector.path.name)
             return report
 
     return Plugin()
