@@ -3,8 +3,8 @@
     xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" \\
         blender --factory-startup --python tests/blender/check_viewport.py -- SCENE.r5dgs
 
-`R5DGS_PYTHON` names the worker's Python where that is not found by itself. Ends with exit code 1 where a picture does not
-come, F12 is not the worker's own, or something goes on after the file is closed.
+`R5DGS_PYTHON` names the worker's Python where that is not found by itself. Ends with exit code 1 where a picture does
+not come, F12 is not the worker's own, or something goes on after the file is closed.
 """
 
 import importlib

@@ -11,8 +11,10 @@ a function may be a generator, whose values are seconds to wait in between.
 import argparse
 import importlib.util
 import inspect
+import shutil
 import subprocess
 import sys
+import tempfile
 import traceback
 from pathlib import Path
 
@@ -20,6 +22,7 @@ import bpy
 from mathutils import Vector
 
 ROOT = Path(__file__).resolve().parents[2]
+CROPS = {"nothing": "225x330+830+66"}  # of 1280 pixels of width: where one panel is all there is to see
 SETTLE_S = 2.5  # for the window to draw what was set up
 SIDEBAR = "R5DGS"
 
@@ -72,8 +75,10 @@ def load(path: Path, window: Window) -> None:
     """A scene in an otherwise empty file, seen by a camera of its data set."""
     for obj in list(bpy.data.objects):
         bpy.data.objects.remove(obj)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path.with_suffix(".blend")))  # the sidebar shows paths from here
     with window.inside():
         bpy.ops.r5dgs.load_scene(filepath=str(path))
+    collection().r5dgs.filepath = f"//{path.name}"
     scene = bpy.context.scene
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(camera)
@@ -239,8 +244,11 @@ def run(path: Path, folder: Path, shots: list):
         with window.inside(window.window.screen.areas[0].type):
             bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
         yield 0.5
-        target = folder / f"{shot.__name__}.png"
-        subprocess.run(["import", "-window", "root", "-depth", "8", str(target)], check=True)
+        target = folder / f"{shot.__name__}.jpg"
+        crop = ["-crop", CROPS[shot.__name__], "+repage"] if shot.__name__ in CROPS else []
+        subprocess.run(
+            ["import", "-window", "root", "-resize", "1280x", *crop, "-quality", "88", str(target)], check=True
+        )
         print(f"written: {target}", flush=True)
 
 
@@ -255,7 +263,9 @@ def main(arguments: list[str]) -> None:
     bpy.context.preferences.view.show_splash = False
     register_extension()
     chosen = [shot for shot in SHOTS if not options.pictures or shot.__name__ in options.pictures]
-    going = run(options.scene.resolve(), options.folder.resolve(), chosen)
+    copy = Path(tempfile.mkdtemp(prefix="r5dgs-pictures-")) / options.scene.name
+    shutil.copy(options.scene, copy)
+    going = run(copy, options.folder.resolve(), chosen)
 
     def step():
         try:
@@ -264,6 +274,7 @@ def main(arguments: list[str]) -> None:
             pass
         except BaseException:
             traceback.print_exc()
+        shutil.rmtree(copy.parent, ignore_errors=True)
         bpy.ops.wm.quit_blender()
         return None
 
