@@ -232,8 +232,9 @@ def _anchor(
 ) -> bpy.types.Object:
     anchor = bpy.data.objects.new(table.fit(f"{_part_name(scene, part, parts)} anchor"), None)
     pivot = _pivot(scene, part)
-    anchor.empty_display_type = "ARROWS"
-    anchor.empty_display_size = 0.03 * extent
+    shadow = scene.groups[part.motion_id].role == "shadow"  # what goes along is drawn smaller than what leads
+    anchor.empty_display_type = "PLAIN_AXES" if shadow else "ARROWS"
+    anchor.empty_display_size = (0.01 if shadow else 0.03) * extent
     anchor.rotation_mode = "QUATERNION"
     anchor.location = pivot
     anchor.parent = root
