@@ -1,5 +1,7 @@
 """Objects are copied, removed and given the motion of others as wholes; what else is there stays."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -156,6 +158,28 @@ def test_deleting_takes_what_belongs_to_the_object_and_nothing_else(blender, sce
     assert "mug" not in blender.data.collections and cloud_of_mug not in blender.data.pointclouds
     np.testing.assert_allclose(motions.matrix(blender, lamp), place, atol=1e-6)
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), (0.3, 0.9))
+
+
+@pytest.mark.parametrize("name", ["background", "mug"])
+def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others(blender, tmp_path, name):
+    """Clouds that move with another object are selected, and do not stand for that one."""
+    scene = scenes.make_scene(n=400, objects=5, seed=1)
+    motion_ids = scene.motion_ids.copy()
+    motion_ids[np.flatnonzero((scene.object_ids == 0) & (motion_ids == 0))[-5:]] = (
+        2  # background that moves with the apple
+    )
+    motion_ids[np.flatnonzero(scene.object_ids == 1)[-5:]] = 3  # of the mug, moving with the car
+    order = np.lexsort((motion_ids, scene.object_ids))
+    fields = ("means", "quats", "log_scales", "opacity_logits", "sh", "identities", "shading", "object_ids")
+    arrays = {field: getattr(scene, field)[order] for field in fields}
+    scene = dataclasses.replace(scene, **arrays, motion_ids=motion_ids[order])
+    path = scene_file.write(scene, tmp_path / "fringe.r5dgs")
+    motions.load(blender, path)
+    blender.ops.r5dgs.select_by_prompt(text=name)
+    selected = blender.context.selected_objects
+    assert any(obj.parent is not None and obj.parent not in selected for obj in selected if obj.r5dgs.role == "CLOUD")
+    meant = motions.addon("motion_objects").chosen(blender.context)
+    assert meant and {obj.r5dgs.object_id for obj in meant} == {anchor(blender, name).r5dgs.object_id}
 
 
 def test_shadows_stay_when_asked_to(blender, loaded):
