@@ -54,6 +54,7 @@ def shares(
             output = rasterize(
                 gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
             )
+        assert output.features is not None  # they were asked for
         image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
         values = scene_render.to_numpy(image, np.float32).reshape(-1, len(chosen))
         for column, group in enumerate(chosen):

@@ -29,6 +29,7 @@ JSON_MEMBER = "scene.json"
 FIXED_POINT = {"quats": 32767.0, "residual_quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
 _QUATS = ("quats", "residual_quats")
 _READ_BEFORE = 1e-7  # float32 rounding of what was read
+_QUATS_AT_ONCE = 1 << 15  # what the processor's cache holds
 _HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
 _MEMORY_DTYPES: dict[str, type] = {
     "means": np.float32,
@@ -223,12 +224,19 @@ def _whole_units(quats: np.ndarray) -> np.ndarray:
     Reading normalises, so that the stored ones may be longer or shorter by their rounding, and others a step beside
     them would be written for what was read.
     """
-    wide, unit = quats.astype(np.float64), FIXED_POINT["quats"]
-    result = np.rint(wide * unit)
-    for radius in (unit - 0.75, unit + 0.75):
-        other = np.clip(np.rint(wide * radius), -unit, unit)
-        missed = np.abs(other / np.linalg.norm(other, axis=-1, keepdims=True) - wide).max(-1, keepdims=True)
-        result = np.where(missed <= _READ_BEFORE, other, result)
+    unit = FIXED_POINT["quats"]
+    result = np.empty(quats.shape)
+    for start in range(0, len(quats), _QUATS_AT_ONCE):
+        wide = np.ascontiguousarray(
+            quats[start : start + _QUATS_AT_ONCE].T, np.float64
+        )  # columns: numpy is slow at fours
+        best = np.rint(wide * unit)
+        for radius in (unit - 0.75, unit + 0.75):
+            other = np.clip(np.rint(wide * radius), -unit, unit)
+            norms = np.sqrt((other * other).sum(0))
+            read = (np.abs(other - wide * norms) <= _READ_BEFORE * norms).all(0)
+            best = np.where(read, other, best)
+        result[start : start + _QUATS_AT_ONCE] = best.T
     return result
 
 
