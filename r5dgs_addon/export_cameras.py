@@ -100,7 +100,7 @@ def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str,
     Raises:
         ConfigError: The scene's own world is sheared or scaled unevenly, so that its cameras would be no cameras.
     """
-    own = views.of_camera(depsgraph, np.zeros((0, 3)), camera, border=False).camera
+    own = views.of_camera(depsgraph, lambda: np.zeros((0, 3)), camera, border=False).camera
     turn = export_gaussians.world_to(axes, world)
     if not carried.is_similarity(turn[:3, :3]) or np.linalg.det(turn[:3, :3]) < 0:
         raise errors.ConfigError("export: expected a root with one scale on all axes, found another; choose other axes")

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from pathlib import Path
 
 import bpy
@@ -77,9 +78,15 @@ def worker_python() -> str:
 
 
 def search() -> str:
-    """Look for a Python that can run the worker and remember it; "" where there is none."""
+    """Look for a Python that can run the worker and remember it, in the preferences, too, where that is allowed.
+
+    Returns:
+        Its path; "" where there is none.
+    """
     global _found
     _found = pythons.find(_beside()) or ""
+    if threading.current_thread() is not threading.main_thread():  # a render: it must not write Blender's data
+        return _found
     preferences = get()
     if preferences is not None and preferences.found_python != _found:
         preferences.found_python = _found

@@ -7,6 +7,7 @@ import stat
 import sys
 import threading
 import time
+import types
 
 import pytest
 
@@ -194,3 +195,15 @@ def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences,
 def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, pythons, monkeypatch):
     monkeypatch.setattr(pythons, "find", lambda beside: None)
     assert preferences.worker_python() == sys.executable
+
+
+def test_a_search_in_a_render_leaves_the_preferences_alone(preferences, pythons, monkeypatch):
+    kept = types.SimpleNamespace(worker_python="", found_python="")
+    monkeypatch.setattr(preferences, "get", lambda: kept)
+    monkeypatch.setattr(pythons, "find", lambda beside: sys.executable)
+    found = []
+    render = threading.Thread(target=lambda: found.append(preferences.worker_python()))
+    render.start()
+    render.join()
+    assert found == [sys.executable] and kept.found_python == ""
+    assert preferences.search() == kept.found_python == sys.executable
