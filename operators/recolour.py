@@ -1,4 +1,4 @@
-"""Recolour: tint the selected objects of loaded scenes; white takes the tint back."""
+"""Recolor: tint the selected objects of loaded scenes; white takes the tint back."""
 
 import bpy
 from bpy.props import FloatVectorProperty
@@ -7,15 +7,15 @@ from ..r5dgs_addon import look, selection, table
 
 
 class R5DGS_OT_recolour(bpy.types.Operator):
-    """Multiply the colours of the selected objects; previews, renders and exports obey it"""
+    """Multiply the colors of the selected objects; previews, renders and exports obey it"""
 
     bl_idname = "r5dgs.recolour"
-    bl_label = "Recolour"
+    bl_label = "Recolor"
     bl_options = {"REGISTER", "UNDO"}
 
     tint: FloatVectorProperty(
         name="Tint",
-        description="Colour that the Gaussians are multiplied with; white leaves them as captured",
+        description="Color that the Gaussians are multiplied with; white leaves them as captured",
         subtype="COLOR_GAMMA",
         size=3,
         default=look.NONE,

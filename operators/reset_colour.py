@@ -1,4 +1,4 @@
-"""Reset Colour: the selected objects of loaded scenes look as captured again."""
+"""Reset Color: the selected objects of loaded scenes look as captured again."""
 
 import bpy
 
@@ -9,7 +9,7 @@ class R5DGS_OT_reset_colour(bpy.types.Operator):
     """Take the tint off the selected objects"""
 
     bl_idname = "r5dgs.reset_colour"
-    bl_label = "Reset Colour"
+    bl_label = "Reset Color"
     bl_options = {"REGISTER", "UNDO"}
 
     @classmethod

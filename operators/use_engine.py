@@ -6,8 +6,7 @@ from ..r5dgs_addon import engine, engine_color
 
 
 class R5DGS_OT_use_engine(bpy.types.Operator):
-    """Render this Blender scene with the engine R5DGS, and set the view transform to Standard, so that colors come out
-    as trained"""
+    """Render with the engine R5DGS, and set the view transform to Standard, so that colors come out as trained"""
 
     bl_idname = "r5dgs.use_engine"
     bl_label = "Use R5DGS Engine"
@@ -21,16 +20,4 @@ class R5DGS_OT_use_engine(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class R5DGS_OT_show_colors_as_trained(bpy.types.Operator):
-    """Set the view transform to Standard, without look, exposure, gamma or curves"""
-
-    bl_idname = "r5dgs.show_colors_as_trained"
-    bl_label = "Show Colors as Trained"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context):
-        engine_color.show_as_trained(context.scene)
-        return {"FINISHED"}
-
-
-CLASSES = (R5DGS_OT_use_engine, R5DGS_OT_show_colors_as_trained)
+CLASSES = (R5DGS_OT_use_engine,)

@@ -124,7 +124,7 @@ def splats_of(
             points = from_points(one.object.data, one.object.r5dgs.object_id)
             parts.append(carried.carry(points, matrix, np.array(one.tint)))
         if parts[-1].sh.shape[1] > 1 and not carried.is_similarity(matrix[:3, :3]):
-            sources.note(f"{names[-1]}: scaled unevenly; how its colours change with the direction is a best fit")
+            sources.note(f"{names[-1]}: scaled unevenly; how its colors change with the direction is a best fit")
     return carried.join(parts), names
 
 

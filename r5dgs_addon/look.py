@@ -23,7 +23,7 @@ class R5DGS_PG_look(bpy.types.PropertyGroup):
 
     tint: FloatVectorProperty(
         name="Tint",
-        description="Colour that the Gaussians are multiplied with; white leaves them as they were captured",
+        description="Color that the Gaussians are multiplied with; white leaves them as they were captured",
         subtype="COLOR_GAMMA",
         size=3,
         default=NONE,
@@ -35,11 +35,11 @@ class R5DGS_PG_look(bpy.types.PropertyGroup):
         override=OVERRIDABLE,
     )
     shown: BoolProperty(
-        name="Shown", description="Whether the viewport colour is the tint's", options=set(), override=OVERRIDABLE
+        name="Shown", description="Whether the viewport color is the tint's", options=set(), override=OVERRIDABLE
     )
     plain: FloatVectorProperty(
-        name="Plain Colour",
-        description="Viewport colour of the object without tint",
+        name="Plain Color",
+        description="Viewport color of the object without tint",
         size=4,
         options=set(),
         override=OVERRIDABLE,

@@ -27,7 +27,7 @@ KINDS = (
     (
         "ballistic_spin",
         "Throw and Spin",
-        "Its centre flies and it spins about that; a hinge or a pendulum where the centre lies on the axis and rests",
+        "Its center flies and it spins about that; a hinge or a pendulum where the center lies on the axis and rests",
     ),
     ("constant_twist", "Screw", "Turns steadily and moves along with its own axes"),
     ("world_twist", "Orbit", "Turns about a place in the world, with steadily changing rates"),
@@ -134,7 +134,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         **_vector("angular_acceleration"),
     )
     center_offset: FloatVectorProperty(
-        name="Centre",
+        name="Center",
         description="The point that flies or rests while the object spins about it, seen from the anchor",
         subtype="TRANSLATION",
         unit="LENGTH",

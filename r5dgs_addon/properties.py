@@ -55,8 +55,8 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
         set=rows.set_label,
     )
     color: FloatVectorProperty(
-        name="Colour",
-        description="Colour in viewports; choosing another one tints the object",
+        name="Color",
+        description="Color in viewports; choosing another one tints the object",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,
@@ -66,7 +66,7 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     )
     tint: FloatVectorProperty(
         name="Tint",
-        description="Colour that the object's Gaussians are multiplied with; white leaves them as captured",
+        description="Color that the object's Gaussians are multiplied with; white leaves them as captured",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,

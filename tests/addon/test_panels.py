@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import os
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -112,3 +113,31 @@ def test_cycles_shows_points_in_the_colours_of_the_file(blender, tmp_path):
     covered = rgba[..., 3] == 1
     assert covered.sum() > 10
     np.testing.assert_allclose(rgba[covered][:, :3], np.broadcast_to(srgb, (covered.sum(), 3)), atol=0.01)
+
+
+def _texts(rna):
+    """Where and what the interface says of a type: labels, tooltips and those of its properties and their items."""
+    yield rna.identifier, rna.name
+    yield rna.identifier, rna.description
+    for item in rna.properties:
+        if item.identifier not in ("rna_type", "bl_idname", "bl_rna"):
+            entries = getattr(item, "enum_items_static", ())
+            for part in (item, *entries):
+                yield f"{rna.identifier}.{item.identifier}", part.name
+                yield f"{rna.identifier}.{item.identifier}", part.description
+
+
+def test_labels_and_tooltips_are_written_as_blenders_own(blender):
+    groups = (blender.types.PropertyGroup, blender.types.AddonPreferences)
+    rnas = [cls.bl_rna for base in groups for cls in base.__subclasses__() if cls.__module__.startswith("r5dgs.")]
+    rnas += [getattr(blender.ops.r5dgs, name).get_rna_type() for name in dir(blender.ops.r5dgs)]
+    wrong = re.compile("\\n|  |[a-z]\\.$|colour|centre|grey", re.IGNORECASE)
+    texts = [found for rna in rnas for found in _texts(rna)]
+    assert len(texts) > 300 and [found for found in texts if wrong.search(found[1])] == []
+
+
+def test_each_operator_has_a_file_of_its_own(extension):
+    operators = importlib.import_module("r5dgs.operators")
+    for module in operators.MODULES:
+        idnames = [cls.bl_idname for cls in module.CLASSES if cls.bl_idname.startswith("r5dgs.")]
+        assert idnames == [f"r5dgs.{module.__name__.rpartition('.')[2]}"]

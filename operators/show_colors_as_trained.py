@@ -1,0 +1,20 @@
+"""Show Colors as Trained: colour management that gives the colours back as trained, whatever the engine is."""
+
+import bpy
+
+from ..r5dgs_addon import engine_color
+
+
+class R5DGS_OT_show_colors_as_trained(bpy.types.Operator):
+    """Set the view transform to Standard, without look, exposure, gamma or curves"""
+
+    bl_idname = "r5dgs.show_colors_as_trained"
+    bl_label = "Show Colors as Trained"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        engine_color.show_as_trained(context.scene)
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_show_colors_as_trained,)
