@@ -88,8 +88,11 @@ def talk(cache, scene_path):
         **{"width": 32, "height": 24, "intrinsics": camera.intrinsics.tolist()},
         "T_cam_world": camera.T_cam_world.tolist(),
     }
-    draw = {"command": "render", "camera": view, "t": 0.3, "want": ["ids"]}
-    lines = request(0, command="hello") + request(1, command="load", path=str(scene_path))
+    at_rest = np.eye(4).tolist()
+    instances = [{"scene": 0, "start": 0, "count": 300, "matrix": at_rest}]
+    sky = {"scene": 0, "matrix": at_rest}
+    draw = {"command": "render", "camera": view, "instances": instances, "sky": sky, "near": 0.01, "want": ["owners"]}
+    lines = request(0, command="hello") + request(1, command="load", paths=[str(scene_path)])
     lines += request(2, **draw) + request(3, **draw)
     return list(headers(io.BytesIO(finish(start(cache, "-m", "r5dgs_core.serve"), lines)[0])))
 
