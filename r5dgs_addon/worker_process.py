@@ -11,8 +11,10 @@ import json
 import logging
 import os
 import queue
+import signal
 import subprocess
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = preferences.ENVIRONMENT
 START_TIMEOUT_S = 120.0
 STDERR_LINES = 12
+REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
 COMPILING = "preparing the rasterizer (first use, about 10 s)"
 
 log = logging.getLogger(__name__)
@@ -64,8 +67,7 @@ class Worker:
             )
         except OSError as error:
             raise errors.BackendError(
-                f"worker: '{python}' cannot be started ({error.strerror or error}); set 'Worker Python' in the "
-                f"add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
+                f"worker: '{python}' cannot be started ({error.strerror or error}); {REMEDY}"
             ) from error
         self._readers = [
             threading.Thread(target=self._read_answers, name="r5dgs worker answers", daemon=True),
@@ -122,8 +124,9 @@ class Worker:
         line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
         try:
             assert self._process.stdin is not None
-            self._process.stdin.write(line.encode())
-            self._process.stdin.flush()
+            with _broken_pipes_are_errors():
+                self._process.stdin.write(line.encode())
+                self._process.stdin.flush()
         except (OSError, ValueError):
             raise self._death() from None
         while True:
@@ -158,7 +161,7 @@ class Worker:
             reader.join(timeout=2.0)
         for pipe in (process.stdin, process.stdout, process.stderr):
             if pipe is not None:
-                with contextlib.suppress(OSError):
+                with contextlib.suppress(OSError), _broken_pipes_are_errors():
                     pipe.close()
 
     def _death(self) -> errors.BackendError:
@@ -167,7 +170,7 @@ class Worker:
         return errors.BackendError(
             f"worker: {self.python} ended unexpectedly (exit code {self._process.returncode})"
             + (f": {said}" if said else "")
-            + "; the next request starts it again"
+            + ("; the next request starts it again" if self.hello else f" before it answered; {REMEDY}")
         )
 
     def _read_answers(self) -> None:
@@ -207,6 +210,25 @@ class Worker:
         with contextlib.suppress(OSError, ValueError):
             for line in stream:
                 self._stderr.append(line.decode(errors="replace").rstrip())
+
+
+@contextlib.contextmanager
+def _broken_pipes_are_errors() -> Iterator[None]:
+    """Let a write to a process that has ended raise BrokenPipeError in this thread.
+
+    Blender, unlike Python, leaves SIGPIPE to the system, which ends Blender.
+    """
+    if not hasattr(signal, "SIGPIPE"):  # Windows has no such signal
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGPIPE})
+    try:
+        yield
+    finally:
+        if signal.SIGPIPE not in before:
+            while signal.SIGPIPE in signal.sigpending():
+                signal.sigwait({signal.SIGPIPE})
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _error_of(header: dict[str, Any]) -> errors.R5dgsError:

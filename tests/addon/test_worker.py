@@ -55,6 +55,23 @@ def held(worker):
     job.join()
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="Windows has no such signal")
+def test_writing_to_a_worker_that_has_ended_is_an_error_and_no_signal_for_blender(worker):
+    """Blender leaves SIGPIPE to the system, which would end it; Python ignores it."""
+    process = importlib.import_module("r5dgs.r5dgs_addon.worker_process")
+    heard = []
+    before = signal.signal(signal.SIGPIPE, lambda *_: heard.append(True))
+    try:
+        running = process.Worker("true")
+        while running.alive:
+            time.sleep(0.005)
+        with pytest.raises(errors.BackendError, match=r"ended unexpectedly.*'Worker Python'"):
+            running.greet()
+        assert not heard and signal.SIGPIPE not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    finally:
+        signal.signal(signal.SIGPIPE, before)
+
+
 def test_the_latest_request_of_a_key_wins_and_other_keys_keep_their_turn(worker, held):
     running, first = held
     other = worker.submit("other", HELLO)
