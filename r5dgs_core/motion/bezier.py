@@ -11,19 +11,24 @@ _HALVINGS = 54  # of the parameter's range: down to rounding
 
 
 def within(segment: np.ndarray) -> np.ndarray:
-    """The segment as it is evaluated: handles that reach past each other are shortened together. [4, 2] -> [4, 2]"""
+    """The segment as Blender evaluates it: a handle that reaches past the other key is shortened. [4, 2] -> [4, 2]
+
+    Handles may overlap: the curve goes on in time all the same.
+    """
     segment = np.array(segment, np.float64)
     length = segment[3, 0] - segment[0, 0]
-    reach = abs(segment[1, 0] - segment[0, 0]) + abs(segment[3, 0] - segment[2, 0])
-    if reach > length:
-        share = length / reach
-        segment[1] = segment[0] + share * (segment[1] - segment[0])
-        segment[2] = segment[3] + share * (segment[2] - segment[3])
+    for key, handle in ((0, 1), (3, 2)):
+        reach = abs(segment[handle, 0] - segment[key, 0])
+        if reach > length:
+            segment[handle] = segment[key] + length / reach * (segment[handle] - segment[key])
     return segment
 
 
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Cut a segment at a time into two that are the same curve together (de Casteljau).
+
+    Where both handles reach over more than 0.8 of the segment, a part's handle may reach past its own key, and is
+    then shortened as `within` does.
 
     Args:
         segment: Key, handle, handle, key, the keys in order of time. [4, 2]

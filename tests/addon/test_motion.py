@@ -209,6 +209,28 @@ def test_a_curve_without_a_key_at_t_max_is_cut_there_and_keeps_its_shape(blender
         assert any(abs(point.co[0] - LAST) < 1e-3 for point in curve.keyframe_points)
 
 
+@pytest.mark.parametrize("reach", [0.5, 0.75])
+def test_a_curve_whose_handles_overlap_keeps_its_shape_when_it_is_cut(blender, loaded, mug, reach):
+    for curve in motions.curves(mug).values():
+        points = curve.keyframe_points
+        at = next(k for k, point in enumerate(points) if abs(point.co[0] - LAST) < 1e-3)
+        points.remove(points[at])
+        left, right = points[at - 1], points[at]
+        gap = right.co[0] - left.co[0]
+        for point in (left, right):
+            point.handle_left_type = point.handle_right_type = "FREE"
+            point.interpolation = "BEZIER"
+        left.handle_right = (left.co[0] + reach * gap, left.co[1] + 0.3)
+        right.handle_left = (right.co[0] - reach * gap, right.co[1] + 0.2)
+        curve.update()
+    frames = np.linspace(1, LAST, 80)
+    before = {name: [curve.evaluate(f) for f in frames] for name, curve in motions.curves(mug).items()}
+    mug.r5dgs_motion.velocity = (1.0, 2.0, 3.0)
+    blender.ops.r5dgs.re_extrapolate()
+    for name, curve in motions.curves(mug).items():
+        np.testing.assert_allclose([curve.evaluate(f) for f in frames], before[name], atol=5e-6)
+
+
 def test_what_cannot_be_cut_is_refused_and_nothing_changes(blender, mug):
     for curve in motions.curves(mug).values():
         at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
