@@ -42,7 +42,11 @@ class R5DGS_OT_show_confidence(bpy.types.Operator):
         leaders = [a for a in everyone if motion_physics.has_motion(a) and a.r5dgs_motion.leader is None]
         anchors = selected or leaders
         try:
-            tubes = [motion_confidence.show(anchor, motion_extrapolate.times_of(anchor)) for anchor in anchors]
+            found = [(anchor, motion_extrapolate.times_of(anchor)) for anchor in anchors]
+            for anchor, times in found:
+                if motion_confidence.moves(anchor, times):
+                    motion_confidence.path(anchor, times)  # what is refused is refused before there is any tube
+            tubes = [motion_confidence.show(anchor, times) for anchor, times in found]
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

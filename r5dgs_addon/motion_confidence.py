@@ -23,15 +23,20 @@ def helper_of(anchor: bpy.types.Object) -> bpy.types.Object | None:
     return anchor.r5dgs_motion.tube
 
 
+def moves(anchor: bpy.types.Object, times: timeline.Times) -> bool:
+    """Whether an anchor has a path past t_max."""
+    state = anchor.r5dgs_motion
+    mover = anchor if motion_physics.follow_matrix(state) is None else state.leader
+    return times.t_end > times.t_max and not motion_physics.model(mover).is_static
+
+
 def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | None:
     """Make or renew the tube of an anchor; removes it where nothing is extrapolated or nothing moves.
 
     Raises:
         ConfigError: The anchor's curves cannot be read.
     """
-    state = anchor.r5dgs_motion
-    mover = anchor if motion_physics.follow_matrix(state) is None else state.leader
-    if times.t_end <= times.t_max or motion_physics.model(mover).is_static:
+    if not moves(anchor, times):
         hide(anchor)
         return None
     centers, sigmas = path(anchor, times)
@@ -47,7 +52,7 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
             collection.objects.link(tube)
         tube.hide_render = tube.hide_select = True
         tube.show_in_front = True  # it begins inside the object
-        state.tube = tube
+        anchor.r5dgs_motion.tube = tube
     tube.parent = anchor.parent
     tube.matrix_parent_inverse = anchor.matrix_parent_inverse
     doubts = np.clip(sigmas / (LOST * reach), 0.0, 1.0)

@@ -73,6 +73,17 @@ def test_all_that_move_get_one_where_nothing_is_chosen_and_a_second_press_remove
     assert {kind: {d.name for d in getattr(blender.data, kind)} for kind in before} == before
 
 
+def test_where_one_path_cannot_be_read_no_tube_is_made(blender, loaded):
+    anchors = [obj for obj in loaded.all_objects if obj.r5dgs.role == "ANCHOR" and obj.r5dgs_motion.leader is None]
+    blender.ops.r5dgs.show_confidence(action="SHOW")
+    shown = [anchor for anchor in anchors if anchor.r5dgs_motion.tube is not None]
+    blender.ops.r5dgs.show_confidence(action="HIDE")
+    shown[-1].rotation_mode = "XYZ"
+    with pytest.raises(RuntimeError, match=f"{shown[-1].name}.*Quaternion"):
+        blender.ops.r5dgs.show_confidence(action="SHOW")
+    assert len(shown) > 1 and not any(anchor.r5dgs_motion.tube for anchor in anchors)
+
+
 def test_a_shadow_gets_one_where_it_is_chosen(blender, loaded):
     shadow = blender.data.objects["mug shadow anchor"]
     motions.choose(blender, shadow)
