@@ -29,7 +29,8 @@ class R5DGS_OT_preview(waiting.Waiting, bpy.types.Operator):
 
     def _finish(self, context, answer):
         image, _ = picture.finish(answer)
-        self.report({"INFO"}, "; ".join([f"{image.name}: {figures.speed()}", *figures.errors()]))
+        place = [] if picture.show(context, image) else [f"open an Image Editor and choose '{image.name}' to see it"]
+        self.report({"INFO"}, "; ".join([f"{image.name}: {figures.speed()}", *figures.errors(), *place]))
         return {"FINISHED"}
 
 

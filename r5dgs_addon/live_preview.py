@@ -55,7 +55,7 @@ def look() -> float:
             return LOOK_S
         job, _job = _job, None
         try:
-            picture.finish(job.answer())
+            picture.show(bpy.context, picture.finish(job.answer())[0])
             _message = ""
         except errors.R5dgsError as error:
             _message = str(error)

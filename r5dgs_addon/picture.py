@@ -131,6 +131,18 @@ def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.ty
     return image, result
 
 
+def show(context: bpy.types.Context, image: bpy.types.Image) -> bool:
+    """Put an image into Image Editors that hold none; whether one shows it, or there is no window to look at."""
+    if bpy.app.background:
+        return True
+    areas = [area for window in context.window_manager.windows for area in window.screen.areas]
+    spaces = [area.spaces.active for area in areas if area.type == "IMAGE_EDITOR"]
+    for space in spaces:
+        if space.image is None:
+            space.image = image
+    return any(space.image == image for space in spaces)
+
+
 def write_image(name: str, color: np.ndarray) -> bpy.types.Image:
     """Put a display-referred picture into a Blender image of 8 bits per channel, made where it does not exist.
 

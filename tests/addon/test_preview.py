@@ -273,6 +273,26 @@ def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, load
     np.testing.assert_array_equal(pixels_of(blender.data.images["R5DGS Preview"]), expected)
 
 
+def test_the_picture_goes_to_image_editors_that_hold_none_and_one_is_asked_for_where_none_shows_it(
+    blender, windowed, monkeypatch
+):
+    editors = [types.SimpleNamespace(image=image) for image in ("another", None)]
+    areas = [
+        types.SimpleNamespace(type="IMAGE_EDITOR", spaces=types.SimpleNamespace(active=one), tag_redraw=lambda: None)
+        for one in editors
+    ]
+    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    monkeypatch.setattr(picture.bpy, "app", types.SimpleNamespace(background=False))
+    for there, asked in ((areas, False), (areas[:1], True), ([], True)):
+        window = windowed()
+        window.screen = types.SimpleNamespace(areas=there)
+        window.windows.append(window)
+        window.operator._job.join()
+        assert window.send("TIMER") == {"FINISHED"}
+        assert ("open an Image Editor" in window.reports[-1][1]) == asked
+    assert editors[0].image == "another" and editors[1].image == blender.data.images["R5DGS Preview"]
+
+
 def test_escape_stops_a_preview_and_the_next_one_works(blender, loaded, worker, windowed):
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
