@@ -28,8 +28,11 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
         anchors = motion_objects.chosen(context)
         try:
             if self.observed:
-                for collection, members in motion_objects.by_scene(anchors).items():
-                    motion_extrapolate.reload(members, picture.scene_path(collection))
+                motion_extrapolate.check(anchors)  # all of it is there and can be written before any of it is
+                members = motion_objects.by_scene(anchors)
+                paths = {collection: picture.scene_path(collection) for collection in members}
+                for collection, path in paths.items():
+                    motion_extrapolate.reload(members[collection], path)
             motion_extrapolate.reset(anchors)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))

@@ -187,12 +187,17 @@ def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
     Raises:
         ConfigError: One of them cannot be; nothing was changed.
     """
-    for anchor in [*anchors, *followers(anchors)]:
-        times_of(anchor)
-        motion_curves.place(anchor)
+    check(anchors)
     for anchor in anchors:
         motion_physics.reset(anchor)
     return re_extrapolate(anchors)
+
+
+def check(anchors: list[bpy.types.Object]) -> None:
+    """Refuse, with a ConfigError, anchors that cannot be written, or that something follows which cannot."""
+    for anchor in [*anchors, *followers(anchors)]:
+        times_of(anchor)
+        motion_curves.place(anchor)
 
 
 def reload(anchors: list[bpy.types.Object], path: Path) -> None:

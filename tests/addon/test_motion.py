@@ -346,6 +346,16 @@ def test_reset_brings_the_learned_motion_back(blender, scene_path, loaded, mug):
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
 
+def test_reset_changes_nothing_where_what_follows_refuses(blender, loaded, mug):
+    curve = next(iter(motions.curves(mug).values()))
+    curve.keyframe_points[0].co.y += 1
+    before = motions.keys(mug)
+    blender.data.objects["mug shadow anchor"].rotation_mode = "XYZ"
+    with pytest.raises(RuntimeError, match="mug shadow anchor.*Quaternion"):
+        blender.ops.r5dgs.reset_motion(observed=True)
+    assert motions.keys(mug) == before
+
+
 def test_reset_reads_observed_keys_from_the_file_when_asked_to(blender, scene_path, loaded, mug):
     mug.scale = (2.0, 2.0, 2.0)
     mug.keyframe_insert("scale", frame=20)
