@@ -43,6 +43,7 @@ class R5DGS_OT_replace_motion(bpy.types.Operator):
                     "CURRENT": context.scene.frame_current_final,
                 }[self.stays]
                 plans.append(motion_objects.replacement(target, source, frame, times))
+            motion_extrapolate.check(targets)
             for plan in plans:
                 motion_objects.replace(plan)
             motion_extrapolate.re_extrapolate(motion_extrapolate.followers(targets))

@@ -94,6 +94,15 @@ def test_a_shadow_goes_with_the_new_motion_of_its_caster(blender, loaded):
         blender.ops.r5dgs.replace_motion()
 
 
+def test_nothing_moves_otherwise_where_the_shadow_cannot_go_along(blender, loaded):
+    shadow, mug, car = blender.data.objects["mug shadow anchor"], anchor(blender, "mug"), anchor(blender, "toy car")
+    shadow.rotation_mode, before = "XYZ", motions.keys(mug)
+    motions.choose(blender, mug, car)
+    with pytest.raises(RuntimeError, match="mug shadow anchor.*Quaternion"):
+        blender.ops.r5dgs.replace_motion()
+    assert motions.keys(mug) == before and not mug.r5dgs_motion.taken
+
+
 def test_rotation_curves_with_keys_at_different_frames_are_refused_and_nothing_changes(blender, loaded):
     mug, car = anchor(blender, "mug"), anchor(blender, "toy car")
     curve = motions.curves(mug)["rotation_quaternion", 2]
@@ -180,6 +189,9 @@ def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others
     assert any(obj.parent is not None and obj.parent not in selected for obj in selected if obj.r5dgs.role == "CLOUD")
     meant = motions.addon("motion_objects").chosen(blender.context)
     assert meant and {obj.r5dgs.object_id for obj in meant} == {anchor(blender, name).r5dgs.object_id}
+    blender.ops.r5dgs.delete_object()
+    blender.ops.r5dgs.select_by_prompt(text=name)  # what is left of it moves with others
+    assert blender.context.selected_objects and not motions.addon("motion_objects").chosen(blender.context)
 
 
 def test_shadows_stay_when_asked_to(blender, loaded):
