@@ -29,27 +29,17 @@ def anchor_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
 def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
     """Anchors of the selected objects, each once, in the order of the scene; the active one's where none is selected.
 
-    A cloud that moves with another object than its own means its own, where an anchor of that is selected, too: a
-    prompt selects both, and who deletes 'background' keeps the mug that some of it moves with. Anchors that remember
-    no motion are left out.
+    A cloud that moves with another object than its own does not stand for that one: a prompt selects such clouds, and
+    who deletes 'background' keeps the mug that some of it moves with. Anchors that remember no motion are left out.
     """
     selected = context.selected_objects or [context.view_layer.objects.active]
-    anchors = [obj for obj in selected if obj is not None and obj.r5dgs.role == "ANCHOR"]
-    found = {}
-    for obj in selected:
-        anchor = anchor_of(obj)
-        if anchor is not None and not any(_moves_with_another(obj, anchor, own) for own in anchors):
-            found[anchor] = None
+    found = {anchor: None for obj in selected if (anchor := anchor_of(obj)) is not None and not _strays(obj, anchor)}
     return [anchor for anchor in found if motion_physics.has_motion(anchor)]
 
 
-def _moves_with_another(cloud: bpy.types.Object, anchor: bpy.types.Object, own: bpy.types.Object) -> bool:
-    """Whether a cloud hangs from the anchor of another object, and ``own`` is one of its own object's."""
-    return (
-        cloud.r5dgs.role == "CLOUD"
-        and cloud.r5dgs.object_id == own.r5dgs.object_id != anchor.r5dgs.object_id
-        and motion_extrapolate.scene_of(own) == motion_extrapolate.scene_of(anchor)
-    )
+def _strays(obj: bpy.types.Object, anchor: bpy.types.Object) -> bool:
+    """Whether an object is a cloud that hangs from the anchor of another object than its own."""
+    return obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id != anchor.r5dgs.object_id
 
 
 def active_anchor(context: bpy.types.Context) -> bpy.types.Object | None:
