@@ -1,12 +1,12 @@
 """Add Alias: another word that finds the active object."""
 
 import bpy
-from bpy.props import IntProperty, StringProperty
+from bpy.props import StringProperty
 
-from ..r5dgs_addon import selection, table
+from ..r5dgs_addon import actions, table
 
 
-class R5DGS_OT_add_alias(bpy.types.Operator):
+class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
     """Add another word that finds the active object"""
 
     bl_idname = "r5dgs.add_alias"
@@ -14,17 +14,6 @@ class R5DGS_OT_add_alias(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     word: StringProperty(name="Word", description="The other word, such as 'cup'", options={"SKIP_SAVE"})
-    scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
-    object_id: IntProperty(
-        name="Object Id", description="Another object than the active one", default=table.NOBODY, options={"SKIP_SAVE"}
-    )
-
-    @classmethod
-    def poll(cls, context):
-        if not selection.scenes(context):
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
@@ -33,7 +22,7 @@ class R5DGS_OT_add_alias(bpy.types.Operator):
         self.layout.prop(self, "word")
 
     def execute(self, context):
-        found = selection.find(context, self.scene, self.object_id)
+        found = self.found(context)
         entry = None if found is None else table.entry_of(*found)
         if entry is None or not table.is_kept(found[0]):
             self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")

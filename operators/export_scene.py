@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..r5dgs_addon import export_running, export_scene, objects, picture
+from ..r5dgs_addon import actions, export_running, export_scene, objects, picture
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_scene(export_running.Exporter, bpy.types.Operator):
+class R5DGS_OT_export_scene(actions.NeedsScene, export_running.Exporter, bpy.types.Operator):
     """Write the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
 
     bl_idname = "r5dgs.export_scene"
@@ -24,13 +24,6 @@ class R5DGS_OT_export_scene(export_running.Exporter, bpy.types.Operator):
         description="Store all numbers as they are, in a file about twice as large",
         default=False,
     )
-
-    @classmethod
-    def poll(cls, context):
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
 
     def suggest(self, context):
         if not self.filepath:

@@ -3,11 +3,11 @@
 import bpy
 from bpy.props import BoolProperty, FloatProperty
 
-from ..r5dgs_addon import motion_extrapolate, objects
+from ..r5dgs_addon import actions, motion_extrapolate, objects
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_extrapolate_until(bpy.types.Operator):
+class R5DGS_OT_extrapolate_until(actions.NeedsScene, bpy.types.Operator):
     """Extend or shorten the future of the whole scene; edited physics are obeyed, keys edited by hand stay"""
 
     bl_idname = "r5dgs.extrapolate_until"
@@ -18,13 +18,6 @@ class R5DGS_OT_extrapolate_until(bpy.types.Operator):
     fit_timeline: BoolProperty(
         name="Fit Timeline", description="Set the last frame of the timeline to the last keys", default=True
     )
-
-    @classmethod
-    def poll(cls, context):
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
 
     def invoke(self, context, event):
         self.t_end = objects.active_collection(context).r5dgs.t_end

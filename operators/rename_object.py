@@ -1,13 +1,13 @@
 """Rename Object: in the table, and its collection, anchor and clouds with it."""
 
 import bpy
-from bpy.props import IntProperty, StringProperty
+from bpy.props import StringProperty
 
-from ..r5dgs_addon import selection, table
+from ..r5dgs_addon import actions, table
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_rename_object(bpy.types.Operator):
+class R5DGS_OT_rename_object(actions.OfObject, bpy.types.Operator):
     """Rename the active object of a loaded scene: its collection, anchor and clouds, and what finds it"""
 
     bl_idname = "r5dgs.rename_object"
@@ -15,20 +15,9 @@ class R5DGS_OT_rename_object(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     new_name: StringProperty(name="Name", description="The new name", options={"SKIP_SAVE"})
-    scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
-    object_id: IntProperty(
-        name="Object Id", description="Object to rename instead", default=table.NOBODY, options={"SKIP_SAVE"}
-    )
-
-    @classmethod
-    def poll(cls, context):
-        if not selection.scenes(context):
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
 
     def invoke(self, context, event):
-        found = selection.find(context, self.scene, self.object_id)
+        found = self.found(context)
         if found is not None and not self.new_name:
             self.new_name = table.names(found[0]).get(found[1], "")
         return context.window_manager.invoke_props_dialog(self)
@@ -37,7 +26,7 @@ class R5DGS_OT_rename_object(bpy.types.Operator):
         self.layout.prop(self, "new_name")
 
     def execute(self, context):
-        found = selection.find(context, self.scene, self.object_id)
+        found = self.found(context)
         if found is None or table.entry_of(*found) is None:
             self.report({"WARNING"}, "Select an object of a loaded scene first")
             return {"CANCELLED"}

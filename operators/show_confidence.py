@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import motion_confidence, motion_extrapolate, motion_objects, motion_physics, objects
+from ..r5dgs_addon import actions, motion_confidence, motion_extrapolate, motion_objects, motion_physics, objects
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -13,7 +13,7 @@ ACTIONS = (
 )
 
 
-class R5DGS_OT_show_confidence(bpy.types.Operator):
+class R5DGS_OT_show_confidence(actions.NeedsScene, bpy.types.Operator):
     """Show the paths of the selected objects, or of all, as tubes as thick as one standard deviation"""
 
     bl_idname = "r5dgs.show_confidence"
@@ -22,13 +22,6 @@ class R5DGS_OT_show_confidence(bpy.types.Operator):
 
     action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
 
-    @classmethod
-    def poll(cls, context):
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
-
     def execute(self, context):
         collection = objects.active_collection(context)
         everyone = objects.members(collection, "ANCHOR")
@@ -36,7 +29,7 @@ class R5DGS_OT_show_confidence(bpy.types.Operator):
         shown = [anchor for anchor in selected or everyone if motion_confidence.helper_of(anchor) is not None]
         if self.action == "HIDE" or (self.action == "TOGGLE" and shown):
             count = sum(motion_confidence.hide(anchor) for anchor in shown)
-            self.report({"INFO"}, f"Removed {count} tubes")
+            self.report({"INFO"}, f"Removed {count} tube{'' if count == 1 else 's'}")
             return {"FINISHED"}
         # Shadows go where their casters go: a tube of their own is shown to who asks for it.
         leaders = [a for a in everyone if motion_physics.has_motion(a) and a.r5dgs_motion.leader is None]
@@ -55,7 +48,7 @@ class R5DGS_OT_show_confidence(bpy.types.Operator):
             self.report({"WARNING"}, "Nothing moves after the last observed time")
             return {"CANCELLED"}
         context.view_layer.update()
-        self.report({"INFO"}, f"{count} tubes, as thick as one standard deviation")
+        self.report({"INFO"}, f"{count} tube{'' if count == 1 else 's'}, as thick as one standard deviation")
         return {"FINISHED"}
 
 

@@ -1,0 +1,29 @@
+"""What several operators have in common."""
+
+from bpy.props import IntProperty, StringProperty
+
+from . import objects, selection, table
+
+
+class NeedsScene:
+    """An operator that needs a loaded scene in the open Blender scene."""
+
+    @classmethod
+    def poll(cls, context):
+        if objects.active_collection(context) is None:
+            cls.poll_message_set("Load an R5DGS scene first")
+            return False
+        return True
+
+
+class OfObject(NeedsScene):
+    """An operator on one object of the table: the active one, unless another is named."""
+
+    scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
+    object_id: IntProperty(
+        name="Object Id", description="Another object than the active one", default=table.NOBODY, options={"SKIP_SAVE"}
+    )
+
+    def found(self, context):
+        """The collection of its scene and its id, or None."""
+        return selection.find(context, self.scene, self.object_id)
