@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..motion import columns, rotations
-from ..scene import carried, playback
+from ..scene import carried, playback, posing
 from ..scene.residuals import Residuals
 from ..scene.scene import Scene
 
@@ -203,7 +203,7 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
             carried.map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
             quats[at], log_scales[at] = shapes
             turns = rotations.quats_to_rotmats(bent.turns)
-            shading[at] = _relit(given, rows, rotation @ turns, light)
+            shading[at] = _shading(given, rows, rotation @ turns, light)
             if given.harmonics_turn[instance.scene] and given.sh.shape[1] > 1:
                 pose_ids[at] = poses + 1 + np.arange(len(at))
                 maps = np.concatenate([maps, np.swapaxes(turns, -1, -2) @ maps])
@@ -327,17 +327,8 @@ def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
     return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
 
 
-def _shading(given: Gathered, rows: slice | np.ndarray, rotation: np.ndarray, light: np.ndarray | None) -> np.ndarray:
-    """Shading factor of a range that has turned by a rotation under a light. [n] float32"""
+def _shading(given: Gathered, rows: slice | np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
+    """Shading factors of rows that have turned under a light, all alike or each. [3, 3] or [n, 3, 3] -> [n] float32"""
     if given.shading is None or given.shading_rest is None or light is None:
         return np.ones(len(given.means[rows]), np.float32)
-    change = (rotation.T @ light - light).astype(np.float32)
-    return np.maximum(given.shading_rest[rows] + given.shading[rows] @ change, 0)
-
-
-def _relit(given: Gathered, rows: np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
-    """As `_shading` for rows that have turned each by a rotation of its own. [R], [R, 3, 3] -> [R] float32"""
-    if given.shading is None or given.shading_rest is None or light is None:
-        return np.ones(len(rows), np.float32)
-    changes = np.swapaxes(turns, -1, -2) @ light - light
-    return np.maximum(given.shading_rest[rows] + (given.shading[rows] * changes).sum(-1), 0)
+    return posing.lit(given.shading_rest[rows], given.shading[rows], light, turns)

@@ -148,10 +148,10 @@ def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarr
     if factor is None or scene.shading is None or scene.light_direction is None:
         return
     light = np.asarray(scene.light_direction, np.float64)
-    whole = rotations.multiply(rotations.rotmats_to_quats(turn), bend.turns)
-    change = rotations.rotate(rotations.conjugate(whole), light) - light
-    lit = posing.rest_factors(scene)[bend.rows] + (scene.shading[bend.rows] * change).sum(-1)
-    factor[bend.rows - start, 0] = np.maximum(lit, 0)
+    turns = turn @ rotations.quats_to_rotmats(bend.turns)
+    factor[bend.rows - start, 0] = posing.lit(
+        posing.rest_factors(scene)[bend.rows], scene.shading[bend.rows], light, turns
+    )
 
 
 def join(parts: Sequence[Splats]) -> Splats:
@@ -229,5 +229,4 @@ def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarr
     if scene.shading is None or scene.light_direction is None:
         return None
     light = np.asarray(scene.light_direction, np.float64)
-    change = (rotation.T @ light - light).astype(np.float32)
-    return np.maximum(posing.rest_factors(scene)[rows] + scene.shading[rows] @ change, 0)[:, None]
+    return posing.lit(posing.rest_factors(scene)[rows], scene.shading[rows], light, rotation)[:, None]

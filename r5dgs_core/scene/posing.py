@@ -139,6 +139,22 @@ def rest_factors(scene: Scene) -> np.ndarray:
     return np.ones(len(scene.means), np.float32) if rest is None else rest
 
 
+def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Factors on the colours of Gaussians that have turned since the bind state.
+
+    Args:
+        rest: Their factors there, before they are bounded at 0. [n]
+        shading: How they change with the light's direction. [n, 3]
+        light: Direction of the light. [3]
+        turns: One rotation for all, or one for each. [3, 3] or [n, 3, 3]
+
+    Returns:
+        The factors, >= 0. [n]
+    """
+    change = (np.swapaxes(turns, -1, -2) @ light - light).astype(np.float32)
+    return np.maximum(rest + (shading @ change if change.ndim == 1 else (shading * change).sum(-1)), 0)
+
+
 def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:
     """Write ``linear p + shift`` for each point p to ``result``, computed in float64.
 
