@@ -28,7 +28,6 @@ first time it compiles, 10 s)"""
         self._began = time.monotonic()
         worker.stop()
         preferences.forget()
-        self._python = preferences.worker_python()
         return worker.submit(KEY, [("testing", "check", {})])
 
     def _finish(self, context, answer):
@@ -39,8 +38,8 @@ first time it compiles, 10 s)"""
         width, height = found["size"]
         self.report(
             {"INFO"},
-            f"Worker ready: {self._python} ({versions}), {found['device']}{compiled}; {found['gaussians']:,} Gaussians "
-            f"at {width} x {height} in {found['milliseconds']:.0f} ms",
+            f"Worker ready: {self._job.python} ({versions}), {found['device']}{compiled}; "
+            f"{found['gaussians']:,} Gaussians at {width} x {height} in {found['milliseconds']:.0f} ms",
         )
         return {"FINISHED"}
 

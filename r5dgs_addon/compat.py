@@ -163,7 +163,7 @@ def do_not_call_at_exit(unregister) -> None:
 def _forget_properties() -> None:
     """Take the properties off our classes: the bpy module crashes where one with a callback outlives it (4.2)."""
     package = __package__.rpartition(".")[0]
-    for base in (bpy.types.PropertyGroup, bpy.types.Operator):
+    for base in (bpy.types.PropertyGroup, bpy.types.Operator, bpy.types.AddonPreferences):
         for cls in base.__subclasses__():
             if cls.__module__.startswith(package + "."):
                 cls.__annotations__ = {}

@@ -112,7 +112,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def _stopped(self, doing: str) -> bool:
         """Say what is waited for, wait a moment, and see whether the user wants to stop."""
-        self._say(doing.capitalize())
+        self._say(f"{doing[:1].upper()}{doing[1:]}")
         time.sleep(LOOK_S)
         return self.test_break()
 

@@ -1,8 +1,14 @@
-"""The add-on's preferences: which Python runs the worker."""
+"""The add-on's preferences: which Python runs the worker.
+
+Preferences are read and written in Blender's main thread alone; other threads get a `Choice` that was made there. The
+search for a Python touches none of Blender's data, so it runs where there is time for it.
+"""
 
 import os
 import sys
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -15,6 +21,11 @@ ENVIRONMENT = "R5DGS_PYTHON"
 ROOT = Path(__file__).resolve().parent.parent
 
 _found: str | None = None  # what the search found in this session, "" for nothing; None before it
+_chosen: "Choice | None" = None  # what the preferences said last
+
+
+def _remember(_: bpy.types.AddonPreferences, context: bpy.types.Context) -> None:
+    choice()
 
 
 class R5DGS_AP_preferences(bpy.types.AddonPreferences):
@@ -26,6 +37,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         name="Worker Python",
         description="Python with torch and numba that renders pictures; searched for in the usual places where empty",
         subtype="FILE_PATH",
+        update=_remember,
     )
     worker_timeout: IntProperty(
         name="Timeout",
@@ -34,6 +46,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         min=1,
         max=3600,
         subtype="TIME_ABSOLUTE",
+        update=_remember,
     )
     found_python: StringProperty(
         name="Found Python", description="What the search for a Python found last", options={"HIDDEN"}
@@ -57,44 +70,84 @@ def get() -> "R5DGS_AP_preferences | None":
     return addon.preferences if addon else None
 
 
-def worker_python() -> str:
-    """Python to start the worker with: the environment's, the preferences', or the first one found that will do.
+@dataclass(frozen=True)
+class Choice:
+    """Which Python the worker shall have, as far as the preferences say it. Any thread may ask it.
 
-    The search takes a moment; what it finds is remembered. Where nothing will do, Blender's own is named: the worker
-    says what it lacks.
+    Attributes:
+        chosen: The environment's, or the user's; "" for the first one found that will do.
+        kept: What an earlier search found; "" for nothing.
+        beside: Folders that are the extension's own, where the search begins.
+        timeout_s: Seconds to wait for an answer of the worker.
     """
-    chosen = os.environ.get(ENVIRONMENT, "").strip()
+
+    chosen: str
+    kept: str
+    beside: tuple[Path, ...]
+    timeout_s: float
+
+    def known(self) -> str | None:
+        """The Python, where no search is needed; else None."""
+        if self.chosen:
+            return self.chosen
+        found = (self.kept or None) if _found is None else _found
+        if found is None or (found and not Path(found).is_file()):
+            return None
+        return found or sys.executable
+
+    def python(self, stopped: Callable[[], bool] = lambda: False) -> str:
+        """The Python, searched for where need be, which may take a while; what is found is remembered.
+
+        Where nothing will do, Blender's own is named: the worker says what it lacks.
+
+        Args:
+            stopped: Whether to give the search up; nothing is remembered then.
+        """
+        global _found
+        known = self.known()
+        if known is not None:
+            return known
+        found = pythons.find(list(self.beside), stopped=stopped) or ""
+        if not stopped():
+            _found = found
+        return found or sys.executable
+
+
+def choice() -> Choice:
+    """What the preferences say at present; in another thread than Blender's main one, what they said last there."""
+    global _chosen
+    if not _may_touch_blender() and _chosen is not None:
+        return _chosen
+    keep_found()
     preferences = get()
+    chosen = os.environ.get(ENVIRONMENT, "").strip()
     if not chosen and preferences is not None:
         chosen = preferences.worker_python.strip()
-    if chosen:
-        return str(Path(bpy.path.abspath(chosen)).expanduser())
-    known = _found
-    if known is None and preferences is not None:
-        known = preferences.found_python or None
-    if known is None or (known and not Path(known).is_file()):
-        known = search()
-    return known or sys.executable
+    _chosen = Choice(
+        chosen=_absolute(chosen) if chosen else "",
+        kept=preferences.found_python if preferences is not None else "",
+        beside=tuple(_beside()),
+        timeout_s=float(preferences.worker_timeout) if preferences is not None else 120.0,
+    )
+    return _chosen
 
 
-def search() -> str:
-    """Look for a Python that can run the worker and remember it, in the preferences, too, where that is allowed.
+def worker_python() -> str:
+    """Python to start the worker with, see `Choice.python`; it waits for the search."""
+    found = choice().python()
+    keep_found()
+    return found
 
-    Returns:
-        Its path; "" where there is none.
-    """
-    global _found
-    _found = pythons.find(_beside()) or ""
-    if threading.current_thread() is not threading.main_thread():  # a render: it must not write Blender's data
-        return _found
-    preferences = get()
+
+def keep_found() -> None:
+    """Write what the search has found into the preferences, for later sessions; only the main thread does."""
+    preferences = get() if _found is not None and _may_touch_blender() else None
     if preferences is not None and preferences.found_python != _found:
         preferences.found_python = _found
-    return _found
 
 
 def forget() -> None:
-    """Have the next `worker_python` search again."""
+    """Have the next `Choice` search again."""
     global _found
     _found = None
     preferences = get()
@@ -102,10 +155,15 @@ def forget() -> None:
         preferences.found_python = ""
 
 
-def worker_timeout_s() -> float:
-    """Seconds to wait for an answer of the worker."""
-    preferences = get()
-    return float(preferences.worker_timeout) if preferences is not None else 120.0
+def _absolute(path: str) -> str:
+    """A path that may begin with ``//``, the folder of the .blend, or with ``~``."""
+    blend = getattr(bpy.data, "filepath", "")  # none while Blender starts and registers its extensions
+    return str(Path(bpy.path.abspath(path, start=os.path.dirname(blend))).expanduser())
+
+
+def _may_touch_blender() -> bool:
+    """Whether this is Blender's main thread; a render in a window and what waits for the worker run in others."""
+    return threading.current_thread() is threading.main_thread()
 
 
 def _beside() -> list[Path]:
@@ -118,8 +176,9 @@ def _beside() -> list[Path]:
 
 
 def register():
-    """Register the preferences' class."""
+    """Register the preferences' class, and read what they say for threads that may not."""
     bpy.utils.register_class(R5DGS_AP_preferences)
+    choice()
 
 
 def unregister():

@@ -5,12 +5,14 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 NEEDED = ("numpy", "torch", "numba")
 OLDEST = (3, 11)
 TIMEOUT_S = 20.0
+LOOK_S = 0.05  # between two looks at whether a search is to stop
 # Nothing is imported: finding a module's place takes milliseconds, importing torch takes seconds.
 CHECK = f"""
 import importlib.util, sys
@@ -52,35 +54,52 @@ def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
             yield str(path)
 
 
-def find(beside: list[Path], home: Path | None = None) -> str | None:
-    """The first of `candidates` that has what rendering needs, or None."""
+def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], bool] = lambda: False) -> str | None:
+    """The first of `candidates` that has what rendering needs, or None.
+
+    Args:
+        beside: As for `candidates`.
+        home: As for `candidates`.
+        stopped: Whether to give up; asked again and again.
+    """
     for python in candidates(beside, home):
-        reason = lacking(python)
+        reason = lacking(python, stopped)
         if reason is None:
             return python
         log.info("worker: %s is passed over: %s", python, reason)
+        if stopped():
+            break
     return None
 
 
-def lacking(python: str) -> str | None:
+def lacking(python: str, stopped: Callable[[], bool] = lambda: False) -> str | None:
     """Why a Python cannot run the worker, in a few words; None where it can."""
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             [python, "-c", CHECK],
             env=environment(),
             stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=TIMEOUT_S,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
     except OSError as error:
         return error.strerror or str(error)
-    except subprocess.TimeoutExpired:
-        return f"no answer within {TIMEOUT_S:g} s"
-    if done.returncode == 0:
+    end = time.monotonic() + TIMEOUT_S
+    with process:
+        while True:
+            try:
+                _, stderr = process.communicate(timeout=LOOK_S)
+                break
+            except subprocess.TimeoutExpired:
+                late = time.monotonic() > end
+                if late or stopped():
+                    process.kill()
+                    return f"no answer within {TIMEOUT_S:g} s" if late else "the search was stopped"
+    if process.returncode == 0:
         return None
-    said = done.stderr.decode(errors="replace").strip().splitlines()
-    return said[-1] if said else f"exit code {done.returncode}"
+    said = stderr.decode(errors="replace").strip().splitlines()
+    return said[-1] if said else f"exit code {process.returncode}"
 
 
 def _places(beside: list[Path], home: Path) -> Iterator[Path | None]:

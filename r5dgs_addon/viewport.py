@@ -153,7 +153,7 @@ def look() -> float | None:
         job, port, wish, smaller = _asked
         if not job.done:
             if job.seconds > 1.0:
-                port.say(f"{job.doing.capitalize()}, {job.seconds:.0f} s")
+                port.say(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
                 _redraw()
             return LOOK_S if job.seconds < 1.0 else 0.25
         _asked = None

@@ -19,30 +19,30 @@ from .worker_process import Worker
 
 Steps = list[tuple[str, str, dict[str, Any]]]
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
+SEARCHING = "looking for a Python with torch"
 
 
 class Job:
     """Requests that wait for their answers in a thread of their own, so that Blender's window stays free.
 
     Args:
-        python: Python of the worker that is started where none runs.
-        timeout_s: Seconds to wait for each answer.
+        choice: Which Python the worker has that is started where none runs; it is searched for in the thread, too.
         steps: What the sidebar says while it waits, the command, and its arguments; one after the other.
         key: What a later job takes the place of this one by; "" for nothing.
     """
 
-    def __init__(self, python: str, timeout_s: float, steps: Steps, key: str = ""):
+    def __init__(self, choice: preferences.Choice, steps: Steps, key: str = ""):
         self.key = key
+        self.python = ""  # the worker's, once it is known
         self.dropped = False  # whether it ended before it began
         self._step = "waiting for the worker"
         self._started = time.monotonic()
         self._answer: Answer | None = None
         self._error: BaseException | None = None
         self._begun = False
+        self._ending = threading.Event()
         self._guard = threading.Lock()
-        self._thread = threading.Thread(
-            target=self._run, args=(python, timeout_s, steps), name="r5dgs worker job", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, args=(choice, steps), name="r5dgs worker job", daemon=True)
         self._thread.start()
 
     @property
@@ -79,6 +79,7 @@ class Job:
     def answer(self) -> Answer:
         """Wait for the last step's result and arrays. Raises what a step raised, BackendError where it was dropped."""
         self.join()
+        preferences.keep_found()
         if self.dropped:
             raise errors.BackendError("worker: what was asked for was taken back before its turn")
         if self._error is not None:
@@ -87,23 +88,31 @@ class Job:
         return self._answer
 
     def _end(self) -> None:
-        """Stop the worker until the job has ended; it may be starting one just now."""
+        """Stop the worker until the job has ended; it may be starting one just now, or looking for its Python."""
+        self._ending.set()
         while not self.done:
             _kill()
             self._thread.join(0.05)
 
-    def _run(self, python: str, timeout_s: float, steps: Steps) -> None:
+    def _run(self, choice: preferences.Choice, steps: Steps) -> None:
         with _turn:
             with self._guard:
                 if self.dropped:
                     return
                 self._begun = True
             try:
+                if choice.known() is None:
+                    self._step = SEARCHING
+                self.python = choice.python(self._ending.is_set)
+                if self._ending.is_set():
+                    raise errors.BackendError(
+                        "worker: stopped while its Python was looked for; the next request looks again"
+                    )
                 self._step = "starting the worker"
-                running = _running(python)
+                running = _running(self.python)
                 running.greet()
                 for self._step, command, arguments in steps:
-                    self._answer = running.request(command, timeout_s, **arguments)
+                    self._answer = running.request(command, choice.timeout_s, **arguments)
             except BaseException as error:  # raised again where the answer is asked for
                 self._error = error
 
@@ -117,7 +126,8 @@ _jobs: list[Job] = []
 def submit(key: str, steps: Steps) -> Job:
     """Begin a `Job`; what waits under the same key and has not begun is dropped: the latest request wins.
 
-    Call it from Blender's main thread, and look at the job's ``done`` from a timer.
+    It returns at once: even the search for a Python is the job's. Call it from Blender's main thread, and look at the
+    job's ``done`` from a timer.
 
     Args:
         key: Who asks, "viewport" for example.
@@ -128,7 +138,7 @@ def submit(key: str, steps: Steps) -> Job:
     """
     for job in _waiting(key):
         job.drop()
-    job = Job(preferences.worker_python(), preferences.worker_timeout_s(), steps, key)
+    job = Job(preferences.choice(), steps, key)
     with _state:
         _jobs[:] = [other for other in _jobs if not other.done] + [job]
     return job

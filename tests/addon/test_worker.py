@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import types
+from pathlib import Path
 
 import pytest
 
@@ -198,7 +199,7 @@ def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences,
     looked = []
     places = [fake_python(elsewhere / "one"), fake_python(elsewhere / "two")]
     monkeypatch.setattr(
-        pythons, "find", lambda beside: looked.append(1) or next(p for p in places if os.path.exists(p))
+        pythons, "find", lambda *_, **__: looked.append(1) or next(p for p in places if os.path.exists(p))
     )
     assert preferences.worker_python() == preferences.worker_python() == places[0] and len(looked) == 1
     os.remove(places[0])
@@ -210,17 +211,77 @@ def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences,
 
 
 def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, pythons, monkeypatch):
-    monkeypatch.setattr(pythons, "find", lambda beside: None)
+    monkeypatch.setattr(pythons, "find", lambda *_, **__: None)
     assert preferences.worker_python() == sys.executable
 
 
-def test_a_search_in_a_render_leaves_the_preferences_alone(preferences, pythons, monkeypatch):
-    kept = types.SimpleNamespace(worker_python="", found_python="")
+def elsewhere_called(function):
+    """What a function returns in another thread than Blender's main one."""
+    results = []
+    thread = threading.Thread(target=lambda: results.append(function()))
+    thread.start()
+    thread.join()
+    return results[0]
+
+
+def test_another_thread_leaves_the_preferences_alone_and_knows_what_they_said_last(preferences, pythons, monkeypatch):
+    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=7)
+    asked = []
+    monkeypatch.setattr(preferences, "get", lambda: asked.append(threading.current_thread()) or kept)
+    monkeypatch.setattr(pythons, "find", lambda *_, **__: sys.executable)
+    assert preferences.choice().timeout_s == 7
+    kept.worker_timeout = 8
+    assert elsewhere_called(preferences.choice).timeout_s == 7
+    assert elsewhere_called(preferences.worker_python) == sys.executable and kept.found_python == ""
+    assert set(asked) == {threading.main_thread()}
+    assert preferences.choice().timeout_s == 8 and kept.found_python == sys.executable
+
+
+@pytest.fixture
+def only_python(preferences, elsewhere, monkeypatch):
+    """Makes an executable script the one Python that a search can find; there is no other on this machine."""
+    monkeypatch.setattr(preferences, "_beside", lambda: [])
+    monkeypatch.setattr(Path, "home", lambda: elsewhere / "home")
+
+    def make(lines):
+        path = elsewhere / "path" / "python3"
+        path.parent.mkdir()
+        path.write_text("#!/bin/sh\n" + lines)
+        path.chmod(0o755)
+        return path
+
+    return make
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the script is one of a POSIX shell")
+def test_who_asks_does_not_wait_for_the_search_and_can_give_it_up(worker, only_python, tmp_path):
+    told = tmp_path / "pid"
+    only_python(f"echo $$ > {told}.new; /bin/mv {told}.new {told}; exec /bin/sleep 600\n")
+    job = worker.submit("view", HELLO)
+    while not told.exists():
+        time.sleep(0.005)
+    assert not job.done and job.doing == worker.SEARCHING == "looking for a Python with torch"
+    job.cancel()
+    assert job.done and not worker.busy()
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(told.read_text()), 0)
+    with pytest.raises(errors.BackendError, match="stopped"):
+        job.answer()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the script is one of a POSIX shell")
+def test_what_a_search_beside_the_window_finds_runs_the_worker_and_is_kept(
+    worker, preferences, only_python, tmp_path, monkeypatch
+):
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=120)
     monkeypatch.setattr(preferences, "get", lambda: kept)
-    monkeypatch.setattr(pythons, "find", lambda beside: sys.executable)
-    found = []
-    render = threading.Thread(target=lambda: found.append(preferences.worker_python()))
-    render.start()
-    render.join()
-    assert found == [sys.executable] and kept.found_python == ""
-    assert preferences.search() == kept.found_python == sys.executable
+    found = only_python(f'[ "$1" = -c ] && read line < {gate}\nexec {PYTHON} "$@"\n')
+    job = worker.submit("view", HELLO)
+    with open(gate, "w"):  # from here on the search waits for the end of this block
+        assert not job.done and job.doing == worker.SEARCHING and job.python == ""
+    assert job.answer()[0]["pid"] and job.python == str(found) == kept.found_python
+    again = worker.submit("view", HELLO)  # which would wait for ever at the gate, searched it anew
+    assert again.answer()[0]["pid"] and again.python == str(found)
+    worker.stop()
