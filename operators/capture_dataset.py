@@ -1,13 +1,12 @@
 """Render the scene into a training data set: images, exact masks, cameras, times and poses."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import capture, capture_objects, capture_views
+from ..r5dgs_addon import capture, capture_objects, capture_views, running
 from ..r5dgs_core import errors
 
 
@@ -15,14 +14,18 @@ def _items(identifiers, descriptions):
     return [(name, name.replace("_", " ").title(), text) for name, text in zip(identifiers, descriptions, strict=True)]
 
 
-class R5DGS_OT_capture_dataset(bpy.types.Operator):
+class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
     """Render this scene from many cameras into a data set that R5DGS trains on"""
 
     bl_idname = "r5dgs.capture_dataset"
     bl_label = "Capture R5DGS Data Set"
     bl_options = {"REGISTER"}
+    work = "Capture"
+    stopped = "nothing was written"
 
-    directory: StringProperty(name="Folder", description="New or empty folder of the data set", subtype="DIR_PATH")
+    directory: StringProperty(
+        name="Folder", description="New or empty folder of the data set", subtype="DIR_PATH", options={"SKIP_SAVE"}
+    )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     resolution_x: IntProperty(name="Width", description="Image width in pixels", default=256, min=1)
     resolution_y: IntProperty(name="Height", description="Image height in pixels", default=256, min=1)
@@ -100,83 +103,16 @@ class R5DGS_OT_capture_dataset(bpy.types.Operator):
                 values[name] = None
         return capture.CaptureSettings(**values)
 
-    def invoke(self, context, event):
-        self._interactive = True
-        if self.directory:
-            return self.execute(context)
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+    def suggest(self, context):
+        return bool(self.directory)
 
-    def execute(self, context):
+    def steps(self, context):
         if not self.directory:
-            self.report({"ERROR"}, "capture.directory: expected a folder for the data set, got nothing")
-            return {"CANCELLED"}
-        self._running = capture.steps(context, self.settings())
-        if bpy.app.background or not getattr(self, "_interactive", False):
-            while True:
-                finished = self._step(context)
-                if finished is not None:
-                    return finished
-        manager = context.window_manager
-        manager.progress_begin(0, 1)
-        manager.modal_handler_add(self)
-        self._timer = manager.event_timer_add(0.05, window=context.window)
-        return {"RUNNING_MODAL"}
-
-    def cancel(self, context):
-        """Blender ends the operator: the file browser is closed, or a window or the file while images render."""
-        if getattr(self, "_timer", None) is not None:
-            self._running.close()
-            self._end(context, {"CANCELLED"})
-
-    def modal(self, context, event):
-        if event.type == "ESC":
-            self.cancel(context)
-            self.report({"INFO"}, "Capture stopped; nothing was written")
-            return {"CANCELLED"}
-        if event.type != "TIMER":
-            return {"RUNNING_MODAL"}
-        failed = True
-        try:
-            finished = self._step(context)
-            failed = False
-        finally:  # the timer and the progress bar go, and the error is shown
-            if failed:
-                self._end(context, {"CANCELLED"})
-        return {"RUNNING_MODAL"} if finished is None else self._end(context, finished)
-
-    def _step(self, context):
-        """Render one image; the operator's result when that was the last, else None."""
-        try:
-            state = next(self._running)
-        except StopIteration as end:
-            return self._finish(end.value)
-        except errors.R5dgsError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        if bpy.app.background:
-            print(json.dumps({"event": "capture", **dataclasses.asdict(state)}), flush=True)
-        else:
-            context.window_manager.progress_update(state.done / state.total)
-            context.workspace.status_text_set(
-                f"Capture: image {state.done} of {state.total}, {state.seconds_left:.0f} s left; Esc stops"
-            )
-        return None
-
-    def _finish(self, result):
+            raise errors.ConfigError("capture.directory: expected a folder for the data set, got nothing; choose one")
+        result = yield from capture.steps(context, self.settings())
         counts = ", ".join(f"{number} {split}" for split, number in result.images.items())
-        self.report({"INFO"}, f"{result.directory}: {counts} images of {len(result.objects)} objects")
-        if result.unseen:
-            self.report({"WARNING"}, f"No image shows: {', '.join(result.unseen)}")
-        return {"FINISHED"}
-
-    def _end(self, context, result):
-        context.window_manager.event_timer_remove(self._timer)
-        self._timer = None
-        context.window_manager.progress_end()
-        if context.workspace is not None:
-            context.workspace.status_text_set(None)
-        return result
+        unseen = [f"No image shows: {', '.join(result.unseen)}"] if result.unseen else []
+        return running.Outcome(f"{result.directory}: {counts} images of {len(result.objects)} objects", unseen)
 
 
 CLASSES = (R5DGS_OT_capture_dataset,)

@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_cameras, export_gaussians, export_running
+from ..r5dgs_addon import export_cameras, export_frames, export_gaussians, running
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_cameras(export_running.Exporter, bpy.types.Operator):
+class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
     """Write cameras with lens, pose and time for radiance-field tools"""
 
     bl_idname = "r5dgs.export_cameras"
@@ -22,7 +22,7 @@ class R5DGS_OT_export_cameras(export_running.Exporter, bpy.types.Operator):
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     which: EnumProperty(name="Cameras", description="What is exported", items=export_cameras.WHICH)
     format: EnumProperty(name="Format", description="What is written", items=export_cameras.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES, default="RANGE")
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES, default="RANGE")
     frame_step: IntProperty(name="Frame Step", description="Frames from one view to the next", default=1, min=1)
     axes: EnumProperty(name="Axes", description="World that the cameras are in", items=export_gaussians.AXES)
 
@@ -47,7 +47,7 @@ class R5DGS_OT_export_cameras(export_running.Exporter, bpy.types.Operator):
         )
 
     def draw(self, context):
-        export_running.draw_properties(self, "which", "format", "frames", "frame_step", "axes")
+        export_frames.draw_properties(self, "which", "format", "frames", "frame_step", "axes")
 
 
 CLASSES = (R5DGS_OT_export_cameras,)

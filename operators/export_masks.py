@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_masks, export_running, objects
+from ..r5dgs_addon import export_frames, export_masks, objects, running
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_masks(export_running.Exporter, bpy.types.Operator):
+class R5DGS_OT_export_masks(running.Running, bpy.types.Operator):
     """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
 
     bl_idname = "r5dgs.export_masks"
@@ -21,7 +21,7 @@ class R5DGS_OT_export_masks(export_running.Exporter, bpy.types.Operator):
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     format: EnumProperty(name="Format", description="What is written", items=export_masks.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES, default="RANGE")
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES, default="RANGE")
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
 
     @classmethod
@@ -43,7 +43,7 @@ class R5DGS_OT_export_masks(export_running.Exporter, bpy.types.Operator):
         )
 
     def draw(self, context):
-        export_running.draw_properties(self, "format", "frames", "frame_step")
+        export_frames.draw_properties(self, "format", "frames", "frame_step")
 
 
 CLASSES = (R5DGS_OT_export_masks,)

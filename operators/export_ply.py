@@ -5,10 +5,10 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_gaussians, export_running, objects
+from ..r5dgs_addon import export_frames, export_gaussians, objects, running
 
 
-class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
+class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
     """Write Gaussians where they are now, edits included, as PLY files that other splat tools read"""
 
     bl_idname = "r5dgs.export_ply"
@@ -19,7 +19,7 @@ class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     which: EnumProperty(name="Objects", description="What is exported", items=export_gaussians.WHICH, default="VISIBLE")
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_running.FRAMES)
+    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES)
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
     axes: EnumProperty(name="Axes", description="World that the positions are in", items=export_gaussians.AXES)
     plain: BoolProperty(
@@ -54,7 +54,7 @@ class R5DGS_OT_export_ply(export_running.Exporter, bpy.types.Operator):
         )
 
     def draw(self, context):
-        export_running.draw_properties(self, "which", "frames", "frame_step", "axes", "plain")
+        export_frames.draw_properties(self, "which", "frames", "frame_step", "axes", "plain")
 
 
 CLASSES = (R5DGS_OT_export_ply,)

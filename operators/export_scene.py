@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..r5dgs_addon import actions, export_running, export_scene, objects, picture
+from ..r5dgs_addon import actions, export_scene, objects, picture, running
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_scene(actions.NeedsScene, export_running.Exporter, bpy.types.Operator):
+class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Operator):
     """Write the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
 
     bl_idname = "r5dgs.export_scene"

@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import displays, keyframes, objects
+from ..r5dgs_addon import displays, keyframes, objects, running
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
@@ -99,8 +99,11 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             display=self.display,
         )
         try:
-            scene = scene_file.read(path)
-            collection = objects.build(context, scene, path, options)
+            with running.cursor(context) as progress:
+                progress(0.1)
+                scene = scene_file.read(path)
+                progress(0.4)
+                collection = objects.build(context, scene, path, options)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

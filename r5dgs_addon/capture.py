@@ -6,7 +6,6 @@ One render gives the colours and the object ids of a view. Afterwards, also afte
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from . import capture_files, capture_objects, capture_render, capture_views
 from .capture_overrides import Overrides
+from .running import Step
 
 SPLITS = ("train", "val", "test")
 MAX_OBJECTS = 32767  # the highest pass index that Blender has
@@ -93,23 +93,6 @@ class CaptureSettings:
     rig_fov_deg: float = 45.0
     objects: str = "AUTO"
     object_collection: str = ""
-
-
-@dataclass(frozen=True)
-class CaptureProgress:
-    """Where a capture stands after an image.
-
-    Attributes:
-        done: Images written.
-        total: Images in all.
-        image: The last one, such as "train/r_0000".
-        seconds_left: Estimate from the images so far.
-    """
-
-    done: int
-    total: int
-    image: str
-    seconds_left: float
 
 
 @dataclass(frozen=True)
@@ -208,7 +191,7 @@ def check_settings(settings: CaptureSettings) -> None:
 def capture(
     context: bpy.types.Context,
     settings: CaptureSettings,
-    progress: Callable[[CaptureProgress], None] | None = None,
+    progress: Callable[[Step], None] | None = None,
 ) -> CaptureResult:
     """Capture the context's scene to a data set folder; see `steps` for what may fail."""
     running = steps(context, settings)
@@ -221,7 +204,7 @@ def capture(
             progress(state)
 
 
-def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[CaptureProgress]:
+def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Step]:
     """Capture image by image, so that a caller can show progress and stop in between.
 
     Closing the iterator early restores the scene and leaves no folder behind. Its return value is the `CaptureResult`.
@@ -258,7 +241,6 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Cap
         frames: dict[str, list[dict]] = {split: [] for split in SPLITS}
         seen: set[int] = set()
         jobs = list(_jobs(plan, views, settings.test_views))
-        started = time.monotonic()
         for done, (split, frame, view) in enumerate(jobs):
             scene.frame_set(math.floor(frame), subframe=frame - math.floor(frame))
             scene.cycles.seed = (settings.seed + done) % 2**31
@@ -268,8 +250,7 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Cap
             capture_files.write_view(folder, stem, image, ids, wide=highest > 255)
             camera = capture_views.describe(context, view.camera, settings.resolution_x, settings.resolution_y)
             frames[split].append({"file_path": f"./{stem}", "time": plan.time(frame), "view": view.name, **camera})
-            seconds_left = (time.monotonic() - started) / (done + 1) * (len(jobs) - done - 1)
-            yield CaptureProgress(done + 1, len(jobs), stem, seconds_left)
+            yield Step(done + 1, len(jobs), stem)
         header = {
             "frames_per_unit": float(max(plan.end - plan.start, 1)),
             "w": settings.resolution_x,

@@ -9,8 +9,8 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import camera_files, cameras, carried
 from ..r5dgs_core.scene.camera_files import View
-from . import export_gaussians, export_running, objects, timeline, views, visible
-from .export_running import Outcome, Step, Steps
+from . import export_frames, export_gaussians, objects, timeline, views, visible
+from .running import Outcome, Step, Steps
 
 FORMATS = (
     ("NERF", "transforms.json", "NeRF and D-NeRF: camera to world with OpenGL axes, lens and time"),
@@ -44,11 +44,11 @@ def steps(
     collection = objects.active_collection(context)
     if axes == "FILE" and collection is None:
         raise errors.ConfigError("export: expected a loaded scene for the axes 'Scene File', found none; choose others")
-    frames = export_running.frames_of(scene, every, step)
-    with export_running.frame_kept(scene):
+    frames = export_frames.frames_of(scene, every, step)
+    with export_frames.frame_kept(scene):
         for number, frame in enumerate(frames):
             yield Step(number, len(frames), f"frame {frame}")
-            export_running.go_to(scene, frame)
+            export_frames.go_to(scene, frame)
             depsgraph, t = context.evaluated_depsgraph_get(), time_of(scene, collection, frame, every)
             world = np.eye(4) if collection is None else visible.world_of(collection, depsgraph)
             for camera in _cameras(scene, which, notes):

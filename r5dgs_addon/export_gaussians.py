@@ -10,8 +10,8 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
-from . import export_running, look, picture, visible
-from .export_running import Outcome, Step, Steps
+from . import export_frames, look, picture, visible
+from .running import Outcome, Step, Steps
 
 AXES = (
     ("BLENDER", "Blender World", "As Blender shows it: z up"),
@@ -181,12 +181,12 @@ def ply_steps(
         SceneFileError: A file cannot be written, or points are no Gaussians.
     """
     wanted, sources, scene = chosen(context, which), Sources(), context.scene
-    frames, most, clouds = export_running.frames_of(scene, every, step), 0, set()
-    with export_running.frame_kept(scene):
+    frames, most, clouds = export_frames.frames_of(scene, every, step), 0, set()
+    with export_frames.frame_kept(scene):
         for number, frame in enumerate(frames):
-            target = export_running.numbered(path, frame) if every else path
+            target = export_frames.numbered(path, frame) if every else path
             yield Step(number, len(frames), target.name)
-            export_running.go_to(scene, frame)
+            export_frames.go_to(scene, frame)
             splats, names = splats_of(context, wanted, axes, sources)
             if not names and not every:
                 raise errors.ConfigError(

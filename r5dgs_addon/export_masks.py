@@ -1,6 +1,7 @@
 """Which object each pixel shows, for a range of frames: masks as data sets have them, and index with depth as EXR."""
 
 import json
+import time
 from pathlib import Path
 
 import bpy
@@ -8,9 +9,10 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import files, image_files
-from . import engine_passes, export_cameras, export_running, picture, table, views, visible
-from .export_running import Outcome, Step, Steps
+from . import engine_passes, export_cameras, export_frames, picture, table, views, visible, worker
+from .running import Outcome, Step, Steps
 
+LOOK_S = 0.005  # between two looks at the worker
 LAYER = "R5DGS"  # of the EXR's channels, as in Blender's own multilayer files
 FORMATS = (
     ("PNG", "Masks", "PNG of 8 bits, or 16 where an id exceeds 255, in object_mask; 0 is the background"),
@@ -33,16 +35,24 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
         R5dgsError: There is no camera, the worker cannot render, or a file cannot be written.
     """
     scene, names = context.scene, {}
-    frames = export_running.frames_of(scene, every, step)
-    with export_running.frame_kept(scene):
+    frames = export_frames.frames_of(scene, every, step)
+    with export_frames.frame_kept(scene):
         for number, frame in enumerate(frames):
             yield Step(number, len(frames), f"frame {frame}")
-            export_running.go_to(scene, frame)
+            export_frames.go_to(scene, frame)
             depsgraph = context.evaluated_depsgraph_get()
             seen = picture.shown(depsgraph)
             view = views.of_camera(depsgraph, visible.points(seen.instances), border=False)
             seen = picture.Shown(view, seen.scenes, seen.worlds, seen.instances)
-            _, arrays = picture.render(seen, ("owners", "depth", "alpha"), sky=False)
+            job = worker.start(picture.steps(seen, ("owners", "depth", "alpha"), sky=False))
+            try:
+                while not job.done:
+                    yield Step(number, len(frames), f"frame {frame}, {job.doing}")
+                    time.sleep(LOOK_S)
+                _, arrays = job.answer()
+            finally:
+                if not job.done:
+                    job.cancel()
             names |= _names(seen)
             try:
                 _write(folder, export_cameras.image_name(frame), format, *planes(seen, arrays))

@@ -9,8 +9,8 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, edited, scene_file
 from ..r5dgs_core.scene.scene import Scene, SceneObject
-from . import export_running, look, motion_physics, objects, picture, table, timeline, visible
-from .export_running import Outcome, Step, Steps
+from . import export_frames, look, motion_physics, objects, picture, table, timeline, visible
+from .running import Outcome, Step, Steps
 
 TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
 KEY_SHARE = 1.5  # of the keys' own tolerance that counts as none, too
@@ -53,13 +53,14 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
             "another one; load it again"
         )
     when = np.concatenate([source.track_times, _later(times)])
-    with export_running.frame_kept(context.scene):
+    with export_frames.frame_kept(context.scene):
         for number, t in enumerate(when):
-            yield Step(number, len(when) + 1, f"frame {times.frame(t):.4g}")
+            yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
-    yield Step(len(when), len(when) + 1, path.name)
+    yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
     pieces = [piece for member in members for piece in _pieces(member, source)]
     result, notes = edited.edit(source, pieces, when, _table(collection, source, members, names))
+    yield Step(len(when) + 1, len(when) + 2, f"packing {len(result.means):,} Gaussians into {path.name}", slow=True)
     scene_file.write(result, path, exact=exact)
     if not _rests(collection):
         notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")

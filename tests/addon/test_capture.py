@@ -562,13 +562,13 @@ def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, 
     """As when the file or the window is closed; bpy has no window, so the operator's own method is called."""
     operator = importlib.import_module("r5dgs.operators.capture_dataset").R5DGS_OT_capture_dataset
     before = fingerprint(blender)
-    running = service.capture.steps(blender.context, settings_for(service, tmp_path / "set", rig="ARC"))
-    next(running)
+    steps = service.capture.steps(blender.context, settings_for(service, tmp_path / "set", rig="ARC"))
+    next(steps)
     removed = []
     manager = SimpleNamespace(event_timer_remove=removed.append, progress_end=lambda: removed.append("progress"))
     context = SimpleNamespace(window_manager=manager, workspace=None)
-    methods = {name: vars(operator)[name] for name in ("cancel", "_end")}
-    rendering = type("Operator", (), {**methods, "_running": running, "_timer": "timer"})()
+    methods = {name: getattr(operator, name) for name in ("cancel", "_end")}
+    rendering = type("Operator", (), {**methods, "_steps": steps, "_timer": "timer"})()
     rendering.cancel(context)
     assert fingerprint(blender) == before and list(tmp_path.iterdir()) == []
     assert removed == ["timer", "progress"]
