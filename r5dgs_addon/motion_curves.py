@@ -126,7 +126,7 @@ def _value(name: str, curve: bpy.types.FCurve, frame: float) -> float:
         return float(points.co[k, 1])
     if k < 0:
         return float(points.co[0, 1]) if len(points.co) else 0.0
-    return float(_cut(name, curve, points, k, frame)[1][0, 1])
+    return float(_cut(name, curve, points, k, frame)[-1, 3, 1])
 
 
 class _Points:
@@ -150,8 +150,11 @@ class _Points:
         return abs(float(self.co[k, 0]) - frame) <= AT
 
 
-def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: float) -> tuple[np.ndarray, np.ndarray]:
-    """The segment that starts with key k, cut at a frame: two of [4, 2]. After the last key, what the curve holds."""
+def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: float) -> np.ndarray:
+    """What the segment that starts with key k is up to a frame: one or two segments. [n, 4, 2]
+
+    After the last key, what the curve holds.
+    """
     start = points.co[k].astype(np.float64)
     if k + 1 == points.count:
         rise = 0.0
@@ -159,8 +162,7 @@ def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: flo
             run, up = start - points.left[k]
             rise = float(up / run) if run > 0 else 0.0
         end = start + (frame - start[0]) * np.array([1.0, rise])
-        line = np.stack([start + share * (end - start) for share in (0.0, 1 / 3, 2 / 3, 1.0)])
-        return line, line[::-1]
+        return np.stack([start + share * (end - start) for share in (0.0, 1 / 3, 2 / 3, 1.0)])[None]
     stop = points.co[k + 1].astype(np.float64)
     kind = curve.keyframe_points[k].interpolation
     if kind not in _CUT:
@@ -169,11 +171,11 @@ def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: flo
             f"observed frame; set a key at frame {frame:g} first, or make it Bezier"
         )
     if kind == "BEZIER":
-        return bezier.split(np.stack([start, points.right[k], points.left[k + 1], stop]).astype(np.float64), frame)
+        return bezier.split(np.stack([start, points.right[k], points.left[k + 1], stop]).astype(np.float64), frame)[0]
     if kind == "CONSTANT":
         stop = np.array([stop[0], start[1]])
     line = np.stack([start + share * (stop - start) for share in (0.0, 1 / 3, 2 / 3, 1.0)])
-    return bezier.split(line, frame)
+    return bezier.split(line, frame)[0]
 
 
 def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: dict[str, Keys]) -> None:
@@ -232,17 +234,19 @@ def _replace(name: str, curve: bpy.types.FCurve, frame: float, tail: Keys | None
         _start(curve, frame, value)
         before, keep = _Points(curve), 1
     elif not before.at(keep - 1, frame) and (tail is not None or keep < before.count):
-        first, second = _cut(name, curve, before, keep - 1, frame)
+        parts = _cut(name, curve, before, keep - 1, frame)
         bends = curve.keyframe_points[keep - 1].interpolation == "BEZIER" and keep < before.count
         left_of_last = before.left[keep - 1].copy()
         _shorten(curve, keep)
-        points.add(1)
-        _fill(curve, keep, second[:1], np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1), np.ones(1), False)
-        points[keep].handle_left = first[2]
-        if bends:
-            _free(points[keep - 1], left_of_last, first[1])
+        for part in parts:
+            points.add(1)
+            _fill(curve, keep, part[3:], np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1), np.ones(1), False)
+            points[keep].handle_left = part[2]
+            if bends:
+                _free(points[keep - 1], left_of_last, part[1])
+            left_of_last = part[2]
+            keep += 1
         before = _Points(curve)
-        keep += 1
     _shorten(curve, keep)
     if tail is not None:
         gaps = np.diff(tail.times)

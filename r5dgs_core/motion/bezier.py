@@ -25,17 +25,18 @@ def within(segment: np.ndarray) -> np.ndarray:
 
 
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a segment at a time into two that are the same curve together (de Casteljau).
+    """Cut a segment at a time into segments that are the same curve together (de Casteljau).
 
-    Where both handles reach over more than 0.8 of the segment, a part's handle may reach past its own key, and is
-    then shortened as `within` does.
+    A handle of a part may reach past that part's other key, which `within` would shorten: it does so only where both
+    handles of the whole reach over more than two thirds of it, and the part spans the point at which time goes on
+    slowest. That part is cut there once more: on either side of that point the thirds of a cubic lie between its ends.
 
     Args:
         segment: Key, handle, handle, key, the keys in order of time. [4, 2]
         time: Strictly between the keys.
 
     Returns:
-        The part before that time and the part after it. [4, 2] each
+        The segments before that time and those after it, one or two each, in order. [n, 4, 2]
     """
     points = within(segment)
     if not points[0, 0] < time < points[3, 0]:
@@ -44,7 +45,26 @@ def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _levels(points, middle)[-1][0, 0] < time else (low, middle)
-    levels = _levels(points, 0.5 * (low + high))
+    share = 0.5 * (low + high)
+    slowest = _slowest(points[:, 0])
+    before, after = _halves(points, share)
+    parts = (before[None], after[None])
+    if (within(before) != before).any() and 0 < slowest < share:
+        parts = (np.stack(_halves(before, slowest / share)), parts[1])
+    if (within(after) != after).any() and share < slowest < 1:
+        parts = (parts[0], np.stack(_halves(after, (slowest - share) / (1 - share))))
+    return parts
+
+
+def _slowest(times: np.ndarray) -> float:
+    """Share at which a cubic with these control times turns from slowing down to speeding up; NaN where it is none."""
+    bends = np.diff(times, 2)
+    return float(-bends[0] / (bends[1] - bends[0])) if bends[1] > bends[0] else np.nan
+
+
+def _halves(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """The curve up to a share of its parameter, and from there on. [4, 2] each"""
+    levels = _levels(points, share)
     return np.stack([level[0] for level in levels]), np.stack([level[-1] for level in reversed(levels)])
 
 

@@ -209,7 +209,7 @@ def test_a_curve_without_a_key_at_t_max_is_cut_there_and_keeps_its_shape(blender
         assert any(abs(point.co[0] - LAST) < 1e-3 for point in curve.keyframe_points)
 
 
-@pytest.mark.parametrize("reach", [0.5, 0.75])
+@pytest.mark.parametrize("reach", [0.5, 0.75, 0.9, 0.97])
 def test_a_curve_whose_handles_overlap_keeps_its_shape_when_it_is_cut(blender, loaded, mug, reach):
     for curve in motions.curves(mug).values():
         points = curve.keyframe_points
