@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import motion_exact, objects
+from ..r5dgs_addon import actions, motion_exact, objects
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -13,7 +13,7 @@ ACTIONS = (
 )
 
 
-class R5DGS_OT_exact_mode(bpy.types.Operator):
+class R5DGS_OT_exact_mode(actions.NeedsScene, bpy.types.Operator):
     """Play points that bend before the last observed time, read from the scene file on every frame change"""
 
     bl_idname = "r5dgs.exact_mode"
@@ -27,10 +27,7 @@ class R5DGS_OT_exact_mode(bpy.types.Operator):
         if context.mode != "OBJECT":
             cls.poll_message_set("Switch to Object Mode first")
             return False
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
-            return False
-        return True
+        return super().poll(context)
 
     def execute(self, context):
         collection = objects.active_collection(context)

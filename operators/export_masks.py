@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_frames, export_masks, objects, running
+from ..r5dgs_addon import actions, export_frames, export_masks, running
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_masks(running.Running, bpy.types.Operator):
+class R5DGS_OT_export_masks(running.Running, actions.NeedsScene, bpy.types.Operator):
     """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
 
     bl_idname = "r5dgs.export_masks"
@@ -26,8 +26,7 @@ class R5DGS_OT_export_masks(running.Running, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
+        if not super().poll(context):
             return False
         if context.scene.camera is None:
             cls.poll_message_set("Add a camera to the scene first")

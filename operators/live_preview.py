@@ -2,10 +2,10 @@
 
 import bpy
 
-from ..r5dgs_addon import live_preview, objects
+from ..r5dgs_addon import actions, live_preview
 
 
-class R5DGS_OT_live_preview(bpy.types.Operator):
+class R5DGS_OT_live_preview(actions.NeedsScene, bpy.types.Operator):
     """Keep the image 'R5DGS Preview' up to date with the frame, the camera and the objects; press again to stop"""
 
     bl_idname = "r5dgs.live_preview"
@@ -18,8 +18,7 @@ class R5DGS_OT_live_preview(bpy.types.Operator):
         if bpy.app.background:
             cls.poll_message_set("Live preview needs a window; render single previews instead")
             return False
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
+        if not super().poll(context):
             return False
         if context.scene.camera is None:
             cls.poll_message_set("Add a camera to the scene first")

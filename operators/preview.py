@@ -2,10 +2,10 @@
 
 import bpy
 
-from ..r5dgs_addon import figures, objects, picture, waiting
+from ..r5dgs_addon import actions, figures, picture, waiting
 
 
-class R5DGS_OT_preview(waiting.Waiting, bpy.types.Operator):
+class R5DGS_OT_preview(waiting.Waiting, actions.NeedsScene, bpy.types.Operator):
     """Render the loaded scenes as the active camera sees them, in the worker, into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"
@@ -14,10 +14,7 @@ class R5DGS_OT_preview(waiting.Waiting, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if not waiting.free(cls, picture.PREVIEW):
-            return False
-        if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
+        if not (waiting.free(cls, picture.PREVIEW) and super().poll(context)):
             return False
         if context.scene.camera is None:
             cls.poll_message_set("Add a camera to the scene first")

@@ -3,10 +3,10 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import displays, objects
+from ..r5dgs_addon import actions, displays, objects
 
 
-class R5DGS_OT_set_display(bpy.types.Operator):
+class R5DGS_OT_set_display(actions.NeedsScene, bpy.types.Operator):
     """Choose what stands for the Gaussians of this scene where the viewport draws no splats"""
 
     bl_idname = "r5dgs.set_display"
@@ -17,11 +17,9 @@ class R5DGS_OT_set_display(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        collection = objects.active_collection(context)
-        if collection is None:
-            cls.poll_message_set("Load an R5DGS scene first")
+        if not super().poll(context):
             return False
-        if not objects.is_own(collection):
+        if not objects.is_own(objects.active_collection(context)):
             cls.poll_message_set("This R5DGS scene is linked from another file: set its display there")
             return False
         return True

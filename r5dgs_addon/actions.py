@@ -11,7 +11,7 @@ class NeedsScene:
     @classmethod
     def poll(cls, context):
         if objects.active_collection(context) is None:
-            cls.poll_message_set("Load an R5DGS scene first")
+            cls.poll_message_set(selection.NO_SCENE)
             return False
         return True
 

@@ -5,13 +5,14 @@ import bpy
 from . import objects, table
 
 Wanted = tuple[bpy.types.Collection, int]  # a loaded scene and the id of one of its objects
+NO_SCENE = "Load an R5DGS scene first"
 
 
 def obstacle(context: bpy.types.Context) -> str:
     """Why objects of scenes cannot be selected now, in words for the user; "" where they can."""
     if context.mode != "OBJECT":
         return "Switch to Object Mode first"
-    return "" if scenes(context) else "Load an R5DGS scene first"
+    return "" if scenes(context) else NO_SCENE
 
 
 def scenes(context: bpy.types.Context) -> list[bpy.types.Collection]:

@@ -371,6 +371,18 @@ def test_bad_input_says_what_to_do_and_changes_nothing(blender, bad, kind, tmp_p
     assert blender.context.scene.frame_end == range_before and not blender.context.scene.timeline_markers
 
 
+NEEDING_A_SCENE = (
+    "add_alias", "exact_mode", "export_masks", "export_ply", "export_scene", "extrapolate_until", "isolate", "preview",
+    "remove_alias", "rename_object", "select_by_prompt", "select_object", "set_display", "show_confidence",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NEEDING_A_SCENE)
+def test_without_a_scene_every_action_asks_for_one(blender, name):
+    with pytest.raises(RuntimeError, match="Load an R5DGS scene first"):
+        getattr(blender.ops.r5dgs, name)()
+
+
 def test_no_file_at_all_is_asked_for(blender):
     with pytest.raises(RuntimeError, match="choose a .r5dgs file"):
         blender.ops.r5dgs.load_scene()
