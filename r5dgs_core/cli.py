@@ -46,6 +46,8 @@ def parser() -> argparse.ArgumentParser:
     train = commands.add_parser("train", help="train a data set into a run folder")
     train.add_argument("data", type=Path, help="data set folder: transforms_train.json, or images and sparse/")
     train.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
+    shown = "masks of the training views (default: DATA/object_mask); 'none': without"
+    train.add_argument("--masks", metavar="FOLDER", help=shown)
     add_training(train)
 
     bake = commands.add_parser("bake", help="turn a run into a scene file")
@@ -132,6 +134,8 @@ def _dispatch(args: argparse.Namespace) -> int:
     """Do what the command line says; returns the exit status."""
     cap = getattr(args, "max_gaussians", None)
     overrides = [*getattr(args, "set", []), *([] if cap is None else [f"densify.max_gaussians={cap}"])]
+    if getattr(args, "masks", None) is not None:
+        overrides.append(f"data.masks={args.masks if args.masks == 'none' else str(Path(args.masks).resolve())}")
     if args.command in ("demo", "train"):
         options = {
             "config_path": args.config,

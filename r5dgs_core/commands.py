@@ -183,7 +183,7 @@ def _open(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]:
 
     if target.is_dir():
         run = checkpoint.open_run(target)
-        dataset = datasets.read(run.data(data))
+        dataset = datasets.read(run.data(data), run.config.data.masks)
         scene, trained_on = bake.bake(run, dataset), run.digest
     else:
         scene = scene_file.read(target)

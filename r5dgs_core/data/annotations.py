@@ -10,6 +10,8 @@ import numpy as np
 from .. import errors
 from . import transforms
 
+OBJECTS = "objects.json"
+
 
 @dataclass(frozen=True)
 class GroundTruth:
@@ -36,7 +38,7 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
     Returns:
         Name of each id, and its other words; empty without the file.
     """
-    path = root / "objects.json"
+    path = root / OBJECTS
     names: dict[int, str] = {}
     aliases: dict[int, tuple[str, ...]] = {}
     if not path.exists():

@@ -18,9 +18,10 @@ import numpy as np
 from .. import errors
 from ..scene import cameras
 from . import colmap, images, masks, transforms
-from .annotations import GroundTruth, read_ground_truth, read_objects
+from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
 
 SPLITS = ("train", "val", "test")
+MASKS, NO_MASKS = "object_mask", "none"
 FRAMES_PER_UNIT = 60.0
 _log = logging.getLogger(__name__)
 
@@ -110,14 +111,20 @@ class Dataset:
         return float(self.times[-1])
 
 
-def read(root: Path) -> Dataset:
+def read(root: Path, train_masks: str = MASKS) -> Dataset:
     """Read and check a data set; images and masks are looked at, not loaded.
 
     Args:
         root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`colmap`).
+        train_masks: Folder of the training views' masks, within ``root`` or anywhere; ``none`` passes all of them over.
+            The other splits keep those of the data set: they are what a run is measured by. An ``objects.json`` in
+            the folder says that its ids are its own; true poses, which go by the data set's, are then left out.
 
     Returns:
         The data set. A split without camera file is empty.
+
+    Raises:
+        DatasetError: A file is missing or cannot be used; the message names it and says what to do.
     """
     root = Path(root)
     if not root.is_dir():
@@ -149,21 +156,30 @@ def read(root: Path) -> Dataset:
 
     camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]])
     image_root = root if reconstruction is None else root / colmap.IMAGES
-    views = {split: _make_views(root, image_root, split, entries[split], camera_names) for split in SPLITS}
-    views = _attach_mask_colors(views)
+    folders = {"train": _mask_folder(root, train_masks), "val": root / MASKS, "test": root / MASKS}
+    views = {split: _make_views(folders[split], image_root, split, entries[split], camera_names) for split in SPLITS}
+    if folders["train"] == folders["val"]:
+        views = _attach_mask_colors(views)
+    else:
+        views = _attach_mask_colors({"train": views["train"]}) | _attach_mask_colors(
+            {split: views[split] for split in SPLITS[1:]}
+        )
     every = [view for split in SPLITS for view in views[split]]
     for view in every:
         for file in (view.image_path, view.mask_path):
             if file is not None:
                 hasher.update(_fingerprint(root, file))
-    names, aliases = read_objects(root)
+    renamed = (
+        folders["train"] is not None and folders["train"] != root / MASKS and (folders["train"] / OBJECTS).exists()
+    )
+    names, aliases = read_objects(folders["train"] if renamed else root)
     convention = header.get("world_convention", "blender")
     if convention not in cameras.WORLD_TO_BLENDER:
         raise errors.DatasetError(
             f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
             f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}"
         )
-    ground_truth = read_ground_truth(root)
+    ground_truth = None if renamed else read_ground_truth(root)  # which goes by the ids of the data set's own masks
     if ground_truth is not None:
         for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
             names.setdefault(object_id, name)
@@ -246,8 +262,18 @@ class _CameraNames:
         return self.by_key[key]
 
 
+def _mask_folder(root: Path, name: str) -> Path | None:
+    """Where the training views' masks are; None for none of them."""
+    if name == NO_MASKS:
+        return None
+    folder = root / name  # an absolute path stays one
+    if name != MASKS and not folder.is_dir():
+        raise errors.DatasetError(f"{folder}: no such folder of masks; give another with --masks, or 'none'")
+    return folder
+
+
 def _make_views(
-    root: Path, image_root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames
+    mask_folder: Path | None, image_root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames
 ) -> tuple[View, ...]:
     views: dict[str, View] = {}
     for entry in entries:
@@ -259,8 +285,10 @@ def _make_views(
         matrix = cameras.opengl_to_cam_world(entry.matrix)
         camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
         camera = replace(camera, name=names.name(entry.camera, camera))
-        mask_path = root / "object_mask" / f"{name}.png"
-        views[name] = View(name, camera, entry.t, split, image_path, mask_path if mask_path.is_file() else None)
+        mask_path = None if mask_folder is None else mask_folder / f"{name}.png"
+        if mask_path is not None and not mask_path.is_file():
+            mask_path = None
+        views[name] = View(name, camera, entry.t, split, image_path, mask_path)
     return tuple(views.values())
 
 
@@ -275,13 +303,13 @@ def _find_image(root: Path, entry: transforms.Entry) -> Path:
 
 
 def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
-    """Number the colours once over all splits, if masks are coded by colour."""
-    paths = [view.mask_path for split in SPLITS for view in views[split] if view.mask_path is not None]
+    """Number the colours once over all these splits, if masks are coded by colour."""
+    paths = [view.mask_path for some in views.values() for view in some if view.mask_path is not None]
     colors = masks.color_table(paths)
     if not colors:
         return views
     _log.info("masks are coded by colour: %d colours numbered by value, black is 0", len(colors) - 1)
-    return {split: tuple(replace(view, mask_colors=colors) for view in views[split]) for split in SPLITS}
+    return {split: tuple(replace(view, mask_colors=colors) for view in some) for split, some in views.items()}
 
 
 def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:

@@ -43,7 +43,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     Raises:
         CheckpointError, DatasetError: A file is missing or damaged.
     """
-    dataset = dataset if dataset is not None else datasets.read(run.data())
+    dataset = dataset if dataset is not None else datasets.read(run.data(), run.config.data.masks)
     state = checkpoint.load(run.folder)
     tensors, wanted = state.tensors, run.config.needs
     found = mask_stack.NAME in tensors  # objects that nobody named: their ids mean nothing to the data set
@@ -414,7 +414,7 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
         if not text.strip().startswith("needs."):
             raise ConfigError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
     run = dataclasses.replace(run, config=run.config.override(overrides))
-    dataset = datasets.read(run.data(dataset_root))
+    dataset = datasets.read(run.data(dataset_root), run.config.data.masks)
     if dataset.digest != run.digest:
         raise CheckpointError(
             f"{dataset.root}: is not the data that {folder} was trained on, or has changed since; "

@@ -25,6 +25,7 @@ from .sections import (
     STRATEGIES,
     VARIANTS,
     CurriculumSection,
+    DataSection,
     DensifyDefaultSection,
     DensifyMcmcSection,
     DensifySection,
@@ -45,6 +46,7 @@ class Config:
     """All sections of a run's configuration."""
 
     train: TrainSection = dataclasses.field(default_factory=TrainSection)
+    data: DataSection = dataclasses.field(default_factory=DataSection)
     init: InitSection = dataclasses.field(default_factory=InitSection)
     rates: RatesSection = dataclasses.field(default_factory=RatesSection)
     losses: LossSection = dataclasses.field(default_factory=LossSection)

@@ -80,7 +80,8 @@ def train(
         resume = False
     if not resume and not overwrite:
         checkpoint.refuse_to_lose(folder)
-    dataset = datasets.read(dataset_root)
+    settled = checkpoint.open_run(folder).config if resume else config
+    dataset = datasets.read(dataset_root, settled.data.masks)
     go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
     state, replaces = None, False
     if resume:

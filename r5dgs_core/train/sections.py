@@ -56,6 +56,17 @@ class TrainSection:
 
 
 @dataclass(frozen=True)
+class DataSection:
+    """What is read of the data set.
+
+    Attributes:
+        masks: Folder of the training views' masks, within the data set or anywhere; ``none`` passes them over.
+    """
+
+    masks: str = "object_mask"
+
+
+@dataclass(frozen=True)
 class InitSection:
     """How Gaussians are placed before training.
 

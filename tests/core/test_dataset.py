@@ -414,3 +414,31 @@ def test_an_image_that_changed_since_reading_is_noticed(flat):
 def test_a_data_set_cannot_be_changed_in_place(flat):
     with pytest.raises(dataclasses.FrozenInstanceError):
         dataset.read(flat).name = "other"
+
+
+def test_training_masks_may_come_from_another_folder(flat, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("masks")
+    name = dataset.read(flat).train[0].name
+    images.write_png(folder / f"{name}.png", np.full((HEIGHT, WIDTH), 7, np.uint8))
+    own, other, without = dataset.read(flat), dataset.read(flat, str(folder)), dataset.read(flat, dataset.NO_MASKS)
+    assert (dataset.load_mask(other.train[0]) == 7).all()
+    assert [view.mask_path for view in other.train[1:]] == [None] * (len(own.train) - 1)
+    assert all(view.mask_path is None for view in without.train)
+    for some in (other, without):  # what a run is measured by stays
+        assert [view.mask_path for view in some.test] == [view.mask_path for view in own.test] != [None, None]
+    assert other.object_names == own.object_names
+    assert len({own.digest, other.digest, without.digest}) == 3
+
+
+def test_a_folder_of_masks_with_names_of_its_own_has_ids_of_its_own(flat, tmp_path_factory):
+    write_json(flat / "ground_truth.json", {"times": [0.0], "t_max": 0.5, "objects": []})
+    folder = tmp_path_factory.mktemp("masks")
+    write_json(folder / "objects.json", {"3": "cup"})
+    other = dataset.read(flat, str(folder))
+    assert other.object_names == {3: "cup"}
+    assert other.ground_truth is None and dataset.read(flat).ground_truth is not None
+
+
+def test_a_folder_of_masks_that_is_missing_is_an_error(flat):
+    with pytest.raises(errors.DatasetError, match=r"nowhere: no such folder of masks; give another with --masks"):
+        dataset.read(flat, "nowhere")
