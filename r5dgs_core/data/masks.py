@@ -1,4 +1,8 @@
-"""Object id images: 8 or 16 bit, palette, or one colour per object."""
+"""Object id images: 8 or 16 bit, palette, or one colour per object.
+
+Id 0 is the background, 1 to `MAX_ID` are objects, and `UNKNOWN` says nothing of a pixel: no loss and no count looks
+at it.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,8 @@ import numpy as np
 from .. import errors
 from . import images
 
+UNKNOWN = 65535
+MAX_ID = UNKNOWN - 1  # what 16 bits hold beside it
 MAX_COLORS = 4096
 _GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # colour types of PNG
 _ONE_CHANNEL = (_GRAY, _PALETTE, _GRAY_ALPHA)

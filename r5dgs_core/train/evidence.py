@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ..data import masks
 from ..scene import cameras
 from .sweep import camera_key
 from .triangulation import Places
@@ -81,7 +82,8 @@ def turn_stiffness(views: Sequence[TrainView], places: Places, times: np.ndarray
         if view.mask is None:
             continue
         s = nearest_knot(times, view.t)
-        boxes = ndimage.find_objects(view.mask.astype(np.int32))
+        known = np.where(view.mask == masks.UNKNOWN, 0, view.mask).astype(np.int32)
+        boxes = ndimage.find_objects(known)
         for row, object_id in enumerate(places.object_ids):
             box = boxes[object_id - 1] if object_id <= len(boxes) else None
             found = None if box is None else _change_per_turn(view.image[box], view.mask[box] == object_id)

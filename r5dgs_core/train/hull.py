@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..data import masks
 from ..scene import cameras
 from .views import TrainView
 
@@ -24,8 +25,9 @@ def carve(
     """Draw points that all views agree to lie in the object.
 
     A view whose mask shows the object and that has the point in its frame votes: for it where the mask shows the
-    object, against it where the mask shows background, not at all where another object may hide it. The bounds start
-    strict (no vote against it) and are relaxed until enough points are found, so that noisy masks still give a start.
+    object, against it where the mask shows background, not at all where another object may hide it or the mask says
+    nothing. The bounds start strict (no vote against it) and are relaxed until enough points are found, so that noisy
+    masks still give a start.
 
     Args:
         views: Views at the reference time.
@@ -57,7 +59,7 @@ def carve(
         here = ids == object_id
         inside += here
         outside += ids == 0
-        seen += valid
+        seen += valid & (ids != masks.UNKNOWN)
         colors += here[:, None] * (view.image[rows, columns] / 255.0)
     for limit in (0.0, 0.1, 0.2, 0.35, 0.5):
         good = (inside >= np.maximum(1, 0.5 * seen)) & (outside <= limit * seen)

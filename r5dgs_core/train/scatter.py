@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..data import masks
 from ..scene import cameras
 from .hull import pixel_indices
 from .normalization import TARGET_DISTANCE
@@ -65,8 +66,10 @@ def behind_objects(
         if view.mask is None:
             continue
         columns, rows, valid = pixel_indices(view, points)
+        ids = view.mask[rows, columns]
+        valid &= ids != masks.UNKNOWN
         shown += valid
-        covered += valid & (view.mask[rows, columns] > 0)
+        covered += valid & (ids > 0)
     free = np.flatnonzero(covered <= shown / 3)
     kept = np.sort(rng.permutation(free)[:count])
     return points[kept], colors[kept]

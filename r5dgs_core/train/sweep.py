@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
+from ..data import masks
 from ..scene import cameras
 from . import sky
 from .views import TrainView, spread
@@ -48,7 +49,7 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
     result = []
     for group in by_camera(views, MAX_BACKDROPS):
         frames = spread(group, MAX_FRAMES)
-        free = np.stack([_free(v) for v in frames])
+        free = _free(frames)
         image = _median([v.image for v in frames], free)
         result.append(Backdrop(group[0].camera, image, np.asarray(free.any(0))))
     return result
@@ -96,12 +97,23 @@ def camera_key(camera: cameras.Camera) -> bytes:
     return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()
 
 
-def _free(view: TrainView) -> np.ndarray:
-    free = np.ones(view.image.shape[:2], bool)
-    if view.mask is not None:
-        free &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
-    if view.alpha is not None:
-        free &= view.alpha > 127
+def _free(frames: Sequence[TrainView]) -> np.ndarray:
+    """Pixels that show the background in each frame of a camera. [F, H, W] bool
+
+    Of what a mask does not know is background what no mask of the camera ever knows.
+    """
+    free = np.ones((len(frames), *frames[0].image.shape[:2]), bool)
+    told = np.zeros(free.shape[1:], bool)
+    for k, view in enumerate(frames):
+        if view.mask is not None:
+            free[k] = np.logical_not(ndimage.binary_dilation(view.mask > 0))
+            told |= view.mask != masks.UNKNOWN
+        else:
+            told[:] = True
+    free |= ~told
+    for k, view in enumerate(frames):
+        if view.alpha is not None:
+            free[k] &= view.alpha > 127
     return free
 
 

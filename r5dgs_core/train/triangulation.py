@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from ..data import masks
 from .views import TrainView, nearest_knot
 
 log = logging.getLogger(__name__)
@@ -109,7 +110,7 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
         s = nearest_knot(times, view.t)
         assert view.mask is not None
         for object_id in np.unique(view.mask):
-            if object_id > 0:
+            if object_id not in (0, masks.UNKNOWN):
                 sighting = _sight(view, s, int(object_id), min_share)
                 if sighting is not None:
                     found.setdefault(int(object_id), []).append(sighting)
