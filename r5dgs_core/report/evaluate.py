@@ -24,7 +24,7 @@ from ..raster import scene_render
 from ..scene import files, playback
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
-from . import metrics, true_poses
+from . import metrics, overlap, true_poses
 
 METRICS = (
     "psnr",
@@ -34,12 +34,15 @@ METRICS = (
     "ssim_objects",
     "flip",
     "lpips",
-    "miou",
-    "miou_matched",
+    *overlap.KEYS,
     "ms_motion",
     "ms_raster",
     "images",
+    "images_later",
 )
+
+
+_SAME_TIME = 1e-9  # scene time
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,8 @@ def measure(
         draw(scene, view.camera, view.t, move, backend=backend)  # compiles, fills what is kept; not timed
     for view in views:
         rendering = draw(scene, view.camera, view.t, move, backend=backend)
-        tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view))
+        later = view.t > scene.t_max + _SAME_TIME
+        tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view), later)
         if measured is not None:
             measured()
     return tally.result()
@@ -255,13 +259,13 @@ class _Tally:
     """Collects the errors of a split's images and averages them."""
 
     def __init__(self, ids: list[int]) -> None:
-        self.ids = ids
         self.values: dict[str, list[float]] = {name: [] for name in METRICS}
         self.errors: list[float] = []
-        self.counts = np.zeros((len(ids) + 1, len(ids) + 1), np.int64)
-        self.masked = False
+        self.overlap = overlap.Overlap(ids)
+        self.later = 0
 
-    def add(self, rendering: Rendering, truth: np.ndarray, mask: np.ndarray | None) -> None:
+    def add(self, rendering: Rendering, truth: np.ndarray, mask: np.ndarray | None, later: bool) -> None:
+        self.later += later
         self.errors.append(metrics.mse(rendering.color, truth))
         self.values["psnr"].append(metrics.psnr_of_mse(self.errors[-1]))
         similarity = metrics.ssim_map(rendering.color, truth)
@@ -270,15 +274,11 @@ class _Tally:
         if flip is not None:
             self.values["flip"].append(flip)
         if mask is not None:
-            self.masked = True
-            self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, mask > 0))
-            if (mask > 0).any():
-                self.values["ssim_objects"].append(float(similarity[mask > 0].mean()))
-            for object_id in sorted(set(np.unique(mask[mask > 0]).tolist()) - set(self.ids)):
-                # An object that the scene lacks counts as missed; so far it was in no truth and in no prediction.
-                self.counts = np.insert(np.insert(self.counts, len(self.ids), 0, axis=0), len(self.ids), 0, axis=1)
-                self.ids = [*self.ids, object_id]
-            self.counts += metrics.confusion(rendering.ids, mask, self.ids)
+            shown = overlap.objects_of(mask)
+            self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, shown))
+            if shown.any():
+                self.values["ssim_objects"].append(float(similarity[shown].mean()))
+            self.overlap.add(rendering.ids, mask)
         self.values["ms_motion"].append(rendering.ms_motion)
         self.values["ms_raster"].append(rendering.ms_raster)
 
@@ -289,10 +289,8 @@ class _Tally:
         for name in ("ms_motion", "ms_raster"):
             out[name] = float(np.median(self.values[name])) if self.values[name] else None
         out["psnr_pooled"] = metrics.psnr_pooled(self.errors) if self.errors else None
-        if self.masked:
-            out["miou"] = _finite(metrics.miou(self.counts))
-            out["miou_matched"] = _finite(metrics.miou_matched(self.counts))
-        out["images"] = len(self.errors)
+        out |= self.overlap.result()
+        out["images"], out["images_later"] = len(self.errors), self.later
         return out
 
 
@@ -300,7 +298,3 @@ def _mean(values: Sequence[float]) -> float | None:
     """Mean of the values that are numbers; None where there are none."""
     kept = [value for value in values if not math.isnan(value)]
     return float(np.mean(kept)) if kept else None
-
-
-def _finite(value: float) -> float | None:
-    return None if math.isnan(value) else value

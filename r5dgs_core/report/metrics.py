@@ -94,19 +94,24 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float | None:
     return float(mean)
 
 
-def confusion(predicted: np.ndarray, truth: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+def confusion(
+    predicted: np.ndarray, truth: np.ndarray, ids: Sequence[int], where: np.ndarray | None = None
+) -> np.ndarray:
     """Count pixels by true and predicted id.
 
     Args:
         predicted: Predicted ids. [H, W]
         truth: True ids. [H, W]
         ids: The ids that are told apart; others, -1 among them, are counted in a last row and column. (M,)
+        where: Pixels that count, all where None. [H, W] bool
 
     Returns:
         Pixels with true id ``ids[i]`` and predicted id ``ids[j]``. [M + 1, M + 1] int64
     """
     if predicted.shape != truth.shape:
         raise ValueError(f"expected id maps of one size, got {predicted.shape} and {truth.shape}")
+    if where is not None:
+        predicted, truth = predicted[where], truth[where]
     order = np.argsort(ids)
     keys, count = np.asarray(ids)[order], len(ids)
 
@@ -129,6 +134,22 @@ def ious(counts: np.ndarray) -> np.ndarray:
     return common / np.maximum(true[:, None] + predicted[None, :] - common, 1)
 
 
+def iou_of_rest(counts: np.ndarray) -> float:
+    """IoU of the pixels of no id with those predicted as none, the background; NaN where neither has any.
+
+    Args:
+        counts: `confusion`. [M + 1, M + 1]
+    """
+    common = int(counts[-1, -1])
+    union = int(counts[-1].sum()) + int(counts[:, -1].sum()) - common
+    return common / union if union else math.nan
+
+
+def present(counts: np.ndarray) -> np.ndarray:
+    """Which ids the truth shows. [M + 1, M + 1] -> [M] bool"""
+    return counts[:-1].sum(axis=1) > 0
+
+
 def miou(counts: np.ndarray) -> float:
     """Mean over the ids present in the truth of their IoU with the same predicted id.
 
@@ -138,18 +159,31 @@ def miou(counts: np.ndarray) -> float:
     Returns:
         The mean; NaN where the truth has none of the ids.
     """
-    present = counts[:-1].sum(axis=1) > 0
-    return float(np.diag(ious(counts))[present].mean()) if present.any() else math.nan
+    shown = present(counts)
+    return float(np.diag(ious(counts))[shown].mean()) if shown.any() else math.nan
+
+
+def matched(counts: np.ndarray) -> dict[int, int]:
+    """The one-to-one map from true to predicted ids with the largest sum of IoU (Hungarian method).
+
+    Args:
+        counts: `confusion`. [M + 1, M + 1]
+
+    Returns:
+        Column of each row that the truth shows; a row that overlaps with nothing left over has none.
+    """
+    shown = np.flatnonzero(present(counts))
+    table = ious(counts)[shown]
+    rows, columns = optimize.linear_sum_assignment(table, maximize=True)
+    return {int(shown[i]): int(j) for i, j in zip(rows, columns, strict=True) if table[i, j] > 0}
 
 
 def miou_matched(counts: np.ndarray) -> float:
-    """As `miou`, after the one-to-one map from predicted to true ids with the largest sum of IoU (Hungarian method)."""
-    present = counts[:-1].sum(axis=1) > 0
-    if not present.any():
-        return math.nan
-    table = ious(counts)[present]
-    rows, columns = optimize.linear_sum_assignment(table, maximize=True)
-    return float(table[rows, columns].sum() / present.sum())
+    """As `miou`, after the map `matched`."""
+    shown = present(counts)
+    table = ious(counts)
+    total = sum(float(table[i, j]) for i, j in matched(counts).items())
+    return total / int(shown.sum()) if shown.any() else math.nan
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

@@ -9,6 +9,8 @@ from rich import box
 from rich.console import Group
 from rich.table import Table
 
+from . import overlap
+
 # What the tables show: key in METRICS, what the user reads, its short form in rows of modes ("": left out), format.
 _SHOWN = (
     ("psnr", "PSNR, mean over images (dB)", "PSNR", "{:.2f}"),
@@ -20,11 +22,11 @@ _SHOWN = (
     ("lpips", "LPIPS (less is better)", "LPIPS", "{:.4f}"),
     ("miou", "mIoU, same ids", "mIoU", "{:.3f}"),
     ("miou_matched", "mIoU, matched ids", "", "{:.3f}"),
+    ("iou_background", "IoU of the background", "", "{:.3f}"),
     ("ms_motion", "motion, per frame (ms)", "motion", "{:.2f}"),
     ("ms_raster", "rasterization, per frame (ms)", "raster", "{:.1f}"),
     ("images", "images", "", "{:d}"),
 )
-_CAPTION = "val: held-out views in the observed time; test: later times (as the data set splits them)"
 ABSENT = "not computed"
 
 
@@ -40,7 +42,7 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
     columns = [(split, mode, values) for split, modes in evaluation["splits"].items() for mode, values in modes.items()]
     if len({mode for _, mode, _ in columns}) > 1:
         return Group(_of_modes(evaluation, columns), *_poses(evaluation))
-    table = Table(title=_title(evaluation), title_justify="left", caption=_CAPTION, caption_justify="left")
+    table = Table(title=_title(evaluation), title_justify="left", caption=_caption(columns), caption_justify="left")
     table.add_column("")
     for split, _, _ in columns:
         table.add_column(split, justify="right")
@@ -51,6 +53,9 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
         values = [metrics[key] for _, _, metrics in columns]
         if any(value is not None for value in values):
             table.add_row(label, *(ABSENT if value is None else form.format(value) for value in values), *padding)
+    table.add_section()
+    for label, cells in _overlaps(evaluation, columns):
+        table.add_row(label, *cells, *padding)
     table.add_section()
     rest = [""] * max(0, len(columns) - 2)
     rows = [row for row in evaluation["objects"] if row["position_error"] is not None]
@@ -65,7 +70,7 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
 def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[str, Any]]]) -> Table:
     """A row for each split and mode; what was computed for none of them is left out."""
     table = Table(title=_title(evaluation), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.caption, table.caption_justify = f"{_CAPTION}; motion and raster in ms per frame", "left"
+    table.caption, table.caption_justify = f"motion and raster: ms per frame. {_caption(rows)}", "left"
     shown = [
         (key, short, form)
         for key, _, short, form in _SHOWN
@@ -82,6 +87,41 @@ def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[st
         table.add_row(mode, *cells)
         before = split
     return table
+
+
+def _caption(columns: Sequence[tuple[str, str, dict[str, Any]]]) -> str:
+    """Which images each split has, and what mIoU is where there is one."""
+    counts = {split: (metrics["images"], metrics.get("images_later")) for split, _, metrics in columns}
+    parts = []
+    for split, (images, later) in counts.items():
+        if images and later is not None:
+            where = {0: "interpolated", images: "extrapolated"}.get(later, f"{later} of them extrapolated")
+            parts.append(f"{split}: {images} held-out images, {where}")
+    said = "; ".join(parts)
+    if any(metrics["miou"] is not None for _, _, metrics in columns):
+        said += f". {overlap.DEFINITION}"
+    return said
+
+
+def _overlaps(
+    evaluation: dict[str, Any], columns: Sequence[tuple[str, str, dict[str, Any]]]
+) -> list[tuple[str, list[str]]]:
+    """Rows of the objects' IoU, below a heading; none without masks."""
+    named = {str(row["id"]): row["name"] for row in evaluation["objects"]}
+    found = [metrics.get("iou_objects") or {} for _, _, metrics in columns]
+    ids = sorted({key for values in found for key in values}, key=int)
+    rows: list[tuple[str, list[str]]] = []
+    for key in ids:
+        cells = []
+        for _, _, metrics in columns:
+            same = (metrics.get("iou_objects") or {}).get(key)
+            cell = "not shown" if same is None else f"{same:.3f}"
+            other = (metrics.get("id_map") or {}).get(key)
+            if same is not None and other is not None and str(other) != key:
+                cell += f" ({metrics['iou_objects_matched'][key]:.3f} as {other})"
+            cells.append(cell)
+        rows.append((f"{named[key]} ({key})" if key in named else f"id {key}", cells))
+    return [("[bold]IoU of each object, same ids[/bold]", [""] * len(columns)), *rows] if rows else []
 
 
 def _poses(evaluation: dict[str, Any]) -> list[Table]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from r5dgs_core.data import dataset, images
+from r5dgs_core.data import dataset, images, masks
 from r5dgs_core.report import evaluate, table
 from tests import pictures, scenes
 
@@ -185,3 +185,30 @@ def test_several_modes_are_rows_that_fit_a_narrow_terminal(result):
 def test_numbers_are_of_the_eight_bit_picture(scene):
     shown = evaluate.render(scene, scenes.orbit_camera(0.5, pictures.WIDTH, pictures.HEIGHT), 0.5, backend=BACKEND)
     np.testing.assert_allclose(shown.color * 255, np.rint(shown.color * 255), atol=1e-4)
+
+
+def test_unknown_pixels_of_the_true_masks_do_not_count(scene, data, tmp_path):
+    shutil.copytree(data.root, tmp_path / "part")
+    for path in (tmp_path / "part" / "object_mask" / "val").iterdir():
+        ids = images.read_png(path).astype(np.uint16)
+        ids[ids == 3] = masks.UNKNOWN
+        images.write_png(path, ids)
+    part = dataset.read(tmp_path / "part")
+    values = evaluate.evaluate(scene, part, splits=("val",), backend=BACKEND)["splits"]["val"]["rigid"]
+    assert values["miou"] == values["iou_background"] == 1.0 and set(values["iou_objects"]) == {"1", "2"}
+
+
+def test_the_images_past_t_max_are_counted(scene, result):
+    assert [result["splits"][split]["rigid"]["images_later"] for split in ("val", "test")] == [0, 4]
+    assert scene.t_max == 0.75
+
+
+def test_the_table_says_what_its_overlap_is(scene, data):
+    swapped = np.array([0, 2, 1, 3])
+    ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
+    wrong = evaluate.evaluate(dataclasses.replace(scene, object_ids=ids), data, backend=BACKEND)
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(table.make(wrong))
+    text = " ".join(console.export_text().split())
+    assert "val: 2 held-out images, interpolated; test: 4 held-out images, extrapolated" in text
+    assert "Hungarian" in text and "0.000 (1.000 as 2)" in text and "toy car (3) │ 1.000 │ 1.000" in text
