@@ -20,6 +20,7 @@ from . import compat, timeline
 
 # Of the scene's size. Blender may differ from playback by 1e-5: its float32 evaluation takes a share too.
 TOLERANCE = 3e-6
+NEAREST = 0.011  # frames between keys of a curve: Blender takes those that are nearer than 0.01 for one
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 
 
@@ -73,9 +74,10 @@ def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: 
     radius = float(reaches(scene)[motion_id]) if reach is None else reach
     allowed = tolerance * scene.extent
     observed = _observed(scene, motion_id, allowed, radius)
+    nearest = NEAREST / scene.frames_per_unit
     if t_end <= scene.t_max:
         return observed
-    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius)
+    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius, nearest=nearest)
     return reduction.join(observed, future)
 
 

@@ -82,7 +82,8 @@ def _plan(anchor: bpy.types.Object, t_end: float | None) -> Plan:
     if times.t_end > times.t_max:
         allowed, reach = motion_physics.key_error(anchor)
         sample = _sampler(anchor, location, quat, times.t_max)
-        future = reduction.reduce(sample, times.t_max, times.t_end, allowed, reach)
+        nearest = keyframes.NEAREST / times.frames_per_unit
+        future = reduction.reduce(sample, times.t_max, times.t_end, allowed, reach, nearest=nearest)
         tails = {
             "location": motion_curves.frames(future.location, times),
             "rotation_quaternion": motion_curves.frames(future.rotation, times),

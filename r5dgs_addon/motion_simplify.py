@@ -93,7 +93,8 @@ def _reduced(
     cuts = cuts[np.concatenate([[True], np.diff(cuts) > motion_curves.AT])]
     joined = None
     for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-        some = reduction.reduce(_sampler(anchor, parts, a, b), float(a), float(b), allowed, reach)
+        sample = _sampler(anchor, parts, a, b)
+        some = reduction.reduce(sample, float(a), float(b), allowed, reach, nearest=keyframes.NEAREST)
         joined = some if joined is None else reduction.join(joined, some)
     assert joined is not None
     return joined

@@ -7,6 +7,7 @@ Location and rotation have their own key times.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ MAX_STEP_RAD = math.radians(120.0)
 _FINER = 4  # points of the checking grid per possible key time
 _FIRST_INTERVALS = 64
 _MOST_INTERVALS = 1 << 15
+_ONE_BY_ONE = 256  # keys; what needs more is cut into stripes that are walked side by side
+_PER_STRIPE = 32  # keys: each stripe adds one at most
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 Sampler = Callable[[np.ndarray], Samples]
@@ -67,6 +70,7 @@ def reduce(
     tolerance: float,
     radius: float,
     forced_times: Sequence[float] = (),
+    nearest: float = 0.0,
 ) -> Curves:
     """Choose keys so that every point of the body stays within ``tolerance`` of the motion.
 
@@ -79,19 +83,24 @@ def reduce(
         tolerance: Largest distance of any point from its place, world units, > 0.
         radius: Largest distance of a point from the pivot, world units.
         forced_times: Times inside (t0, t1) that get a key in any case.
+        nearest: Least time between possible keys, for editors that drop keys which are nearer.
 
     Returns:
         Location and rotation keys; one key for a curve that is constant within its share of the tolerance. The error
         |dd| + 2 radius sin(dtheta / 2) holds on a grid four times finer than the possible key times, whose own density
-        doubles until single steps hold the tolerance. No rotation step is above 120 degrees.
+        doubles until single steps hold the tolerance; no rotation step is above 120 degrees. A motion too fast for
+        ``nearest`` or for 32,768 steps gets what they allow, exact at its keys.
     """
     if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
         raise ValueError(f"t0, t1: expected t0 < t1, got {t0} and {t1}")
-    if not (tolerance > 0 and radius >= 0):
-        raise ValueError(f"tolerance, radius: expected > 0 and >= 0, got {tolerance} and {radius}")
+    if not (tolerance > 0 and radius >= 0 and nearest >= 0):
+        raise ValueError(
+            f"tolerance, radius, nearest: expected > 0, >= 0 and >= 0, got {tolerance}, {radius} and {nearest}"
+        )
     cuts = sorted({float(t) for t in forced_times if t0 < t < t1})
     bounds = [t0, *cuts, t1]
-    intervals = _FIRST_INTERVALS
+    shortest = min(b - a for a, b in itertools.pairwise(bounds))
+    intervals = min(_FIRST_INTERVALS, max(1, int(shortest / nearest))) if nearest > 0 else _FIRST_INTERVALS
     while True:
         grid = np.concatenate(
             [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -100,7 +109,7 @@ def reduce(
         location, rotation = _Curve.pair(sample(grid), grid, tolerance, radius)
         possible = np.arange(0, len(grid), _FINER)
         steps_hold = location.holds_steps(possible) and rotation.holds_steps(possible)
-        if steps_hold or intervals >= _MOST_INTERVALS:
+        if steps_hold or intervals >= _MOST_INTERVALS or shortest < 2 * intervals * nearest:
             break
         intervals *= 2
     forced = possible[::intervals]
@@ -243,10 +252,6 @@ class _Curve:
         angle = rotations.angle_between(rotations.normalize(values), truth)
         return 2 * self.radius * np.sin(0.5 * angle)
 
-    def holds(self, start: int, stop: int) -> bool:
-        """Whether one cubic from sample ``start`` to ``stop`` is good enough at all samples between."""
-        return bool(self._segments_hold(np.array([start]), np.array([stop]), np.arange(start + 1, stop)[None]).all())
-
     def holds_steps(self, possible: np.ndarray) -> bool:
         """Whether each single step between possible key times is good enough."""
         inside = possible[:-1, None] + np.arange(1, _FINER)
@@ -266,29 +271,65 @@ class _Curve:
         """Farthest reach from each key, by galloping and bisection; at most one possible step where none is good."""
         chosen = [0]
         if not self.constant:
-            for stop in forced[1:] // _FINER:
-                position = chosen[-1] // _FINER
-                while position < stop:
-                    position += self._reach(position, int(stop))
-                    chosen.append(int(possible[position]))
+            for start, stop in itertools.pairwise((forced // _FINER).tolist()):
+                chosen.extend(possible[self._walk(start, stop)].tolist())
         rows = np.array(chosen)
         slopes = np.zeros_like(self.slopes[rows]) if self.constant else self.slopes[rows]
         return Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())
 
-    def _reach(self, position: int, stop: int) -> int:
-        """Possible steps that one cubic from ``position`` can take, at least 1."""
+    def _walk(self, start: int, stop: int) -> list[int]:
+        """Positions of the keys after one position up to another, ``stop`` included."""
+        taken, position = [], start
+        while position < stop and len(taken) < _ONE_BY_ONE:
+            position += int(self._reaches(np.array([position]), np.array([stop]))[0])
+            taken.append(position)
+        if position == stop:
+            return taken
+        still_needed = (stop - position) * len(taken) // (position - start)
+        bounds = np.linspace(position, stop, 1 + max(1, still_needed // _PER_STRIPE)).astype(np.int64)
+        at, ends = bounds[:-1].copy(), bounds[1:]
+        while len(on := np.flatnonzero(at < ends)):
+            at[on] += self._reaches(at[on], ends[on])
+            taken.extend(at[on].tolist())
+        return self._without_seams(np.array([start, *sorted(set(taken))]), bounds[1:-1])[1:].tolist()
 
-        def good(length: int) -> bool:
-            return self.holds(position * _FINER, (position + length) * _FINER)
+    def _without_seams(self, positions: np.ndarray, seams: np.ndarray) -> np.ndarray:
+        """The positions without those seams that need no key: half of them at a time, which are no neighbours."""
+        parity = 0
+        while len(seams):
+            k = np.searchsorted(positions, seams)
+            tried, parity = k % 2 == parity, 1 - parity
+            rows = k[tried]
+            needless = rows[self._hold(positions[rows - 1], positions[rows + 1])]
+            positions, seams = np.delete(positions, needless), seams[~tried]
+        return positions
 
-        most = stop - position
-        low, high = 1, 2
-        while high <= most and good(high):
-            low, high = high, 2 * high
-        high = min(high, most + 1)
-        if low < most < high and good(most):
-            return most
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if good(middle) else (low, middle)
+    def _hold(self, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
+        """Whether one cubic between two positions is good enough. [n], [n] -> [n] bool"""
+        start, stop = starts * _FINER, stops * _FINER
+        inside = start[:, None] + np.arange(1, max(2, int((stop - start).max(initial=0))))
+        return self._segments_hold(start, stop, np.minimum(inside, stop[:, None] - 1))
+
+    def _reaches(self, positions: np.ndarray, stops: np.ndarray) -> np.ndarray:
+        """Possible steps that one cubic from each position can take up to its stop, at least 1. [n], [n] -> [n]"""
+
+        def good(rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+            return self._hold(positions[rows], positions[rows] + lengths)
+
+        most = stops - positions
+        low, high = np.ones_like(most), np.full_like(most, 2)
+        rows = np.flatnonzero(high <= most)
+        while len(rows):
+            rows = rows[good(rows, high[rows])]
+            low[rows] = high[rows]
+            high[rows] *= 2
+            rows = rows[high[rows] <= most[rows]]
+        high = np.minimum(high, most + 1)
+        rows = np.flatnonzero((low < most) & (most < high))
+        low[rows] = np.where(good(rows, most[rows]), most[rows], low[rows])
+        while len(rows := np.flatnonzero(high - low > 1)):
+            middle = (low[rows] + high[rows]) // 2
+            holds = good(rows, middle)
+            low[rows] = np.where(holds, middle, low[rows])
+            high[rows] = np.where(holds, high[rows], middle)
         return low

@@ -570,6 +570,20 @@ def test_what_lies_in_another_blend_file_is_refused(blender, loaded, tmp_path):
     assert len(blender.data.objects) == count
 
 
+def test_blender_keeps_every_key_however_fast_it_spins(blender, loaded, mug):
+    state = mug.r5dgs_motion
+    state.kind, state.angular_velocity = "ballistic_spin", (0.0, 300.0, per_second(blender, 1e5))
+    assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
+    curves = [curve for name, curve in motions.curves(mug).items() if name[0] == "rotation_quaternion"]
+    keys = np.array([[point.co for point in curve.keyframe_points if point.co[0] > LAST] for curve in curves])
+    assert keys.shape[1] > 15 * 45  # of those that fit into fifteen frames at more than a hundredth of one
+    np.testing.assert_allclose(np.linalg.norm(keys[:, :, 1], axis=0), 1.0, atol=1e-6)
+    model = motions.addon("motion_physics").model(mug)
+    quats, _ = models.evaluate(model, (keys[0, :, 0].astype(np.float64) - LAST) / 60)
+    # The frame of a key is rounded to float32, and 2e3 rad pass in one.
+    assert rotations.angle_between(rotations.normalize(keys[:, :, 1].T), quats).max() < 2e3 * 6e-6
+
+
 @pytest.mark.parametrize("speed", [1e9, 1e30, math.inf])
 def test_speeds_beyond_all_measure_do_no_harm(blender, loaded, mug, speed):
     before = motions.keys(mug, LAST)

@@ -89,6 +89,35 @@ def test_fast_spins_never_step_over_120_degrees():
     assert largest_error(curves, model, np.linspace(0, 2, 3001)) <= 0.5 * SIZE
 
 
+FAST = MotionModel("ballistic_spin", angular_velocity=[0, 100, 900.0], center_offset=[0.2, 0, 0], radius=RADIUS)
+CALM = MotionModel(  # flies straight once its offsets are blended in
+    "translation", velocity=[1, 0, 0], offset_displacement=[3, 2, 1], fade_time=0.02, radius=RADIUS
+)
+
+
+@pytest.mark.parametrize("name, tolerance", [("fast", 1e-4 * SIZE), ("calm", 1e-11 * SIZE)])
+def test_thousands_of_keys_are_as_good_as_few_and_hardly_more_than_one_after_another(name, tolerance, monkeypatch):
+    model = {"fast": FAST, "calm": CALM}[name]
+    curves = reduced(model, tolerance)
+    assert largest_error(curves, model, np.linspace(0, 2, 200_001)) <= 1.001 * tolerance
+    monkeypatch.setattr(keyframes, "_ONE_BY_ONE", 1 << 30)
+    serial = reduced(model, tolerance)
+    assert len(serial.location.times) > 500
+    for striped, one_by_one in ((curves.location, serial.location), (curves.rotation, serial.rotation)):
+        assert (np.diff(striped.times) > 0).all() and striped.times[[0, -1]].tolist() == [0, 2]
+        assert len(one_by_one.times) <= len(striped.times) <= 1.1 * len(one_by_one.times)
+
+
+@pytest.mark.parametrize("t1", [2.0, 0.05, 0.004])
+def test_keys_are_never_nearer_than_is_allowed(t1):
+    curves = reduced(FAST, 1e-6 * SIZE, t1, nearest=0.01)
+    for keys in (curves.location, curves.rotation):
+        assert (np.diff(keys.times) >= min(0.01, t1) - 1e-12).all()
+        assert len(keys.times) >= min(t1 / 0.02, 2)
+    quats, displacements = models.evaluate(FAST, curves.location.times)
+    np.testing.assert_array_equal(curves.location.values, displacements)
+
+
 def test_forced_times_get_a_key():
     curves = reduced(MOTIONS["ballistic, spinning"][0], forced_times=(0.3, 1.7, 5.0))
     for keys in (curves.location, curves.rotation):
