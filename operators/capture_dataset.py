@@ -6,7 +6,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import capture, capture_objects, capture_views, running
+from ..r5dgs_addon import amounts, capture, capture_objects, capture_views, running
 from ..r5dgs_core import errors
 
 
@@ -112,7 +112,9 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
         result = yield from capture.steps(context, self.settings())
         counts = ", ".join(f"{number} {split}" for split, number in result.images.items())
         unseen = [f"No image shows: {', '.join(result.unseen)}"] if result.unseen else []
-        return running.Outcome(f"{result.directory}: {counts} images of {len(result.objects)} objects", unseen)
+        return running.Outcome(
+            f"{result.directory}: {counts} images of {amounts.of(len(result.objects), 'object')}", unseen
+        )
 
 
 CLASSES = (R5DGS_OT_capture_dataset,)

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, motion_exact, objects
+from ..r5dgs_addon import actions, amounts, motion_exact, objects
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -40,7 +40,9 @@ class R5DGS_OT_exact_mode(actions.NeedsScene, bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{count} Gaussians bend; Lock Interface is on, so that renders stay in step")
+        self.report(
+            {"INFO"}, f"{amounts.of(count, 'Gaussian', 'bend')}; Lock Interface is on, so that renders stay in step"
+        )
         return {"FINISHED"}
 
 

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import IntProperty, StringProperty
 
-from ..r5dgs_addon import isolation, prompt, selection, table
+from ..r5dgs_addon import amounts, isolation, prompt, selection, table
 
 
 class R5DGS_OT_isolate(bpy.types.Operator):
@@ -46,7 +46,7 @@ class R5DGS_OT_isolate(bpy.types.Operator):
             return {"CANCELLED"}
         hidden = isolation.isolate(context, wanted)
         shown = ", ".join(table.names(collection)[object_id] for collection, object_id in wanted)
-        self.report({"INFO"}, f"{shown}: {hidden} others hidden; Un-Isolate shows them again")
+        self.report({"INFO"}, f"{shown}: {amounts.of(hidden, 'other')} hidden; Un-Isolate shows all again")
         return {"FINISHED"}
 
 

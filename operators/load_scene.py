@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import displays, keyframes, objects, running
+from ..r5dgs_addon import amounts, displays, keyframes, objects, running
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
@@ -108,12 +108,14 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
-        self.report({"INFO"}, f"{path.name}: {len(scene.means)} Gaussians, {named} objects")
+        self.report({"INFO"}, f"{path.name}: {amounts.of(len(scene.means), 'Gaussian')}, {amounts.of(named, 'object')}")
         if named == 0:
             self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
         if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say
             count = len(scene.residual_rows)
-            self.report({"WARNING"}, f"{count} Gaussians bend while observed; here they move with their group alone")
+            self.report(
+                {"WARNING"}, f"{amounts.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
+            )
         return {"FINISHED"}
 
     def draw(self, context):

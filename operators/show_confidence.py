@@ -3,7 +3,15 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, motion_confidence, motion_extrapolate, motion_objects, motion_physics, objects
+from ..r5dgs_addon import (
+    actions,
+    amounts,
+    motion_confidence,
+    motion_extrapolate,
+    motion_objects,
+    motion_physics,
+    objects,
+)
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -29,7 +37,7 @@ class R5DGS_OT_show_confidence(actions.NeedsScene, bpy.types.Operator):
         shown = [anchor for anchor in selected or everyone if motion_confidence.helper_of(anchor) is not None]
         if self.action == "HIDE" or (self.action == "TOGGLE" and shown):
             count = sum(motion_confidence.hide(anchor) for anchor in shown)
-            self.report({"INFO"}, f"Removed {count} tube{'' if count == 1 else 's'}")
+            self.report({"INFO"}, f"Removed {amounts.of(count, 'tube')}")
             return {"FINISHED"}
         # Shadows go where their casters go: a tube of their own is shown to who asks for it.
         leaders = [a for a in everyone if motion_physics.has_motion(a) and a.r5dgs_motion.leader is None]

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import FloatProperty
 
-from ..r5dgs_addon import motion_objects, motion_simplify
+from ..r5dgs_addon import amounts, motion_objects, motion_simplify
 from ..r5dgs_core import errors
 
 
@@ -33,7 +33,7 @@ class R5DGS_OT_simplify_keys(bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{before} keys became {after}")
+        self.report({"INFO"}, f"{amounts.of(before, 'key')} became {after:,}")
         return {"FINISHED"}
 
 

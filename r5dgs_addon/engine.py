@@ -9,6 +9,7 @@ import bpy
 
 from ..r5dgs_core import errors
 from . import (
+    amounts,
     compat,
     engine_color,
     engine_cryptomatte,
@@ -36,7 +37,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
     _port = None  # what this engine draws in its viewport
     _said = ""
 
-    def update_render_passes(self, scene=None, renderlayer=None):
+    def update_render_passes(self, scene, renderlayer):
         """Tell the compositor which passes there are."""
         for one in engine_passes.of_layer(renderlayer):
             self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
@@ -107,7 +108,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
                 return None
         result, arrays = job.answer()
         milliseconds = result["ms_motion"] + result["ms_raster"]
-        self._say(f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms")
+        self._say(f"{amounts.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms")
         return arrays
 
     def _stopped(self, doing: str) -> bool:

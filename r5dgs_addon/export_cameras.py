@@ -9,7 +9,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import camera_files, cameras, carried
 from ..r5dgs_core.scene.camera_files import View
-from . import export_frames, export_gaussians, objects, timeline, views, visible
+from . import amounts, export_frames, export_gaussians, objects, timeline, views, visible
 from .running import Outcome, Step, Steps
 
 FORMATS = (
@@ -64,7 +64,7 @@ def steps(
             written = camera_files.write_colmap(folder, found)
     except OSError as error:
         raise errors.SceneFileError(f"{folder}: cannot be written: {error}") from error
-    return Outcome(f"{written}: {len(found)} views", notes)
+    return Outcome(f"{written}: {amounts.of(len(found), 'view')}", notes)
 
 
 def image_name(frame: int) -> str:

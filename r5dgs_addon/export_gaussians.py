@@ -10,7 +10,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
-from . import export_frames, look, picture, visible
+from . import amounts, export_frames, look, picture, visible
 from .running import Outcome, Step, Steps
 
 AXES = (
@@ -197,5 +197,5 @@ def ply_steps(
             most, clouds = max(most, len(splats.means)), clouds | set(names)
     if not clouds:
         sources.note("No frame shows anything to export; the files are empty")
-    files = f"{len(frames)} files" if every else path.name
-    return Outcome(f"{files}: {most} Gaussians of {len(clouds)} clouds", sources.notes)
+    files = amounts.of(len(frames), "file") if every else path.name
+    return Outcome(f"{files}: {amounts.of(most, 'Gaussian')} of {amounts.of(len(clouds), 'cloud')}", sources.notes)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import files, image_files
-from . import engine_passes, export_cameras, export_frames, picture, table, views, visible, worker
+from . import amounts, engine_passes, export_cameras, export_frames, picture, table, views, visible, worker
 from .running import Outcome, Step, Steps
 
 LOOK_S = 0.005  # between two looks at the worker
@@ -59,7 +59,7 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
                 files.write(folder / "objects.json", (json.dumps(names, indent=1, ensure_ascii=False) + "\n").encode())
             except OSError as error:
                 raise errors.SceneFileError(f"{folder}: cannot be written: {error}") from error
-    return Outcome(f"{folder}: {len(frames)} frames of {len(names)} objects")
+    return Outcome(f"{folder}: {amounts.of(len(frames), 'frame')} of {amounts.of(len(names), 'object')}")
 
 
 def planes(seen: picture.Shown, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, edited, scene_file
 from ..r5dgs_core.scene.scene import Scene, SceneObject
-from . import export_frames, look, motion_physics, objects, picture, table, timeline, visible
+from . import amounts, export_frames, look, motion_physics, objects, picture, table, timeline, visible
 from .running import Outcome, Step, Steps
 
 TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
@@ -60,12 +60,14 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
     pieces = [piece for member in members for piece in _pieces(member, source)]
     result, notes = edited.edit(source, pieces, when, _table(collection, source, members, names))
-    yield Step(len(when) + 1, len(when) + 2, f"packing {len(result.means):,} Gaussians into {path.name}", slow=True)
+    yield Step(
+        len(when) + 1, len(when) + 2, f"packing {amounts.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
+    )
     scene_file.write(result, path, exact=exact)
     if not _rests(collection):
         notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
     named = sum(item.id > 0 for item in result.objects)
-    return Outcome(f"{path.name}: {len(result.means)} Gaussians, {named} objects", notes)
+    return Outcome(f"{path.name}: {amounts.of(len(result.means), 'Gaussian')}, {amounts.of(named, 'object')}", notes)
 
 
 def _refuse_sources(path: Path) -> None:

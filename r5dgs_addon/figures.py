@@ -5,6 +5,8 @@ from typing import Any
 import bpy
 from bpy.props import FloatProperty, IntProperty, PointerProperty, StringProperty
 
+from . import amounts
+
 
 class R5DGS_PG_figures(bpy.types.PropertyGroup):
     """Figures of the last preview."""
@@ -41,7 +43,7 @@ def errors() -> list[str]:
     figures = bpy.context.window_manager.r5dgs_figures
     lines = [figures.error] if figures.error else []
     if figures.unbent:
-        lines.append(f"{figures.unbent:,} Gaussians bend while observed, shown unbent; see Exact Mode")
+        lines.append(f"{amounts.of(figures.unbent, 'Gaussian', 'bend')} while observed, shown unbent; see Exact Mode")
     return lines
 
 

@@ -16,7 +16,7 @@ from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
-from . import engine_color, engine_settings, picture, views, visible, worker
+from . import amounts, engine_color, engine_settings, picture, views, visible, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by
 LOOK_S = 0.01  # between two looks at the worker
@@ -123,7 +123,7 @@ class Port:
         self._shown = wish, smaller
         if smaller == FULL:
             self._full_ms = milliseconds
-        self._message = f"{result['gaussians']:,} Gaussians in {milliseconds:.0f} ms"
+        self._message = f"{amounts.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms"
 
     def say(self, message: str) -> None:
         """Show a few words at the viewport's corner."""

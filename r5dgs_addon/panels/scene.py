@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import displays, objects, timeline
+from .. import amounts, displays, objects, timeline
 from . import sidebar
 
 
@@ -25,7 +25,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         column = layout.column(align=True)
         named = sum(entry.object_id > 0 for entry in state.table)
         column.label(
-            text=f"{state.scene_name}: {named} objects, {state.gaussians:,} Gaussians", icon="OUTLINER_COLLECTION"
+            text=f"{state.scene_name}: {amounts.of(named, 'object')}, {amounts.of(state.gaussians, 'Gaussian')}",
+            icon="OUTLINER_COLLECTION",
         )
         column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
         if t > times.t_max + 1e-6:
