@@ -110,7 +110,7 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
         s = nearest_knot(times, view.t)
         assert view.mask is not None
         for object_id in np.unique(view.mask):
-            if object_id not in (0, masks.UNKNOWN):
+            if object_id > 0 and object_id != masks.UNKNOWN:
                 sighting = _sight(view, s, int(object_id), min_share)
                 if sighting is not None:
                     found.setdefault(int(object_id), []).append(sighting)
