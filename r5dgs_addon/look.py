@@ -56,7 +56,7 @@ def is_tinted(obj: bpy.types.Object) -> bool:
     return tuple(obj.r5dgs_look.tint) != NONE
 
 
-def recolour(wanted: list[bpy.types.Object], tint) -> list[str]:
+def recolor(wanted: list[bpy.types.Object], tint) -> list[str]:
     """Tint clouds.
 
     Args:

@@ -30,7 +30,7 @@ def color(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
 
 def set_color(entry: bpy.types.PropertyGroup, value) -> None:
     """Tint the object."""
-    look.recolour(table.clouds(entry.id_data, entry.object_id), value)
+    look.recolor(table.clouds(entry.id_data, entry.object_id), value)
 
 
 def tint(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:

@@ -74,7 +74,7 @@ def _draw_active(box, collection, entry):
         box.label(text=f"Motion: {moves}", icon="CON_FOLLOWPATH")
     row = box.row(align=True)
     row.prop(entry, "tint")
-    row.operator("r5dgs.reset_colour", text="", icon="LOOP_BACK")
+    row.operator("r5dgs.reset_color", text="", icon="LOOP_BACK")
     if any(look.is_tinted(cloud) for cloud in table.clouds(collection, entry.object_id)):
         box.label(text="Tinted: previews, renders and exports obey it", icon="COLOR")
     if entry.caption:

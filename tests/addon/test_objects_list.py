@@ -92,8 +92,8 @@ def test_recolouring_takes_all_clouds_of_the_selected_objects(blender, loaded):
     blender.ops.r5dgs.select_by_prompt(text="mug")
     blender.ops.object.duplicate()
     blender.ops.r5dgs.select_by_prompt(text="mug, car")
-    assert not blender.ops.r5dgs.reset_colour.poll()
-    assert blender.ops.r5dgs.recolour(tint=TINT) == {"FINISHED"}
+    assert not blender.ops.r5dgs.reset_color.poll()
+    assert blender.ops.r5dgs.recolor(tint=TINT) == {"FINISHED"}
     look = importlib.import_module("r5dgs.r5dgs_addon.look")
 
     def tinted():
@@ -101,7 +101,7 @@ def test_recolouring_takes_all_clouds_of_the_selected_objects(blender, loaded):
 
     assert tinted() == {"mug", "mug.001", "toy car"}
     blender.ops.r5dgs.select_by_prompt(text="mug")
-    assert blender.ops.r5dgs.reset_colour() == {"FINISHED"}
+    assert blender.ops.r5dgs.reset_color() == {"FINISHED"}
     assert tinted() == {"toy car"}
 
 
@@ -115,7 +115,7 @@ def test_recolouring_can_be_undone_and_redone(blender, loaded):
     blender.ops.r5dgs.select_by_prompt(text="mug")
     blender.ops.ed.undo_push(message="before")
     states = [state()]
-    for call in (lambda: blender.ops.r5dgs.recolour(tint=TINT), blender.ops.r5dgs.reset_colour):
+    for call in (lambda: blender.ops.r5dgs.recolor(tint=TINT), blender.ops.r5dgs.reset_color):
         call()
         blender.ops.ed.undo_push(message="colour")
         states.append(state())
@@ -137,7 +137,7 @@ def test_of_a_linked_scene_only_what_is_kept_here_changes(blender, loaded, tmp_p
     blender.context.scene.collection.children.link(linked)
     assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
     assert {obj.name for obj in blender.context.selected_objects} == {"mug", "mug anchor"}
-    assert blender.ops.r5dgs.recolour(tint=TINT) == {"CANCELLED"}
+    assert blender.ops.r5dgs.recolor(tint=TINT) == {"CANCELLED"}
     assert blender.ops.r5dgs.add_alias(word="beaker") == {"CANCELLED"}
     with pytest.raises(RuntimeError, match="linked"):
         blender.ops.r5dgs.rename_object(new_name="beaker")

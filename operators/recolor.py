@@ -6,10 +6,10 @@ from bpy.props import FloatVectorProperty
 from ..r5dgs_addon import look, selection, table
 
 
-class R5DGS_OT_recolour(bpy.types.Operator):
+class R5DGS_OT_recolor(bpy.types.Operator):
     """Multiply the colors of the selected objects; previews, renders and exports obey it"""
 
-    bl_idname = "r5dgs.recolour"
+    bl_idname = "r5dgs.recolor"
     bl_label = "Recolor"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -33,10 +33,10 @@ class R5DGS_OT_recolour(bpy.types.Operator):
 
     def execute(self, context):
         wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
-        linked = look.recolour(wanted, self.tint)
+        linked = look.recolor(wanted, self.tint)
         if linked:
             self.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
         return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
 
 
-CLASSES = (R5DGS_OT_recolour,)
+CLASSES = (R5DGS_OT_recolor,)

@@ -5,10 +5,10 @@ import bpy
 from ..r5dgs_addon import look, selection, table
 
 
-class R5DGS_OT_reset_colour(bpy.types.Operator):
+class R5DGS_OT_reset_color(bpy.types.Operator):
     """Take the tint off the selected objects"""
 
-    bl_idname = "r5dgs.reset_colour"
+    bl_idname = "r5dgs.reset_color"
     bl_label = "Reset Color"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -21,8 +21,8 @@ class R5DGS_OT_reset_colour(bpy.types.Operator):
 
     def execute(self, context):
         wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
-        look.recolour(wanted, look.NONE)
+        look.recolor(wanted, look.NONE)
         return {"FINISHED"}
 
 
-CLASSES = (R5DGS_OT_reset_colour,)
+CLASSES = (R5DGS_OT_reset_color,)
