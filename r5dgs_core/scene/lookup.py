@@ -19,7 +19,8 @@ from .scene import Scene
 THRESHOLD = 0.5
 EMBEDDING_THRESHOLD = 0.25  # cosine; encoders put unrelated words of one scene below it
 _TYPO_RATIO = 0.75
-_SUGGESTED = 0.5  # least closeness of a word that someone may have meant
+_LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
+_MOST_SLIPS = 3
 _FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
 _HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
 _SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
@@ -113,12 +114,13 @@ def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
         count: Most suggestions.
 
     Returns:
-        The closest word of each object that is close at all, the best first.
+        The closest word of each object that is near, the best first; a word is near that a few slips of the keyboard
+        make of what was typed.
     """
     ranked = []
     for label in labels:
         nearest = max(((_closeness(text, name), name) for name in (label.name, *label.aliases)), key=lambda c: c[0])
-        if nearest[0] >= _SUGGESTED:
+        if nearest[0] > 0:
             ranked.append((-nearest[0], label.object_id, nearest[1]))
     return [name for _, _, name in sorted(ranked)[:count]]
 
@@ -210,13 +212,37 @@ def _similarity(word: str, present: str) -> float:
 
 
 def _closeness(text: str, name: str) -> float:
-    """How alike two texts are, in [0, 1]: the best of their words, or all of them run together."""
+    """How near two texts are, in [0, 1]: the best of their words, or all of them run together; 0 where none is."""
     asked = [word for wish in wishes(text) for word in wish]
     present = words_of(name)
     if not asked or not present:
         return 0.0
     pairs = [(a, b) for a in asked for b in present] + [("".join(asked), "".join(present))]
-    return max(difflib.SequenceMatcher(None, a, b, autojunk=False).ratio() for a, b in pairs)
+    return max(_nearness(a, b) for a, b in pairs)
+
+
+def _nearness(word: str, other: str) -> float:
+    """1 for equal words, less for each slip that makes one of the other; 0 for more slips than their length excuses."""
+    shorter, longer = sorted((len(word), len(other)))
+    excused = min(shorter // _LETTERS_PER_SLIP, _MOST_SLIPS)
+    if longer - shorter > excused:
+        return 0.0
+    slips = edit_distance(word, other)
+    return 1 - slips / longer if slips <= excused else 0.0
+
+
+def edit_distance(word: str, other: str) -> int:
+    """Least number of slips between two words: letters that are too many, missing, wrong, or two that are exchanged."""
+    before: list[int] = []
+    row = list(range(len(other) + 1))
+    for i, letter in enumerate(word, 1):
+        before, last, row = row, before, [i]
+        for j, wanted in enumerate(other, 1):
+            best = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (letter != wanted))
+            if i > 1 and j > 1 and letter == other[j - 2] and word[i - 2] == wanted:
+                best = min(best, last[j - 2] + 1)
+            row.append(best)
+    return row[-1]
 
 
 def _by_meaning(meanings: Meanings, text: str) -> list[Match]:

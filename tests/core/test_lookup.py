@@ -2,6 +2,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from r5dgs_core.scene import lookup
 from tests.scenes import make_scene
@@ -126,7 +128,16 @@ def test_a_sentence_says_what_there_is(scene):
 
 
 @pytest.mark.parametrize(
-    ("text", "meant"), [("bug", ["mug"]), ("aplle tree", ["red apple"]), ("cap", ["cup"]), ("zzz", [])]
+    ("text", "meant"),
+    [
+        ("bug", ["mug"]),
+        ("aplle tree", ["red apple"]),
+        ("cap", ["cup"]),
+        ("muug cpu", ["mug"]),
+        ("zzz", []),
+        ("hippo", []),
+        ("no", []),
+    ],
 )
 def test_what_nothing_matches_may_be_close_to_a_name_or_an_alias(scene, text, meant):
     labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id > 0]
@@ -140,6 +151,31 @@ def test_suggestions_are_the_closest_first_and_no_more_than_wanted():
     labels = [lookup.Label(1, "handle"), lookup.Label(2, "candle"), lookup.Label(3, "sandal"), lookup.Label(4, "rock")]
     assert lookup.suggest(labels, "candel", count=2) == ["candle", "handle"]
     assert lookup.suggest([], "candel") == [] and lookup.suggest(labels, " ?") == []
+
+
+@pytest.mark.parametrize("text", ["the red fruit", "fruit", "putting", "cupboard", "cuttlefish", "hoard game"])
+def test_words_that_merely_share_letters_are_not_suggested(text):
+    names = ("cutting board", "cup", "candle")
+    labels = [lookup.Label(i, name) for i, name in enumerate(names)]
+    near = {"putting": ["cutting board"], "hoard game": ["cutting board"]}
+    assert lookup.suggest(labels, text) == near.get(text, [])
+    said = lookup.explain_nothing(labels, text)
+    assert ("did you mean" in said) == (text in near) and ("the scene has" in said) == (text not in near)
+
+
+@given(st.text("abc", max_size=6), st.text("abc", max_size=6), st.text("abc", max_size=6))
+def test_edit_distance_counts_slips(a, b, c):
+    distance = lookup.edit_distance(a, b)
+    assert distance == lookup.edit_distance(b, a) and (distance == 0) == (a == b)
+    assert abs(len(a) - len(b)) <= distance <= max(len(a), len(b))
+    assert lookup.edit_distance(c + a, c + b) <= distance
+    assert lookup.edit_distance(a, a[:1] + c + a[1:]) <= len(c)
+
+
+def test_each_slip_counts_one():
+    for word in ("aple", "appple", "apble", "appel"):
+        assert lookup.edit_distance(word, "apple") == 1
+    assert lookup.edit_distance("elppa", "apple") == 4 and lookup.edit_distance("", "mug") == 3
 
 
 def test_embeddings_answer_beside_labels_that_were_renamed():
