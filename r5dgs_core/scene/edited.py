@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +120,7 @@ def _groups(
 
 def _meanings(
     scene: Scene, objects: tuple[SceneObject, ...], kept: np.ndarray, object_ids: np.ndarray
-) -> dict[str, np.ndarray | None]:
+) -> dict[str, Any]:
     """Rows of the classifier and of the embeddings for the new table; a new object has those of what it was made of."""
     rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
     for item in objects:
@@ -129,10 +130,13 @@ def _meanings(
     offset = sum(item.id < 0 for item in scene.objects)
     named = [rows[item.id] - offset for item in objects if item.id >= 0]
     weight, bias, embeddings = scene.classifier_weight, scene.classifier_bias, scene.embeddings
+    views, mine = scene.view_embeddings, [rows[item.id] for item in objects]
     return {
         "classifier_weight": None if weight is None else weight[named],
         "classifier_bias": None if bias is None else bias[named],
-        "embeddings": None if embeddings is None else embeddings[[rows[item.id] for item in objects]],
+        "embeddings": None if embeddings is None else embeddings[mine],
+        "view_embeddings": None if views is None else views[mine],
+        "lookup": None if scene.lookup is None else scene.lookup.select(mine),
     }
 
 

@@ -1,7 +1,8 @@
-"""Find objects by words, without any network: names and aliases, and stored embeddings of words that have them.
+"""Find objects by words, without any network: names and aliases first, then what stored embeddings say.
 
 A query is cut into wishes at "and", "," and the like; each wish is compared with every name and alias of the table.
-Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo.
+Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo. A name that says a
+wish whole settles it; other wishes are asked of the embeddings, too (`meanings`), where their words have one.
 """
 
 from __future__ import annotations
@@ -9,15 +10,18 @@ from __future__ import annotations
 import difflib
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from . import meanings as stored
+from .meanings import Meanings
 from .scene import Scene
 
-THRESHOLD = 0.5
-EMBEDDING_THRESHOLD = 0.25  # cosine; encoders put unrelated words of one scene below it
+THRESHOLD = stored.PASS
+Embed = Callable[[str], np.ndarray]  # embedding of a phrase, unit [D]
+_SETTLED = 0.9  # of a name that says the wish whole
 _TYPO_RATIO = 0.75
 _LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
 _MOST_SLIPS = 3
@@ -34,11 +38,15 @@ class Match:
         object_id: Id in the table.
         score: In (0, 1], 1 for its exact name.
         why: In words, such as "name 'mug'" or "alias 'cup', spelled 'cupp'".
+        cosine: Of the embeddings, None for a match by name.
+        relevancy: See `meanings`, None for a match by name and where the file has no canonical phrases.
     """
 
     object_id: int
     score: float
     why: str
+    cosine: float | None = None
+    relevancy: float | None = None
 
 
 @dataclass(frozen=True)
@@ -50,59 +58,46 @@ class Label:
     aliases: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Meanings:
-    """Embeddings that a scene stores, by which words find objects that are called otherwise.
-
-    Attributes:
-        object_ids: Ids of the M objects, in the order of ``embeddings``.
-        embeddings: One row per object, unit. [M, D]
-        vocabulary: The V words with an embedding.
-        vocabulary_embeddings: One row per word, unit. [V, D]
-    """
-
-    object_ids: tuple[int, ...]
-    embeddings: np.ndarray
-    vocabulary: tuple[str, ...]
-    vocabulary_embeddings: np.ndarray
-
-    @classmethod
-    def of(cls, scene: Scene) -> Meanings | None:
-        """Those of a scene; None where it stores none."""
-        if scene.embeddings is None or scene.vocabulary_embeddings is None:
-            return None
-        ids = tuple(item.id for item in scene.objects)
-        return cls(ids, scene.embeddings, scene.vocabulary, scene.vocabulary_embeddings)
-
-
-def search(scene: Scene, text: str, threshold: float = THRESHOLD) -> list[Match]:
-    """Objects that a text names, best first.
+def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed | None = None) -> list[Match]:
+    """Objects that a text names or means, best first.
 
     Args:
         scene: The scene; its stored embeddings are used for words that its vocabulary holds.
         text: One or several names: "red mug", "mugs and lemon".
         threshold: Least score that counts as a match.
+        embed: Gives the embedding of other words, by the encoder that made the scene's.
 
     Returns:
         Matches with score >= threshold, ranked by score, then by id; empty where nothing matches.
     """
     labels = [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
-    return search_labels(labels, text, threshold, Meanings.of(scene))
+    return search_labels(labels, text, threshold, Meanings.of(scene), embed)
 
 
 def search_labels(
-    labels: Sequence[Label], text: str, threshold: float = THRESHOLD, meanings: Meanings | None = None
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
 ) -> list[Match]:
     """As `search`, on names and aliases, and on stored embeddings where they are given."""
-    found = [match for wish in wishes(text) for label in labels if (match := _match(label, wish)) is not None]
-    if meanings is not None:
-        known = {label.object_id for label in labels}
-        found += [match for match in _by_meaning(meanings, text) if match.object_id in known]
     best: dict[int, Match] = {}
-    for match in found:
-        if match.score >= threshold and (match.object_id not in best or match.score > best[match.object_id].score):
-            best[match.object_id] = match
+    for said, wish in _parts(text):
+        for match in _fulfil(labels, said, wish, meanings, embed):
+            if match.score >= threshold and (match.object_id not in best or match.score > best[match.object_id].score):
+                best[match.object_id] = match
     return _ranked(best.values())
+
+
+def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
+    """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
+    return [
+        said
+        for said, wish in _parts(text)
+        if not any(match.score >= _SETTLED for match in _named(labels, wish))
+        and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
+    ]
 
 
 def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
@@ -136,13 +131,13 @@ def explain_nothing(labels: Sequence[Label], text: str) -> str:
 
 def wishes(text: str) -> list[list[str]]:
     """Words of each thing that a text asks for, normalised, fillers left out."""
-    result = []
-    for part in _SPLIT.split(text):
-        words = words_of(part)
-        kept = [word for word in words if word not in _FILLER] or words
-        if kept:
-            result.append(kept)
-    return result
+    return [words for _, words in _parts(text)]
+
+
+def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
+    """Row of the first word of a vocabulary that says a wish, None for none."""
+    wanted = list(wish)
+    return next((row for row, word in enumerate(vocabulary) if [wanted] == wishes(word)), None)
 
 
 def words_of(text: str) -> list[str]:
@@ -162,6 +157,51 @@ def singular(word: str) -> str:
     if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")):
         return word[:-1]
     return word
+
+
+def _parts(text: str) -> list[tuple[str, list[str]]]:
+    """Each thing that a text asks for: as it was said, and its words as in `wishes`."""
+    result = []
+    for part in _SPLIT.split(text):
+        words = words_of(part)
+        kept = [word for word in words if word not in _FILLER] or words
+        if kept:
+            result.append((part.strip(), kept))
+    return result
+
+
+def _fulfil(
+    labels: Sequence[Label], said: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
+) -> list[Match]:
+    """Everything that fits one wish at all."""
+    named = _named(labels, wish)
+    if meanings is None or any(match.score >= _SETTLED for match in named):
+        return named
+    row = vocabulary_row(meanings.vocabulary, wish)
+    if row is None and embed is None:
+        return named
+    query = embed(said) if row is None and embed is not None else meanings.vocabulary_embeddings[row or 0]
+    known = {label.object_id: label for label in labels}
+    meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
+    if row is not None:  # a word of its own is neither a typo nor the beginning of another: "car" is no "cart"
+        fitting = {one.object_id for one in meant if one.score >= stored.PASS}
+        named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
+    return [*named, *(_by_meaning(one, said) for one in meant)]
+
+
+def _by_meaning(one: stored.Meant, said: str) -> Match:
+    sure = "" if one.relevancy is None else f", relevancy {one.relevancy:.2f}"
+    why = f"meaning of {said!r} (cosine {one.cosine:.2f}{sure})"
+    return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
+
+
+def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
+    return [match for label in labels if (match := _match(label, wish)) is not None]
+
+
+def _ends_with(label: Label, word: str) -> bool:
+    """Whether a word is the end of one of a name: a chessboard is a board."""
+    return any(present.endswith(word) for name in (label.name, *label.aliases) for present in words_of(name))
 
 
 def _ranked(matches: Iterable[Match]) -> list[Match]:
@@ -243,20 +283,3 @@ def edit_distance(word: str, other: str) -> int:
                 best = min(best, last[j - 2] + 1)
             row.append(best)
     return row[-1]
-
-
-def _by_meaning(meanings: Meanings, text: str) -> list[Match]:
-    """Cosine between the stored embedding of a known word and those of the objects, rescaled to a score."""
-    rows = {tuple(words_of(word)): i for i, word in enumerate(meanings.vocabulary)}
-    objects = np.asarray(meanings.embeddings, np.float64)
-    matches = []
-    for wish in wishes(text):
-        row = rows.get(tuple(wish))
-        if row is None:
-            continue
-        cosines = objects @ np.asarray(meanings.vocabulary_embeddings[row], np.float64)
-        for object_id, cosine in zip(meanings.object_ids, cosines, strict=True):
-            if object_id >= 0 and cosine >= EMBEDDING_THRESHOLD:
-                score = 0.5 + 0.45 * (float(min(cosine, 1.0)) - EMBEDDING_THRESHOLD) / (1 - EMBEDDING_THRESHOLD)
-                matches.append(Match(object_id, score, f"meaning of {meanings.vocabulary[row]!r} ({cosine:.2f})"))
-    return matches

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..motion.models import MotionModel
 from .cameras import Camera
+from .meanings import Table
 
 ROLES = ("pinned", "body", "shadow")
 IDENTITY_DIM = 16  # numbers of an identity encoding (Gaussian Grouping)
@@ -117,9 +118,13 @@ class Scene:
         shading_rest: That factor in the bind state; None where it is 1 for all. A Gaussian that is unlit at t_max has
             one below 0. [N] float32 or None
         light_direction: l above, unit, world. [3]
-        embeddings: One row per object of ``objects``, unit. [M, D] or None
+        embeddings: One row per object of ``objects``, unit, zero for one without. [M, D] or None
         vocabulary: Words with stored embeddings.
-        vocabulary_embeddings: One row per word, unit. [V, D] or None
+        vocabulary_embeddings: One row per word, unit. [W, D] or None
+        lookup: What made the embeddings and what they are worth; None where nobody said.
+        canonical_embeddings: One row per phrase of ``lookup.canonical``, unit. [C, D] or None
+        view_embeddings: Of each object, one row per view of ``lookup.views``, unit, zero past its last. [M, V, D] or
+            None
         provenance: Configuration, data hash, versions.
         needs: The needs table: rows of ``name, value, threshold, decision, reason``.
         near_plane: Gaussians whose centre lies nearer than this depth are not drawn, as in training; world units.
@@ -159,6 +164,9 @@ class Scene:
     embeddings: np.ndarray | None = None
     vocabulary: tuple[str, ...] = ()
     vocabulary_embeddings: np.ndarray | None = None
+    lookup: Table | None = None
+    canonical_embeddings: np.ndarray | None = None
+    view_embeddings: np.ndarray | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     needs: tuple[dict[str, Any], ...] = ()
     near_plane: float = NEAR_PLANE

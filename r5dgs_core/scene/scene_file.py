@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from . import files, lookup, playback, scene_json, validation
+from . import files, meanings, playback, scene_json, validation
 from .scene import Scene
 
 FORMAT = "r5dgs scene"
@@ -55,6 +55,8 @@ _MEMORY_DTYPES: dict[str, type] = {
     "shading_rest": np.float32,
     "embeddings": np.float32,
     "vocabulary_embeddings": np.float32,
+    "canonical_embeddings": np.float32,
+    "view_embeddings": np.float32,
 }
 _TRACKS = ("track_times", "track_poses")  # left out where nothing moves
 _OPTIONAL = (
@@ -72,6 +74,8 @@ _OPTIONAL = (
     "shading_rest",
     "embeddings",
     "vocabulary_embeddings",
+    "canonical_embeddings",
+    "view_embeddings",
 )
 _STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in _MEMORY_DTYPES.items()}
 for _name in FIXED_POINT:
@@ -113,26 +117,24 @@ def read(path: str | Path) -> Scene:
     return scene
 
 
-def read_meanings(path: str | Path) -> lookup.Meanings | None:
+def read_meanings(path: str | Path) -> meanings.Meanings | None:
     """Only the stored embeddings of a scene, None where it has none. Raises as `read` does."""
     place = str(path)
     with _open(Path(path)) as archive:
         data = _read_json(archive, place)
         json_place = f"{place}: {JSON_MEMBER}"
         listed = scene_json.words(data, "arrays", json_place)
-        objects, words = (
-            _read_array(archive, name, place, name in listed) for name in ("embeddings", "vocabulary_embeddings")
-        )
-        if objects is None or words is None:
-            return None
-        ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
-        vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
-    if len(objects) != len(ids) or len(words) != len(vocabulary) or objects.shape[1:] != words.shape[1:]:
-        raise errors.SceneFileError(
-            f"{place}: expected embeddings of {len(ids)} objects and {len(vocabulary)} words of one length, found "
-            f"shapes {objects.shape} and {words.shape}"
-        )
-    return lookup.Meanings(ids, objects, vocabulary, words)
+        arrays = {name: _read_array(archive, name, place, name in listed) for name in validation.EMBEDDINGS}
+    objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
+    if objects is None or words is None:
+        return None
+    ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
+    vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
+    table = scene_json.table(data, json_place)
+    validation.check_meanings(arrays, len(ids), len(vocabulary), table, place)
+    return meanings.Meanings(
+        ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"]
+    )
 
 
 def _open(path: Path) -> zipfile.ZipFile:
@@ -181,6 +183,7 @@ def info(scene: Scene) -> dict[str, Any]:
         "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),
         "modes": list(playback.modes(scene)),
         "vocabulary": len(scene.vocabulary),
+        "lookup": None if scene.lookup is None else f"{scene.lookup.encoder.kind} {scene.lookup.encoder.name}",
         "needs": list(scene.needs),
     }
 

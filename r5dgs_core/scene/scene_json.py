@@ -12,6 +12,7 @@ import numpy as np
 from .. import __version__, errors
 from ..motion.models import MotionModel
 from .cameras import Camera
+from .meanings import POOLINGS, EncoderCard, Table, View
 from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 
@@ -68,6 +69,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         ],
         "light_direction": None if light is None else np.asarray(light, np.float64).tolist(),
         "vocabulary": list(scene.vocabulary),
+        **({} if scene.lookup is None else {"lookup": _table_tree(scene.lookup)}),
         "provenance": scene.provenance,
         "needs": list(scene.needs),
     }
@@ -87,11 +89,40 @@ def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
         "cameras": tuple(each(data, "cameras", _read_camera, place)),
         "light_direction": None if light is None else numbers(data, "light_direction", (3,), place),
         "vocabulary": tuple(words(data, "vocabulary", place)),
+        "lookup": table(data, place),
         "provenance": get(data, "provenance", dict, place),
         "needs": tuple(each(data, "needs", lambda row, place: dict(row), place)),
         "near_plane": get(data, "near_plane", float, place) if "near_plane" in data else NEAR_PLANE,
         "harmonics_turn": get(data, "harmonics_turn", bool, place) if "harmonics_turn" in data else True,
     }
+
+
+def table(data: dict[str, Any], place: str) -> Table | None:
+    """What is said about the embeddings, None in files that say nothing. Raises as `fields` does."""
+    if data.get("lookup") is None:
+        return None
+    found, place = get(data, "lookup", dict, place), f"{place}: lookup"
+    encoder = get(found, "encoder", dict, place)
+    card = EncoderCard(
+        kind=get(encoder, "kind", str, place),
+        name=get(encoder, "name", str, place),
+        digest=get(encoder, "digest", str, place),
+        dimension=get(encoder, "dimension", int, place),
+        templates=tuple(words(encoder, "templates", place)),
+        scale=get(encoder, "scale", float, place),
+    )
+    pooling = get(found, "pooling", str, place)
+    if pooling not in POOLINGS:
+        raise errors.SceneFileError(f"{place}: pooling: expected one of {POOLINGS}, found {pooling!r}")
+    rows = each(found, "objects", lambda row, place: row, place)
+    return Table(
+        encoder=card,
+        canonical=tuple(words(found, "canonical", place)),
+        views=tuple(tuple(each(row, "views", _read_view, place)) for row in rows),
+        thresholds=tuple(None if row.get("threshold") is None else get(row, "threshold", float, place) for row in rows),
+        margin=get(found, "margin", float, place),
+        pooling=pooling,
+    )
 
 
 def get(data: dict[str, Any], key: str, kind: type, place: str) -> Any:
@@ -168,6 +199,44 @@ def _read_group(row: dict[str, Any], place: str) -> MotionGroup:
         rigid_max=get(row, "rigid_max", float, place),
         seen=None if row.get("seen") is None else _interval(numbers(row, "seen", (2,), place)),
     )
+
+
+def _read_view(row: dict[str, Any], place: str) -> View:
+    left, top, right, bottom = (0.0,) * 4 if row.get("box") is None else numbers(row, "box", (4,), place).tolist()
+    return View(
+        source=get(row, "source", str, place),
+        threshold=get(row, "threshold", float, place),
+        t=None if row.get("t") is None else get(row, "t", float, place),
+        box=None if row.get("box") is None else (left, top, right, bottom),
+    )
+
+
+def _table_tree(found: Table) -> dict[str, Any]:
+    """JSON form of what `table` reads."""
+    card = found.encoder
+    return {
+        "encoder": {
+            "kind": card.kind,
+            "name": card.name,
+            "digest": card.digest,
+            "dimension": card.dimension,
+            "templates": list(card.templates),
+            "scale": float(card.scale),
+        },
+        "canonical": list(found.canonical),
+        "margin": float(found.margin),
+        "pooling": found.pooling,
+        "objects": [
+            {"threshold": None if threshold is None else float(threshold), "views": [_view_tree(v) for v in views]}
+            for threshold, views in zip(found.thresholds, found.views, strict=True)
+        ],
+    }
+
+
+def _view_tree(view: View) -> dict[str, Any]:
+    place = {} if view.box is None else {"box": [float(edge) for edge in view.box]}
+    when = {} if view.t is None else {"t": float(view.t)}
+    return {"source": view.source, "threshold": float(view.threshold), **when, **place}
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:

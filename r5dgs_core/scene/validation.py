@@ -11,10 +11,12 @@ import numpy as np
 
 from .. import errors
 from . import cameras
+from .meanings import Table
 from .playback import runs
 from .scene import IDENTITY_DIM, ROLES, MotionGroup, Scene
 
 SH_BASES = (1, 4, 9, 16)
+EMBEDDINGS = ("embeddings", "vocabulary_embeddings", "canonical_embeddings", "view_embeddings")
 _UNIT_TOLERANCE = 1e-3
 
 
@@ -51,8 +53,6 @@ def check(scene: Scene, place: str) -> None:
         "shading": ((count, 3), np.float32),
         "shading_rest": ((count,), np.float32),
         "light_direction": ((3,), None),
-        "embeddings": ((len(scene.objects), None), None),
-        "vocabulary_embeddings": ((len(scene.vocabulary), None), None),
     }
     for name, (shape, dtype) in expected.items():
         array = getattr(scene, name)
@@ -69,6 +69,8 @@ def check(scene: Scene, place: str) -> None:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             bad = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(-1))[0])
             _fail(place, name, "finite numbers", f"NaN or infinity in row {bad}")
+    stored = {name: getattr(scene, name) for name in EMBEDDINGS}
+    check_meanings(stored, len(scene.objects), len(scene.vocabulary), scene.lookup, place)
     if (scene.classifier_weight is None) != (scene.classifier_bias is None):
         _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
     stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
@@ -92,6 +94,57 @@ def check(scene: Scene, place: str) -> None:
             _fail(place, f"camera {camera.name!r}", "a rigid T_cam_world", "scale, shear or mirror")
         if camera.width < 1 or camera.height < 1:
             _fail(place, f"camera {camera.name!r}", "a positive size", f"{camera.width} x {camera.height}")
+
+
+def check_meanings(
+    arrays: dict[str, np.ndarray | None], objects: int, words: int, table: Table | None, place: str
+) -> None:
+    """Raise `SceneFileError` where stored embeddings do not fit each other, the objects or what is said about them.
+
+    Args:
+        arrays: `EMBEDDINGS` by name.
+        objects: Rows of the table of objects.
+        words: Words of the vocabulary.
+        table: What is said about the embeddings.
+        place: For messages.
+    """
+    lengths = {array.shape[-1] for array in arrays.values() if array is not None and array.ndim}
+    if table is not None:
+        lengths.add(table.encoder.dimension)
+        absent = [name for name, array in arrays.items() if array is None]
+        if absent:
+            _fail(place, absent[0], "an array beside 'lookup'", "none")
+    elif any(arrays[name] is not None for name in ("canonical_embeddings", "view_embeddings")):
+        _fail(place, "lookup", "an entry beside 'canonical_embeddings' and 'view_embeddings'", "none")
+    if len(lengths) > 1:
+        _fail(place, "embeddings", "vectors of one length", sorted(lengths))
+    canonical = 0 if table is None else len(table.canonical)
+    views = arrays["view_embeddings"]
+    most = 0 if views is None or views.ndim < 2 else views.shape[1]
+    shapes = {
+        "embeddings": (objects, None),
+        "vocabulary_embeddings": (words, None),
+        "canonical_embeddings": (canonical, None),
+        "view_embeddings": (objects, most, None),
+    }
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array is None:
+            continue
+        if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+            _fail(place, name, f"shape {shape}", array.shape)
+        if not np.isfinite(array).all():
+            _fail(place, name, "finite numbers", "NaN or infinity")
+    if table is None:
+        return
+    if len(table.views) != objects or any(len(own) > most for own in table.views):
+        _fail(place, "lookup", f"{objects} objects of at most {most} views", [len(own) for own in table.views])
+    thresholds = [each for each in table.thresholds if each is not None]
+    thresholds += [view.threshold for own in table.views for view in own]
+    if not all(np.isfinite(each) for each in (*thresholds, table.margin, table.encoder.scale)):
+        _fail(place, "lookup", "finite thresholds, margin and scale", "others")
+    if any("{}" not in template for template in table.encoder.templates):
+        _fail(place, "lookup", "templates with '{}' for the phrase", table.encoder.templates)
 
 
 def _fail(place: str, member: str, expected: str, found: object) -> None:

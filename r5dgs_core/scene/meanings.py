@@ -1,0 +1,217 @@
+"""What stored embeddings say about words: which objects a phrase means, how surely, and that it means none.
+
+Notation: M objects, V views of an object at most, D numbers of an embedding, W words, C canonical phrases. An embedding
+e of an object answers a phrase q by its cosine e . q, and by the relevancy of LERF, the least over the canonical
+phrases c of exp(s e . q) / (exp(s e . q) + exp(s e . c)).
+
+What a cosine is worth differs from encoder to encoder and from object to object, so each embedding has a threshold of
+its own, calibrated where the table is made (`semantics.calibration`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .scene import Scene
+
+POOLINGS = ("mean", "max")
+UNCALIBRATED = 0.25  # threshold of a file that says nothing about its encoder
+PASS = 0.5  # score at the threshold
+_BEST = 0.95  # score of relevancy 1: below a name's
+_BESIDE = 0.4  # most of an object that fits far worse than another
+
+
+@dataclass(frozen=True)
+class EncoderCard:
+    """Which encoder made the embeddings, and how.
+
+    Attributes:
+        kind: "clip", "siglip", "open_clip" or "text".
+        name: Name of its folder, for people.
+        digest: SHA-256 of its weights, hexadecimal: queries have to come from the same ones.
+        dimension: D.
+        templates: Sentences with "{}" for the phrase; a phrase is the mean over them.
+        scale: s above.
+    """
+
+    kind: str
+    name: str
+    digest: str
+    dimension: int
+    templates: tuple[str, ...]
+    scale: float = 10.0
+
+    @property
+    def sees(self) -> bool:
+        """Whether it looks at pixels."""
+        return self.kind != "text"
+
+
+@dataclass(frozen=True)
+class View:
+    """What one embedding of an object was made of.
+
+    Attributes:
+        source: Name of the camera, or the phrase.
+        threshold: Least cosine of a match with this embedding.
+        t: Scene time of the picture, None for a phrase.
+        box: What was cut out: left, top, right, bottom in pixels of that camera, None for a phrase.
+    """
+
+    source: str
+    threshold: float
+    t: float | None = None
+    box: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """What a scene stores about its embeddings, beside the numbers.
+
+    Attributes:
+        encoder: What made them.
+        canonical: The C phrases that everything is compared with.
+        views: Of each object of the scene's table, its views, the rows of `Scene.view_embeddings`; none for an object
+            that has no embedding.
+        thresholds: Least cosine of a match with each object's embedding, None for an object without.
+        margin: How far below the best cosine others still match.
+        pooling: What answers: "mean", the object's embedding, or "max", the best of its views.
+    """
+
+    encoder: EncoderCard
+    canonical: tuple[str, ...]
+    views: tuple[tuple[View, ...], ...]
+    thresholds: tuple[float | None, ...]
+    margin: float
+    pooling: str
+
+    def select(self, rows: Sequence[int]) -> Table:
+        """The table for other objects, each by the row that it had."""
+        return replace(
+            self,
+            views=tuple(self.views[row] for row in rows),
+            thresholds=tuple(self.thresholds[row] for row in rows),
+        )
+
+
+@dataclass(frozen=True)
+class Meanings:
+    """Embeddings that a scene stores, by which words find objects that are called otherwise.
+
+    Attributes:
+        object_ids: Ids of the M objects, in the order of ``embeddings``.
+        embeddings: One row per object, unit, zero for an object without. [M, D]
+        vocabulary: The W words with an embedding.
+        vocabulary_embeddings: One row per word, unit. [W, D]
+        table: What is known about them, None in files that say nothing.
+        canonical_embeddings: One row per canonical phrase, unit. [C, D] or None
+        view_embeddings: Of each object, one row per view, unit, zero past the last. [M, V, D] or None
+    """
+
+    object_ids: tuple[int, ...]
+    embeddings: np.ndarray
+    vocabulary: tuple[str, ...]
+    vocabulary_embeddings: np.ndarray
+    table: Table | None = None
+    canonical_embeddings: np.ndarray | None = None
+    view_embeddings: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, scene: Scene) -> Meanings | None:
+        """Those of a scene; None where it stores none."""
+        if scene.embeddings is None or scene.vocabulary_embeddings is None:
+            return None
+        return cls(
+            tuple(item.id for item in scene.objects),
+            scene.embeddings,
+            scene.vocabulary,
+            scene.vocabulary_embeddings,
+            scene.lookup,
+            scene.canonical_embeddings,
+            scene.view_embeddings,
+        )
+
+
+@dataclass(frozen=True)
+class Meant:
+    """How well one object fits a phrase.
+
+    Attributes:
+        object_id: Id in the table.
+        score: In [0, 0.95]; from `PASS` on it is a match.
+        cosine: Of the embedding that answers with that of the phrase.
+        relevancy: See the module, None where no canonical phrases are stored.
+    """
+
+    object_id: int
+    score: float
+    cosine: float
+    relevancy: float | None
+
+
+def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
+    """How well each object that has an embedding fits a phrase, the best first.
+
+    An object whose cosine is more than the table's margin below the best one's is no match beside that one.
+
+    Args:
+        meanings: What the scene stores.
+        query: Embedding of the phrase, unit. [D]
+    """
+    answers = [one for row in range(len(meanings.object_ids)) if (one := _answer(meanings, row, query)) is not None]
+    table = meanings.table
+    if table is not None and answers:
+        least = max(one.cosine for one in answers) - table.margin
+        answers = [one if one.cosine >= least else replace(one, score=min(one.score, _BESIDE)) for one in answers]
+    return sorted(answers, key=lambda one: (-round(one.score, 6), -one.cosine, one.object_id))
+
+
+def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
+    """LERF's, of a cosine with a phrase beside those with the canonical ones. canonical: [C]"""
+    return float(1.0 / (1.0 + np.exp(-scale * (cosine - float(np.max(canonical))))))
+
+
+def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
+    rows, thresholds = _rows(meanings, row)
+    if len(rows) == 0:
+        return None
+    cosines = rows @ np.asarray(query, np.float64)
+    table, canonical = meanings.table, meanings.canonical_embeddings
+    if table is None or canonical is None or len(canonical) == 0:
+        passed, certain = cosines - thresholds, 1 - thresholds
+        scores = np.where(passed >= 0, PASS + (_BEST - PASS) * passed / certain, PASS * cosines / thresholds)
+        best = int(np.argmax(scores))
+        return Meant(meanings.object_ids[row], _bounded(scores[best]), float(cosines[best]), None)
+    answers = []
+    for cosine, threshold, beside in zip(cosines, thresholds, rows @ canonical.astype(np.float64).T, strict=True):
+        found, least = (relevancy(value, beside, table.encoder.scale) for value in (cosine, threshold))
+        if found >= least:
+            score = PASS + (_BEST - PASS) * (found - least) / max(1 - least, 1e-9)
+        else:
+            score = PASS * found / least
+        answers.append(Meant(meanings.object_ids[row], _bounded(score), float(cosine), found))
+    return max(answers, key=lambda one: one.score)
+
+
+def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """The embeddings that answer for an object and their thresholds; none where it has none. [R, D], [R]"""
+    table, views = meanings.table, meanings.view_embeddings
+    if table is None:
+        own = np.asarray(meanings.embeddings[row], np.float64)[None]
+        return (own if own.any() else own[:0]), np.full(int(own.any()), UNCALIBRATED)
+    threshold = table.thresholds[row]
+    if threshold is None:
+        return np.zeros((0, table.encoder.dimension)), np.zeros(0)
+    if table.pooling == "max" and views is not None and table.views[row]:
+        count = len(table.views[row])
+        return np.asarray(views[row, :count], np.float64), np.array([view.threshold for view in table.views[row]])
+    return np.asarray(meanings.embeddings[row], np.float64)[None], np.array([threshold])
+
+
+def _bounded(score: float) -> float:
+    return float(min(max(score, 0.0), _BEST))
