@@ -7,44 +7,16 @@
 not come, F12 is not the worker's own, or something goes on after the file is closed.
 """
 
-import importlib
-import importlib.util
-import os
 import sys
 import time
-import traceback
 from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Quaternion
 
-ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 240.0  # the first picture may have to compile the rasterizer
-STEP_S = 0.02
-
-
-def register() -> str:
-    """Register the extension that this file lies in; returns its package."""
-    spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["r5dgs"] = module
-    spec.loader.exec_module(module)
-    module.register()
-    return "r5dgs"
-
-
-def service(name: str):
-    """A module of the add-on."""
-    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
-
-
-def wait(condition, what: str):
-    """Let Blender go on until a condition holds."""
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end, f"{what}: nothing within {PATIENCE_S:g} s"
-        yield STEP_S
+sys.path.insert(0, str(Path(__file__).parent))
+from window import STEP_S, run, service, wait  # noqa: E402
 
 
 def full_picture():
@@ -121,26 +93,5 @@ def pixels(image: bpy.types.Image) -> np.ndarray:
     return values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
 
 
-def main(path: str) -> None:
-    """Run the check from a timer, and end Blender with its outcome."""
-    bpy.context.preferences.view.show_splash = False
-    register()
-    steps = checks(path)
-
-    def step():
-        try:
-            return next(steps)
-        except StopIteration:
-            code = 0
-        except BaseException:
-            traceback.print_exc()
-            code = 1
-        service("worker").stop()
-        sys.stderr.flush()
-        os._exit(code)  # quitting would end with 0
-
-    bpy.app.timers.register(step, first_interval=1.0, persistent=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[sys.argv.index("--") + 1])
+    run(checks, sys.argv[sys.argv.index("--") + 1])

@@ -1,0 +1,240 @@
+"""Check in Blender's window what a user does with keys and mouse: load, undo, type, click, and stop long work by Esc.
+
+    xvfb-run -a -s "-screen 0 1280x800x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1280 800 \\
+        --python tests/blender/check_window.py -- SCENE.r5dgs [CHECK ...]
+
+Needs ``xdotool``, and a worker's Python (`R5DGS_PYTHON`) where that is not found by itself. Each check is a function
+named below, of which some may be asked for. Ends with exit code 1 where one fails.
+"""
+
+import inspect
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy_extras import view3d_utils
+
+sys.path.insert(0, str(Path(__file__).parent))
+import window as w  # noqa: E402
+
+SIDEBAR = "R5DGS"
+
+
+def loaded():
+    """Collections of loaded scenes."""
+    return [collection for collection in bpy.data.collections if collection.r5dgs.is_scene]
+
+
+def load(path: Path) -> None:
+    """Load the scene where none is loaded."""
+    if not loaded():
+        with w.inside():
+            bpy.ops.r5dgs.load_scene(filepath=str(path))
+
+
+def nothing_runs() -> bool:
+    """Whether no operator waits for events, and no job for the worker."""
+    return not w.main_window().modal_operators and not w.service("worker").busy()
+
+
+def choose(folder: Path, name: str = ""):
+    """Choose a file or folder in the open file browser, by Enter."""
+    yield from w.wait(lambda: any(area.type == "FILE_BROWSER" for area in w.main_window().screen.areas), "browser")
+    yield 0.5
+    params = w.area_of("FILE_BROWSER").spaces.active.params
+    if params.directory != str(folder).encode() + b"/":
+        params.directory = str(folder).encode() + b"/"
+    if name:
+        params.filename = name
+    yield 0.5
+    yield from w.hover(w.region_of(w.area_of("FILE_BROWSER")))
+    yield from w.press("Return")
+
+
+def browsing(path: Path, folder: Path):
+    """The file browser and a drop load a scene; Ctrl+Z takes it back, Ctrl+Shift+Z brings it again."""
+    with w.inside():
+        bpy.ops.r5dgs.load_scene("INVOKE_DEFAULT")
+    yield from choose(path.parent, path.name)
+    yield from w.wait(loaded, "loading from the file browser")
+    assert nothing_runs()
+    yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
+    yield from w.press("ctrl+z")
+    assert not loaded() and not bpy.data.pointclouds, "Ctrl+Z left something"
+    yield from w.press("ctrl+shift+z")
+    assert len(loaded()) == 1, "Ctrl+Shift+Z did not bring the scene back"
+    yield from w.press("ctrl+z")
+    with w.inside():  # what Blender calls where a file is dropped
+        bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=str(path.parent), files=[{"name": path.name}])
+    yield 1.0
+    assert len(loaded()) == 1, "a drop loaded nothing"
+
+
+def typing(path: Path, folder: Path):
+    """A prompt that is typed into the sidebar's field is asked on Enter."""
+    area = w.area_of("VIEW_3D")
+    area.spaces.active.show_region_ui = True
+    yield 0.5
+    sidebar = w.region_of(area, "UI")
+    sidebar.active_panel_category = SIDEBAR
+    yield 1.0
+    session = bpy.context.window_manager.r5dgs_words
+    name = next(entry.name for entry in loaded()[0].r5dgs.table if entry.object_id > 0)
+    for y in range(sidebar.height - 8, 0, -8):
+        yield from w.hover(sidebar, 0.35 * sidebar.width, y)
+        with w.inside(region="UI"):
+            found = bpy.context.property
+        if found is not None and found[1] == "prompt":
+            break
+    else:
+        raise AssertionError("the sidebar shows no field for a prompt")
+    yield from w.click()
+    yield from w.write(name)
+    yield from w.press("Return")
+    assert session.prompt == session.asked == name, (session.prompt, session.asked)
+    assert session.matches[0].name == name, [match.name for match in session.matches]
+
+
+def clicking(path: Path, folder: Path):
+    """A click on Gaussians selects the anchor that moves them."""
+    area = w.area_of("VIEW_3D")
+    region, view = w.region_of(area), area.spaces.active.region_3d
+    with w.inside():
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.view3d.view_all()
+    yield 1.0
+    hits = {}
+    clouds = [obj for obj in loaded()[0].all_objects if obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id > 0]
+    for cloud in clouds:
+        if cloud.r5dgs.object_id in hits:
+            continue
+        places = np.empty(3 * len(cloud.data.points), np.float32)
+        cloud.data.attributes["position"].data.foreach_get("vector", places)
+        middle = cloud.matrix_world @ cloud.data.points[0].co.__class__(np.median(places.reshape(-1, 3), axis=0))
+        pixel = view3d_utils.location_3d_to_region_2d(region, view, middle)
+        yield from w.hover(region, *pixel)
+        yield from w.click()
+        yield 0.0  # timers run before those who hear of changes
+        active = bpy.context.view_layer.objects.active
+        assert active.r5dgs.role != "CLOUD", f"{active.name}: not its anchor"
+        hits[cloud.r5dgs.object_id] = active == cloud.parent
+    print(f"clicks: {sum(hits.values())} of {len(hits)} objects selected by their anchors", flush=True)
+    assert sum(hits.values()) > len(hits) / 2
+
+
+def rendering(path: Path, folder: Path):
+    """Esc stops F12 in mid-render, and the next F12 is whole."""
+    scene = w.main_window().scene
+    with w.inside():
+        bpy.ops.r5dgs.use_engine()
+    render, ended = scene.render, []
+    bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancelled"))
+    bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
+    job = w.service("worker")
+    for size, stop in ((320, False), (6000, True), (320, False)):
+        render.resolution_x, render.resolution_y, render.resolution_percentage = size, size * 3 // 4, 100
+        yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
+        ended.clear()
+        yield from w.press("F12")
+        if stop:
+            yield from w.wait(job.busy, "F12")
+            yield 1.0
+            assert job.busy() and not ended, "the picture was there before Esc"
+            began = time.monotonic()
+            yield from w.press("Escape")
+        yield from w.wait(lambda: ended and not bpy.app.is_job_running("RENDER"), "F12")
+        assert ended == ["cancelled" if stop else "complete"], ended
+        if stop:
+            print(f"F12: stopped {time.monotonic() - began:.1f} s after Esc", flush=True)
+        yield 0.5
+        yield from w.press("Escape")  # back from the picture
+        yield 0.5
+    assert nothing_runs()
+
+
+def exporting(path: Path, folder: Path):
+    """Esc stops exports: what was finished stays, nothing else, and the frame is as before."""
+    scene = w.main_window().scene
+    scene.render.resolution_x, scene.render.resolution_y = 320, 240
+    scene.frame_set(7)
+    for operator, name in (("export_masks", ""), ("export_ply", "a.ply"), ("export_scene", "b.r5dgs")):
+        target = folder / operator
+        target.mkdir()
+        path_of = {"filepath": str(target / name)} if name else {"directory": str(target)}
+        ranged = {} if operator == "export_scene" else {"frames": "RANGE"}
+        with w.inside():
+            getattr(bpy.ops.r5dgs, operator)("INVOKE_DEFAULT", **path_of, **ranged)
+        yield from choose(target, name)
+        wanted = [] if operator == "export_scene" else [f".{'png' if operator == 'export_masks' else 'ply'}"]
+        finished = lambda: [p for p in target.rglob("*") if p.suffix in wanted]  # noqa: B023, E731
+        yield from w.wait(lambda: w.main_window().modal_operators, operator)
+        if wanted:
+            yield from w.wait(lambda: len(finished()) > 2, operator)  # noqa: B023
+        yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
+        yield from w.press("Escape")
+        yield from w.wait(nothing_runs, operator)
+        yield 1.0
+        count = len(finished())
+        print(f"{operator}: stopped by Esc after {count} files", flush=True)
+        frames = scene.frame_end - scene.frame_start + 1
+        assert scene.frame_current == 7 and count < frames
+        others = [p for p in target.rglob("*") if p.is_file() and p.suffix not in (*wanted, ".json")]
+        assert not others, others
+    with w.inside():
+        bpy.ops.r5dgs.export_scene("INVOKE_DEFAULT", filepath=str(folder / "c.r5dgs"))
+    yield from choose(folder, "c.r5dgs")
+    yield from w.wait(lambda: (folder / "c.r5dgs").exists() and nothing_runs(), "export_scene")
+
+
+def capturing(path: Path, folder: Path):
+    """Esc stops a capture and leaves nothing; one that is left alone is whole."""
+    scene = w.main_window().scene
+    engine = scene.render.engine
+    few = {"resolution_x": 64, "resolution_y": 48, "samples": 1, "denoise": False, "rig": "ARC"}
+    with w.inside():
+        bpy.ops.r5dgs.capture_dataset("INVOKE_DEFAULT", directory=str(folder / "stopped"), **few)
+    yield from w.wait(lambda: any(folder.glob("*stopped*/*/*.png")), "capture")
+    yield from w.press("Escape")
+    yield from w.wait(nothing_runs, "Esc")
+    assert not any(folder.glob("*stopped*")), list(folder.iterdir())
+    assert scene.render.engine == engine
+    (folder / "whole").mkdir()
+    with w.inside():
+        bpy.ops.r5dgs.capture_dataset("INVOKE_DEFAULT", **few, frame_end=2, rig_observed=2, rig_novel=1)
+    yield from choose(folder / "whole")  # it asks again, though a folder was given before
+    yield from w.wait(lambda: (folder / "whole" / "objects.json").exists() and nothing_runs(), "capture")
+    assert scene.render.engine == engine
+
+
+CHECKS = (browsing, typing, clicking, rendering, exporting, capturing)
+
+
+def checks(path: Path, chosen: list):
+    """The checks one after the other; yields seconds to wait."""
+    view = bpy.context.preferences.view
+    view.filebrowser_display_type = view.render_display_type = "SCREEN"
+    with tempfile.TemporaryDirectory(prefix="r5dgs-window-") as folder:
+        bpy.data.objects.remove(bpy.data.objects["Cube"])
+        yield 1.0
+        for check in chosen:
+            if check != browsing:
+                load(path)
+            yield 0.5
+            yield from check(path, Path(folder))
+            print(f"ok: {inspect.getdoc(check)}", flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Run the checks that are named, or all."""
+    unknown = set(arguments[1:]) - {check.__name__ for check in CHECKS}
+    if unknown:
+        raise SystemExit(f"{', '.join(unknown)}: expected some of {', '.join(check.__name__ for check in CHECKS)}")
+    chosen = [check for check in CHECKS if not arguments[1:] or check.__name__ in arguments[1:]]
+    w.run(checks, Path(arguments[0]).resolve(), chosen)
+
+
+if __name__ == "__main__":
+    main(sys.argv[sys.argv.index("--") + 1 :])

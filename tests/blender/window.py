@@ -1,0 +1,129 @@
+"""Blender's window for checks that run inside it: the extension, waiting, and keys and mouse as a user has them.
+
+Keys and mouse are X's own, by ``xdotool``; without a window manager they go to the window that the mouse is in.
+"""
+
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import bpy
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 240.0  # the first picture may have to compile the rasterizer
+STEP_S = 0.02
+KEY_S = 0.3  # for Blender to take in what a user does
+
+
+def register() -> None:
+    """Register the extension that this file lies in."""
+    spec = importlib.util.spec_from_file_location("r5dgs", ROOT / "__init__.py", submodule_search_locations=[str(ROOT)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["r5dgs"] = module
+    spec.loader.exec_module(module)
+    module.register()
+
+
+def service(name: str):
+    """A module of the add-on."""
+    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+
+
+def wait(condition: Callable[[], object], what: str) -> Iterator[float]:
+    """Let Blender go on until a condition holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, f"{what}: nothing within {PATIENCE_S:g} s"
+        yield STEP_S
+
+
+def main_window() -> bpy.types.Window:
+    """Blender's first window."""
+    return bpy.context.window_manager.windows[0]
+
+
+def area_of(kind: str) -> bpy.types.Area:
+    """The largest area of a kind in the first window."""
+    areas = [area for area in main_window().screen.areas if area.type == kind]
+    return max(areas, key=lambda area: area.width * area.height)
+
+
+def region_of(area: bpy.types.Area, kind: str = "WINDOW") -> bpy.types.Region:
+    """The region of a kind in an area."""
+    return next(region for region in area.regions if region.type == kind)
+
+
+def inside(kind: str = "VIEW_3D", region: str = "WINDOW"):
+    """A context in the largest area of a kind."""
+    area = area_of(kind)
+    return bpy.context.temp_override(window=main_window(), area=area, region=region_of(area, region))
+
+
+def hover(region: bpy.types.Region, x: float | None = None, y: float | None = None) -> Iterator[float]:
+    """Move the mouse into a region, to a pixel from its lower left corner; by default to its middle."""
+    x = region.width / 2 if x is None else x
+    y = region.height / 2 if y is None else y
+    place = round(region.x + x), round(main_window().height - 1 - region.y - y)
+    _xdotool("mousemove", *place)
+    yield KEY_S
+
+
+def press(*keys: str) -> Iterator[float]:
+    """Press keys, such as ``ctrl+z``, where the mouse is."""
+    for key in keys:
+        _xdotool("key", key)
+        yield KEY_S
+
+
+def write(text: str) -> Iterator[float]:
+    """Type a text."""
+    _xdotool("type", "--delay", 40, text)
+    yield KEY_S
+
+
+def click() -> Iterator[float]:
+    """Click with the left button where the mouse is."""
+    _xdotool("click", 1)
+    yield KEY_S
+
+
+def drag(region: bpy.types.Region, start: tuple[float, float], end: tuple[float, float]) -> Iterator[float]:
+    """Drag with the left button between two pixels of a region."""
+    yield from hover(region, *start)
+    _xdotool("mousedown", 1)
+    yield KEY_S
+    yield from hover(region, *end)
+    _xdotool("mouseup", 1)
+    yield KEY_S
+
+
+def run(checks: Callable[..., Iterator[float]], *arguments) -> None:
+    """Run checks, whose values are seconds to wait, from a timer, and end Blender with 0, or 1 where one failed."""
+    bpy.context.preferences.view.show_splash = False
+    register()
+    steps = checks(*arguments)
+
+    def step():
+        try:
+            return next(steps)
+        except StopIteration:
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+            code = 1
+        service("worker").stop()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # quitting would end with 0
+
+    bpy.app.timers.register(step, first_interval=1.0, persistent=True)
+
+
+def _xdotool(*arguments) -> None:
+    subprocess.run(["xdotool", *map(str, arguments)], check=True, timeout=30)
