@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from . import edited_gaussians, edited_motion, group_dynamics
-from .edited_motion import Cluster, Piece
+from .edited_motion import Moved, Piece
 from .scene import MotionGroup, Scene, SceneObject
 
 __all__ = ("Piece", "edit")
@@ -42,8 +42,7 @@ def edit(
     for piece in pieces:
         if not 0 <= piece.start <= piece.start + piece.count <= len(scene.means):
             raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.means)} Gaussians")
-    clusters = edited_motion.clusters(scene, pieces, notes)
-    edited_motion.move(scene, clusters, times, notes)
+    clusters = edited_motion.move(scene, edited_motion.clusters(scene, pieces, notes), times, notes)
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])
     groups = _groups(clusters, scene, objects, kept, arrays["motion_ids"])
@@ -85,7 +84,7 @@ def _objects(scene: Scene, table: Mapping[int, SceneObject], object_ids: np.ndar
 
 
 def _groups(
-    clusters: Sequence[Cluster],
+    clusters: Sequence[Moved],
     scene: Scene,
     objects: tuple[SceneObject, ...],
     kept: np.ndarray,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..motion import rotations
-from . import carried, tints
+from . import carried, posing, tints
 from .edited_motion import Cluster
 from .scene import Scene
 
@@ -91,7 +91,7 @@ def _placed(scene: Scene, rows: slice, bind: np.ndarray | None) -> dict[str, np.
         if shading is not None and scene.light_direction is not None:
             turn = carried.nearest_rotation(bind[:3, :3])
             light = np.asarray(scene.light_direction, np.float64)
-            rest = (rest + shading @ (turn.T @ light - light)).astype(np.float32)
+            rest = (rest + shading @ posing.light_change(light, turn)).astype(np.float32)
             shading = (shading @ turn.T).astype(np.float32)
     values = {"means": splats.means, "quats": splats.quats, "log_scales": splats.log_scales, "sh": splats.sh}
     if shading is not None:

@@ -79,7 +79,7 @@ class Motion:
         return float(np.abs(self.linears - rotations.quats_to_rotmats(self.quats)).max(initial=0.0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Cluster:
     """Pieces that move alike: what becomes a motion group.
 
@@ -88,26 +88,53 @@ class Cluster:
         source: The group of the file that they come from.
         motion: What Blender shows.
         id: Of the new group.
-        pivot: At t_max. [3]
-        parent: Linear part of what moves all of the learned motion. [3, 3]
-        reach: Largest distance of a member from the pivot.
-        allowed: Difference of positions that counts as none.
-        same: Whether it moves as in the file.
-        group: The new group.
-        poses: Of the new group at the observed times. [S, 7]
     """
 
     pieces: list[Piece]
     source: MotionGroup
     motion: Motion
     id: int = 0
-    pivot: np.ndarray = None  # type: ignore[assignment]
-    parent: np.ndarray = None  # type: ignore[assignment]
+
+    @property
+    def first(self) -> Piece:
+        """Its largest member, which speaks for all."""
+        return max(self.pieces, key=lambda piece: piece.count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moved(Cluster):
+    """A cluster as the motion group that it has become.
+
+    Attributes:
+        group: The new group.
+        poses: Of it at the observed times. [S, 7]
+        same: Whether it moves as in the file.
+    """
+
+    group: MotionGroup
+    poses: np.ndarray
+    same: bool
+
+
+@dataclass(frozen=True)
+class _Course:
+    """How a cluster moves while it is observed.
+
+    Attributes:
+        poses: Of the new group. [S, 7]
+        pivot: At t_max. [3]
+        parent: Linear part of what moves all of the learned motion. [3, 3]
+        reach: Largest distance of a member from the pivot.
+        allowed: Difference of positions that counts as none.
+        same: Whether that is as in the file.
+    """
+
+    poses: np.ndarray
+    pivot: np.ndarray
+    parent: np.ndarray
     reach: float = 0.0
     allowed: float = 0.0
     same: bool = True
-    group: MotionGroup = None  # type: ignore[assignment]
-    poses: np.ndarray = None  # type: ignore[assignment]
 
 
 def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
@@ -221,9 +248,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
         return (again, cluster.source.id)
 
     found = [cluster for _, cluster in sorted(((order(c), c) for c in found), key=lambda entry: entry[0])]
-    for number, cluster in enumerate(found):
-        cluster.id = number
-    return found
+    return [replace(cluster, id=number) for number, cluster in enumerate(found)]
 
 
 def _apart(motion: Motion, other: Motion | None, reach: float) -> np.ndarray:
@@ -243,103 +268,137 @@ def _reach(scene: Scene, piece: Piece) -> float:
     return float(np.linalg.norm(placed, axis=-1).max())
 
 
-def move(scene: Scene, found: list[Cluster], times: np.ndarray, notes: list[str]) -> None:
-    """Find track and model of every cluster; those that follow another come last.
+def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[Moved]:
+    """Find track and model of every cluster.
 
     Args:
         scene: The scene that was edited.
         found: What `clusters` gave.
         times: The observed times and later ones. [T]
         notes: Gets what cannot be kept.
+
+    Returns:
+        The clusters in the same order.
     """
-    count = len(scene.track_times)
     quats, moves = playback.knots(scene)
     known = np.concatenate([quats, moves], axis=-1)
-    for cluster in found:
-        source = cluster.source
-        if not cluster.pieces or cluster.id == 0:
-            cluster.group, cluster.poses = replace(source, id=cluster.id), scene.track_poses[source.id]
-            cluster.pivot, cluster.parent = np.asarray(source.pivot, np.float64), np.eye(3)
-            continue
-        first = max(cluster.pieces, key=lambda piece: piece.count)
-        cluster.allowed = max(piece.allowed for piece in cluster.pieces)
-        cluster.parent = np.eye(3) if first.parent is None else first.parent
-        cluster.pivot = _pivot(scene, cluster, first)
-        cluster.reach = _radius(scene, cluster)
-        if source.id == 0 and cluster.id != 0:
-            before = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
-        else:
-            before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], cluster.parent), axis=-1)
-        cluster.poses, observed = _track(
-            cluster.motion, slice(0, count), cluster.pivot, before, cluster.reach, cluster.allowed
+    courses = [_course(scene, cluster, known) for cluster in found]
+    later = np.asarray(times[len(scene.track_times) :], np.float64) - scene.t_max
+    groups: dict[int, tuple[MotionGroup, bool]] = {}
+    for follows in (False, True):  # those that follow another come last
+        for cluster, course in zip(found, courses, strict=True):
+            if cluster.id == 0 or not cluster.pieces:
+                groups[cluster.id] = replace(cluster.source, id=cluster.id), True
+            elif (cluster.source.follows is not None) == follows:
+                leaders = [
+                    (courses[other.id], *groups[other.id])
+                    for other in found[1:]
+                    if other.source.id == cluster.source.follows and other.id in groups
+                ]
+                groups[cluster.id] = _go_on(scene, cluster, course, leaders, later, notes)
+    return [
+        Moved(
+            cluster.pieces,
+            cluster.source,
+            cluster.motion,
+            cluster.id,
+            group=groups[cluster.id][0],
+            poses=course.poses,
+            same=groups[cluster.id][1],
         )
-        if observed and (before == known[source.id]).all() and source.id:
-            cluster.poses = scene.track_poses[source.id].copy()  # signs included
-        cluster.same = observed and bool((cluster.parent == np.eye(3)).all())
-    later = np.asarray(times[count:], np.float64) - scene.t_max
-    for follows in (False, True):
-        for cluster in found[1:]:
-            if cluster.pieces and (cluster.source.follows is not None) == follows:
-                _go_on(scene, cluster, found, later, notes)
+        for cluster, course in zip(found, courses, strict=True)
+    ]
 
 
-def _pivot(scene: Scene, cluster: Cluster, first: Piece) -> np.ndarray:
+def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
+    """How a cluster moves to t_max, by the file's own poses [G, S, 7] where Blender shows those."""
+    source, count = cluster.source, len(scene.track_times)
+    if not cluster.pieces or cluster.id == 0:
+        return _Course(scene.track_poses[source.id], np.asarray(source.pivot, np.float64), np.eye(3))
+    first = cluster.first
+    allowed = max(piece.allowed for piece in cluster.pieces)
+    parent = np.eye(3) if first.parent is None else first.parent
+    pivot = _pivot(scene, cluster, allowed)
+    reach = _radius(scene, cluster, pivot)
+    if source.id == 0:
+        before = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
+    else:
+        before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], parent), axis=-1)
+    poses, observed = _track(cluster.motion, slice(0, count), pivot, before, reach, allowed)
+    if observed and (before == known[source.id]).all() and source.id:
+        poses = scene.track_poses[source.id].copy()  # signs included
+    return _Course(poses, pivot, parent, reach, allowed, observed and bool((parent == np.eye(3)).all()))
+
+
+def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
     """Where the pivot is at t_max; the file's own where that is it."""
+    first = cluster.first
     own = np.asarray(cluster.source.pivot, np.float64)
     bind = first.matrices[len(scene.track_times) - 1]
     if cluster.source.id == 0:
         own = np.median(scene.means[first.start : first.start + first.count].astype(np.float64), axis=0)
     pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
-    return own if np.linalg.norm(pivot - own) <= cluster.allowed else pivot
+    return own if np.linalg.norm(pivot - own) <= allowed else pivot
 
 
-def _radius(scene: Scene, cluster: Cluster) -> float:
+def _radius(scene: Scene, cluster: Cluster, pivot: np.ndarray) -> float:
     """Largest distance of a member from the pivot in the new bind state."""
     last, best = len(scene.track_times) - 1, 1e-9 * scene.extent
     for piece in cluster.pieces:
         means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
         placed = means @ piece.matrices[last][:3, :3].T + piece.matrices[last][:3, 3]
-        best = max(best, float(np.linalg.norm(placed - cluster.pivot, axis=-1).max()))
+        best = max(best, float(np.linalg.norm(placed - pivot, axis=-1).max()))
     return best
 
 
-def _go_on(scene: Scene, cluster: Cluster, found: list[Cluster], later: np.ndarray, notes: list[str]) -> None:
-    """The motion model of a cluster: the one it had or was given where Blender shows that, else one that is fitted."""
-    source, first = cluster.source, max(cluster.pieces, key=lambda piece: piece.count)
+def _go_on(
+    scene: Scene,
+    cluster: Cluster,
+    course: _Course,
+    leaders: Sequence[tuple[_Course, MotionGroup, bool]],
+    later: np.ndarray,
+    notes: list[str],
+) -> tuple[MotionGroup, bool]:
+    """The new group of a cluster, with the motion model that it had or was given where Blender shows that, else one
+    that is fitted; and whether it moves as in the file, to t_max and after it.
+
+    Args:
+        scene: The scene that was edited.
+        cluster: The cluster.
+        course: How it moves while it is observed.
+        leaders: What has become of the group that its own follows: course, new group, whether it moves as before.
+        later: Times since t_max. [L]
+        notes: Gets what cannot be kept.
+    """
+    source, first = cluster.source, cluster.first
     rows = slice(len(scene.track_times), None)
-    quats, moves = cluster.motion.quats[rows], cluster.motion.moves(cluster.pivot)[rows]
-    scale = float(abs(np.linalg.det(cluster.parent)) ** (1 / 3))
-    known = {"pivot": cluster.pivot, "id": cluster.id, "seen": source.seen}
+    quats, moves = cluster.motion.quats[rows], cluster.motion.moves(course.pivot)[rows]
+    scale = float(abs(np.linalg.det(course.parent)) ** (1 / 3))
+    known = {"pivot": course.pivot, "id": cluster.id, "seen": source.seen}
     known |= {"rigid_rms": scale * source.rigid_rms, "rigid_max": scale * source.rigid_max}
     if source.id == 0:
         known |= {"role": "body", "object_id": first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
 
     def shown(q: np.ndarray, d: np.ndarray) -> bool:
-        return bool((drawn.pose_errors(q, d, quats, moves, cluster.reach) <= cluster.allowed).all())
+        return bool((drawn.pose_errors(q, d, quats, moves, course.reach) <= course.allowed).all())
 
     if source.follows is not None and source.follow_matrix is not None:
-        for leader in found[1:]:
-            if leader.source.id == source.follows and leader.group is not None:
-                back = np.linalg.inv(leader.parent)
-                matrix = cluster.parent @ source.follow_matrix @ back
-                _, led = models.evaluate(leader.group.model, later)
-                if shown(rotations.identity(len(later)), led @ matrix.T):
-                    cluster.group = replace(source, **known, follows=leader.id, follow_matrix=matrix)
-                    cluster.same &= leader.same
-                    return
+        for leading, leader, as_before in leaders:
+            matrix = course.parent @ source.follow_matrix @ np.linalg.inv(leading.parent)
+            _, led = models.evaluate(leader.model, later)
+            if shown(rotations.identity(len(later)), led @ matrix.T):
+                group = replace(source, **known, follows=leader.id, follow_matrix=matrix)
+                return group, course.same and as_before
     else:
         given = [] if first.model is None else [first.model]
         for model in (*given, source.model):
-            turned = _turned_model(model, cluster.parent)
+            turned = _turned_model(model, course.parent)
             if shown(*models.evaluate(turned, later)):
-                cluster.same &= turned == source.model
-                cluster.group = replace(source, **known, model=turned)
-                return
-    model, error = drawn.fit(later, quats, moves, cluster.reach, cluster.allowed)
-    cluster.same = False
-    cluster.group = replace(source, **known, model=model, follows=None, follow_matrix=None)
-    if error > 10 * cluster.allowed:
+                return replace(source, **known, model=turned), course.same and turned == source.model
+    model, error = drawn.fit(later, quats, moves, course.reach, course.allowed)
+    if error > 10 * course.allowed:
         notes.append(
             f"{first.name}: no motion model goes on past t_max as its curves do; the nearest one is up to "
             f"{error:.3g} away from them"
         )
+    return replace(source, **known, model=model, follows=None, follow_matrix=None), False

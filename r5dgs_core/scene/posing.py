@@ -151,8 +151,13 @@ def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndar
     Returns:
         The factors, >= 0. [n]
     """
-    change = (np.swapaxes(turns, -1, -2) @ light - light).astype(np.float32)
+    change = light_change(light, turns).astype(np.float32)
     return np.maximum(rest + (shading @ change if change.ndim == 1 else (shading * change).sum(-1)), 0)
+
+
+def light_change(light: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """How the light's direction, seen from what has turned, has changed. [3] and [..., 3, 3] -> [..., 3]"""
+    return np.swapaxes(turns, -1, -2) @ light - light
 
 
 def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:
