@@ -1,0 +1,227 @@
+"""The inverse of a view transform, from samples of it: which scene-linear colour is displayed as a wanted one.
+
+A view transform (AgX, Filmic, with a look, an exposure, curves) is known here by a function alone, ``forward``, which
+displays scene-linear colours. Its inverse is a table in two steps. A curve for each channel, the inverse along greys,
+leaves a map that is nearly the identity; a grid holds that map, solved at each of its nodes by damped Newton steps on
+``forward`` itself. Codes are asinh(colour / KNEE): linear around black, logarithmic where it is bright, and defined for
+the negative values that stand for colours outside of the scene's gamut.
+
+What a view cannot display gets the colour that is displayed nearest to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+Forward = Callable[[np.ndarray], np.ndarray]  # scene linear [N, 3] to display, in [0, 1] [N, 3]
+
+KNEE = 0.05  # scene-linear colour at which codes turn from linear to logarithmic
+BRIGHTEST = 16.3  # scene-linear colour that view transforms display as white: 6.5 stops over middle grey
+SIZE = 33  # nodes of the grid along each channel
+STEP = 1 / 255  # of a display, in which errors are told
+SOLVED = 0.5 * STEP  # nodes that are displayed this near to what is wanted are within the view's reach
+
+_TOP = float(np.arcsinh(BRIGHTEST / KNEE))
+_CODES = 65536  # of the curves: display colours are rounded to so many, far finer than files keep them
+_CHUNK = 65536  # colours at a time, so that they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """A view transform's inverse; equal to itself alone.
+
+    Attributes:
+        curves: Place in the grid, in nodes, of each display colour. [3, 65536] float32
+        grid: Codes of the scene-linear colours at the nodes. [SIZE, SIZE, SIZE, 3] float32
+        scale: By what decoded colours are multiplied.
+        error: How far off colours within reach come out, of 255 steps: 95 % of them are nearer.
+    """
+
+    curves: np.ndarray
+    grid: np.ndarray
+    scale: float
+    error: float
+
+    def scene_linear(self, display: np.ndarray) -> np.ndarray:
+        """The colours that are displayed as wanted, or as near to that as the view can.
+
+        Args:
+            display: Display colours, clamped to [0, 1] here. [..., 3]
+
+        Returns:
+            Scene linear; below 0 where the colour is outside of the gamut of the scene's space. [..., 3] float32
+        """
+        flat = display.reshape(-1, 3)
+        result = np.empty(flat.shape, np.float32)
+        for start in range(0, len(flat), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            result[part] = self.scale * _decode(_interpolate(self.grid, self._places(flat[part])))
+        return result.reshape(display.shape)
+
+    def _places(self, display: np.ndarray) -> np.ndarray:
+        """Where in the grid display colours lie, in nodes. [N, 3]"""
+        index = (np.clip(display, 0, 1) * (_CODES - 1) + 0.5).astype(np.intp)
+        return np.stack([curve[index[:, channel]] for channel, curve in enumerate(self.curves)], axis=-1)
+
+
+def invert(forward: Forward, scale: float = 1.0) -> Inverse:
+    """Make the inverse of a view transform.
+
+    Args:
+        forward: Displays scene-linear colours; called a few dozen times with up to 110,000 of them.
+        scale: Of the colours: ``forward(scale * BRIGHTEST)`` should be about white; 2 ** -exposure.
+
+    Returns:
+        The inverse.
+    """
+
+    def shown(codes: np.ndarray) -> np.ndarray:
+        return np.asarray(forward(scale * _decode(codes)), np.float64)
+
+    greys = np.linspace(0, _TOP, 2048)
+    # Where a curve is flat, the darkest of the colours that are displayed alike counts.
+    rising = np.maximum.accumulate(shown(np.repeat(greys[:, None], 3, axis=1)), axis=0)
+    axis = np.linspace(0, _TOP, SIZE)
+    axes = [np.interp(axis, greys, rising[:, channel]) for channel in range(3)]
+    wanted = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    start = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    codes, found = _solve(shown, wanted, start, rounds=5)
+    codes, found = _retry(shown, wanted, codes, found, rounds=3)
+    grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), _far(found, wanted) < SOLVED)
+    display = np.linspace(0, 1, _CODES)
+    tiny = 1e-9 * np.arange(len(greys))  # np.interp asks for values that rise
+    curves = [np.interp(display, rising[:, channel] + tiny, greys) for channel in range(3)]
+    curves = (np.stack(curves) / _TOP * (SIZE - 1)).astype(np.float32)
+    made = Inverse(curves, grid.astype(np.float32), scale, 0.0)
+    return replace(made, error=_error(forward, made))
+
+
+def _decode(codes: np.ndarray) -> np.ndarray:
+    return KNEE * np.sinh(codes)
+
+
+def _far(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Distance of colours, in their worst channel. [N]"""
+    return np.abs(found - wanted).max(axis=-1)
+
+
+def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Codes that are displayed as wanted, by Levenberg-Marquardt steps with differences for derivatives.
+
+    Args:
+        shown: Displays codes.
+        wanted: Display colours. [N, 3]
+        codes: Where to start. [N, 3]
+        rounds: Number of steps; each shows four colours for each that is not solved yet.
+
+    Returns:
+        Codes, and how they are displayed. [N, 3] each
+    """
+    codes, found, delta = codes.copy(), shown(codes), 0.01
+    damping = np.full(len(codes), 1e-4)
+    for _ in range(rounds):
+        rows = np.flatnonzero((_far(found, wanted) > SOLVED / 2) & (damping < 10))
+        if not len(rows):
+            break
+        here, miss = codes[rows], found[rows] - wanted[rows]
+        ahead = np.where(here > _TOP - delta, -delta, delta)
+        moved = here + ahead.T[:, :, None] * np.eye(3)[:, None, :]
+        shifted = shown(moved.reshape(-1, 3)).reshape(moved.shape) - found[rows]
+        jacobian = np.moveaxis(shifted / ahead.T[:, :, None], 0, -1)
+        normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping[rows, None, None] * np.eye(3)
+        step = np.linalg.solve(normal, -np.einsum("nki,nk->ni", jacobian, miss)[..., None])[..., 0]
+        there = np.clip(here + np.clip(step, -1, 1), -_TOP, _TOP)
+        then = shown(there)
+        better = np.square(then - wanted[rows]).sum(-1) < np.square(miss).sum(-1)
+        codes[rows[better]], found[rows[better]] = there[better], then[better]
+        damping[rows] = np.where(better, np.maximum(0.1 * damping[rows], 1e-9), 10 * damping[rows])
+    return codes, found
+
+
+def _retry(
+    shown: Forward, wanted: np.ndarray, codes: np.ndarray, found: np.ndarray, rounds: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solve the nodes that are not again, each from the solved one that is displayed nearest to what it wants."""
+    solved = _far(found, wanted) < SOLVED
+    shape = (SIZE, SIZE, SIZE)
+    nearest = np.where(solved, np.arange(len(codes)), -1).reshape(shape)
+    goal = wanted.reshape(*shape, 3)
+    gap = np.where(solved.reshape(shape), np.square(found - wanted).sum(-1).reshape(shape), np.inf)
+    for _ in range(SIZE):  # from node to node, like a flood
+        changed = False
+        for into, out_of in _neighbours():
+            candidate = nearest[out_of]
+            distance = np.where(candidate >= 0, np.square(found[candidate] - goal[into]).sum(-1), np.inf)
+            closer = distance < gap[into]
+            changed |= bool(closer.any())
+            nearest[into] = np.where(closer, candidate, nearest[into])
+            gap[into] = np.where(closer, distance, gap[into])
+        if not changed:
+            break
+    rows = np.flatnonzero(gap.ravel() < np.square(found - wanted).sum(-1))
+    codes, found = codes.copy(), found.copy()
+    if len(rows):
+        codes[rows], found[rows] = _solve(shown, wanted[rows], codes[nearest.ravel()[rows]], rounds)
+    return codes, found
+
+
+def _neighbours() -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+    """Slices of a grid and of the same shifted by a node, along each axis, both ways."""
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        yield tuple(low), tuple(high)
+        yield tuple(high), tuple(low)
+
+
+def _continue(grid: np.ndarray, solved: np.ndarray) -> np.ndarray:
+    """Let the grid go on straight for a node past the view's reach, so that cells on its border are right inside.
+
+    Args:
+        grid: Codes. [SIZE, SIZE, SIZE, 3]
+        solved: Whether they are displayed as wanted. [SIZE ** 3]
+
+    Returns:
+        Codes. [SIZE, SIZE, SIZE, 3]
+    """
+    solved = solved.reshape(grid.shape[:3])
+    total, count = np.zeros_like(grid), np.zeros(grid.shape[:3])
+    for axis in range(3):
+        for order in (slice(None), slice(None, None, -1)):
+            flip = tuple(order if other == axis else slice(None) for other in range(3))
+            codes, fine = np.moveaxis(grid[flip], axis, 0), np.moveaxis(solved[flip], axis, 0)
+            into, number = np.moveaxis(total[flip], axis, 0), np.moveaxis(count[flip], axis, 0)
+            both = fine[:-2] & fine[1:-1]
+            into[2:] += np.where(both[..., None], 2 * codes[1:-1] - codes[:-2], 0)
+            number[2:] += both
+    edge = ~solved & (count > 0)
+    result = grid.copy()
+    result[edge] = np.clip(total[edge] / count[edge][:, None], -_TOP, _TOP)
+    return result
+
+
+def _interpolate(grid: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Trilinear values of a grid at places in nodes. [N, 3]"""
+    size = grid.shape[0]
+    low = np.minimum(places.astype(np.intp), size - 2)
+    part = places - low
+    weights = (1 - part, part)
+    rows, base = grid.reshape(-1, 3), (low[:, 0] * size + low[:, 1]) * size + low[:, 2]
+    result = np.zeros((len(places), 3), np.float32)
+    for corner in range(8):
+        i, j, k = corner >> 2, corner >> 1 & 1, corner & 1
+        weight = weights[i][:, 0] * weights[j][:, 1] * weights[k][:, 2]
+        result += weight[:, None] * rows.take(base + ((i * size + j) * size + k), axis=0)
+    return result
+
+
+def _error(forward: Forward, made: Inverse) -> float:
+    """How far off colours come out that the view displays of a scene without negative light, of 255 steps."""
+    random = np.random.default_rng(0)
+    light = 2.0 ** random.uniform(-6, 2, (4000, 1)) * 2.0 ** random.uniform(-0.7, 0.7, (4000, 3))
+    wanted = np.asarray(forward(made.scale * light), np.float64)
+    again = np.asarray(forward(made.scene_linear(wanted)), np.float64)
+    return float(np.percentile(_far(again, wanted), 95)) / STEP

@@ -1,0 +1,106 @@
+"""Inverses of view transforms give back the colours that a view displays, and come near to those that it cannot."""
+
+import numpy as np
+import pytest
+
+from r5dgs_core.scene import view_inverse
+
+
+def film(colors):
+    """A curve for each channel: logarithmic, with a toe and a shoulder, clipped at both ends."""
+    stops = np.log2(np.maximum(colors, 1e-6) / 0.18)
+    return np.clip(0.5 - 0.5 * np.cos(np.pi * np.clip((stops + 10) / 16.6, 0, 1)), 0, 1)
+
+
+MIX = np.array([[0.86, 0.09, 0.05], [0.06, 0.88, 0.06], [0.04, 0.12, 0.84]])
+
+
+def mixed(colors):
+    """Channels that bleed into each other before the curve, so that saturated colours need light below nothing."""
+    return film(np.maximum(colors @ MIX.T, 0))
+
+
+def gamma(colors):
+    return np.clip(colors, 0, 1) ** (1 / 2.2)
+
+
+def seen(n=3000, spread=0.7, seed=1):
+    """Scene-linear colours as scenes have them. [N, 3]"""
+    random = np.random.default_rng(seed)
+    return 2.0 ** random.uniform(-5, 2, (n, 1)) * 2.0 ** random.uniform(-spread, spread, (n, 3))
+
+
+def steps(a, b):
+    return 255 * np.abs(np.asarray(a, np.float64) - b).max(axis=-1)
+
+
+@pytest.fixture(scope="module")
+def of():
+    made = {}
+
+    def get(forward):
+        if forward not in made:
+            made[forward] = view_inverse.invert(forward)
+        return made[forward]
+
+    return get
+
+
+@pytest.mark.parametrize("forward", [film, mixed, gamma])
+def test_what_a_view_displays_comes_back(of, forward):
+    wanted = forward(seen())
+    off = steps(forward(of(forward).scene_linear(wanted)), wanted)
+    assert off.mean() < 0.3 and np.percentile(off, 95) < 1
+
+
+@pytest.mark.parametrize("forward", [film, gamma])
+def test_views_of_single_channels_reach_every_colour(of, forward):
+    wanted = np.random.default_rng(2).random((3000, 3))
+    off = steps(forward(of(forward).scene_linear(wanted)), wanted)
+    assert np.percentile(off, 95) < 0.5
+
+
+def test_the_colour_itself_comes_back_where_it_is_displayed_alone(of):
+    light = seen()
+    found = of(film).scene_linear(film(light))
+    np.testing.assert_allclose(found, light, rtol=0.02, atol=1e-3)
+
+
+def test_light_below_nothing_reaches_more(of):
+    """Colours that are more saturated than the view shows of any scene without negative light."""
+    light = seen(500)
+    light[:, 2] = -0.04 * light[:, 0]
+    wanted = mixed(light)
+    found = of(mixed).scene_linear(wanted)
+    assert (found[:, 2] < 0).mean() > 0.9
+    assert 5 * steps(mixed(found), wanted).mean() < steps(mixed(np.maximum(found, 0)), wanted).mean()
+
+
+def test_what_is_out_of_reach_comes_as_near_as_it_can(of):
+    """Nearer than clamping light at nothing, which is what the start of the search does."""
+    wanted = np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.1, 0.1, 0.9]])
+    greys = 2.0 ** np.linspace(-10, 4, 500)
+    curve = mixed(np.repeat(greys[:, None], 3, axis=1))[:, 0]
+    single = np.interp(wanted, curve, greys)
+    inverse = of(mixed)
+    assert np.square(mixed(inverse.scene_linear(wanted)) - wanted).sum() < np.square(mixed(single) - wanted).sum()
+    assert np.isfinite(inverse.scene_linear(wanted)).all()
+
+
+def test_an_exposure_is_a_scale(of):
+    brighter = view_inverse.invert(lambda colors: mixed(8 * colors), scale=1 / 8)
+    wanted = np.random.default_rng(3).random((100, 3))
+    np.testing.assert_allclose(8 * brighter.scene_linear(wanted), of(mixed).scene_linear(wanted), rtol=1e-3, atol=1e-4)
+
+
+def test_it_knows_how_far_off_colours_are(of):
+    assert of(film).error < 0.5 and of(mixed).error < 1
+    folded = view_inverse.invert(lambda colors: np.abs(2 * gamma(colors) - 1))  # what is dark is displayed bright
+    assert folded.error > 50
+
+
+def test_pictures_keep_their_shape_and_colours_out_of_range_are_clamped(of):
+    picture = np.array([[[-1.0, 0.5, 2.0], [0.0, 0.5, 1.0]]])
+    found = of(film).scene_linear(picture)
+    assert found.shape == picture.shape and found.dtype == np.float32
+    np.testing.assert_array_equal(found[0, 0], found[0, 1])
