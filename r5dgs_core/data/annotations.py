@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import errors
-from . import transforms
+from . import masks, transforms
 
 OBJECTS = "objects.json"
 
@@ -50,6 +50,10 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
         entry = {"name": value} if isinstance(value, str) else value
         if not key.isdecimal():
             raise errors.DatasetError(f"{path}: expected object ids as keys, found {key!r}")
+        if int(key) > masks.MAX_ID:
+            raise errors.DatasetError(
+                f"{path}: expected object ids up to {masks.MAX_ID}, which masks of 16 bits hold, found {key}"
+            )
         words = entry.get("aliases", []) if isinstance(entry, dict) else None
         if (
             not isinstance(entry, dict)

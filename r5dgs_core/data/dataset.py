@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import errors
 from ..scene import cameras
-from . import colmap, images, masks, transforms
+from . import colmap, images, mask_notes, masks, transforms
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
 
 SPLITS = ("train", "val", "test")
@@ -38,6 +38,8 @@ class View:
         image_path: The image file.
         mask_path: The object id image, None where there is none.
         mask_colors: Object id of each packed colour where masks are coded by colour.
+        mask_unknown: Value in the mask's file that says nothing of a pixel.
+        mask_video: Video within which the mask's ids hold, "" where they are those of the scene.
     """
 
     name: str
@@ -47,6 +49,8 @@ class View:
     image_path: Path
     mask_path: Path | None
     mask_colors: dict[int, int] | None = None
+    mask_unknown: int = masks.UNKNOWN
+    mask_video: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,23 @@ class Dataset:
         """Last observed time: that of the latest training view."""
         return float(self.times[-1])
 
+    def require_one_numbering(self) -> None:
+        """Refuse masks of the training views that cannot be trained with.
+
+        Raises:
+            DatasetError: Ids hold within a video only, and there are several.
+        """
+        paths = [view.mask_path for view in self.train if view.mask_path is not None]
+        if not paths:
+            return
+        videos = sorted({view.mask_video for view in self.train if view.mask_path is not None})
+        if len(videos) > 1:
+            raise errors.DatasetError(
+                f"{paths[0]} and others: their ids hold within a video only ({len(videos)} of them: "
+                f"{', '.join(videos[:3])}{', ...' if len(videos) > 3 else ''}), an object has another one in each. "
+                "Remedy: train with --masks none, then r5dgs associate RUN, which gives them one numbering"
+            )
+
 
 def read(root: Path, train_masks: str = MASKS) -> Dataset:
     """Read and check a data set; images and masks are looked at, not loaded.
@@ -164,6 +185,8 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         views = _attach_mask_colors({"train": views["train"]}) | _attach_mask_colors(
             {split: views[split] for split in SPLITS[1:]}
         )
+    for split, folder in folders.items():
+        views[split] = _attach_notes(views[split], folder, hasher)
     every = [view for split in SPLITS for view in views[split]]
     for view in every:
         for file in (view.image_path, view.mask_path):
@@ -218,10 +241,14 @@ def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
 
 
 def load_mask(view: View) -> np.ndarray | None:
-    """Load the object ids of a view, in the size of its image; None where it has no mask. [H, W] int32"""
+    """Load the object ids of a view, in the size of its image; None where it has no mask.
+
+    Returns:
+        Object ids, 0 = background, `masks.UNKNOWN` where the mask says nothing. [H, W] int32
+    """
     if view.mask_path is None:
         return None
-    ids = masks.read(view.mask_path, view.mask_colors)
+    ids = masks.read(view.mask_path, view.mask_colors, view.mask_unknown)
     return masks.resize(ids, view.camera.width, view.camera.height, str(view.mask_path))
 
 
@@ -310,6 +337,22 @@ def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[V
         return views
     _log.info("masks are coded by colour: %d colours numbered by value, black is 0", len(colors) - 1)
     return {split: tuple(replace(view, mask_colors=colors) for view in some) for split, some in views.items()}
+
+
+def _attach_notes(views: tuple[View, ...], folder: Path | None, hasher: Any) -> tuple[View, ...]:
+    """The views with what the folder of their masks says of these (`mask_notes`)."""
+    if folder is None or not (folder / mask_notes.FILE).exists():
+        return views
+    notes = mask_notes.read(folder)
+    hasher.update(f"{notes.numbering} {notes.unknown}".encode())
+    if not notes.finished:
+        _log.warning("%s: masks are missing; give the command of r5dgs masks again, it goes on", folder)
+    videos = notes.video_of()
+    lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
+    return tuple(
+        replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone)) if view.mask_path else view
+        for view in views
+    )
 
 
 def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:

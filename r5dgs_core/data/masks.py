@@ -19,12 +19,13 @@ from . import images
 UNKNOWN = 65535
 MAX_ID = UNKNOWN - 1  # what 16 bits hold beside it
 MAX_COLORS = 4096
+MAX_BLENDED = 16  # colours in single pixels that objects far away may have
 _GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # colour types of PNG
 _ONE_CHANNEL = (_GRAY, _PALETTE, _GRAY_ALPHA)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def read(path: Path, colors: Mapping[int, int] | None = None) -> np.ndarray:
+def read(path: Path, colors: Mapping[int, int] | None = None, unknown: int = UNKNOWN) -> np.ndarray:
     """Read an object id image.
 
     Without ``colors`` the image holds ids: one channel as they are, a palette image as palette indices, three equal
@@ -34,16 +35,39 @@ def read(path: Path, colors: Mapping[int, int] | None = None) -> np.ndarray:
     Args:
         path: A PNG file.
         colors: Object id of each packed colour (R << 16 | G << 8 | B); what `color_table` found in all masks.
+        unknown: Value of the file that says nothing of a pixel; with ``colors`` there is none.
 
     Returns:
-        Object ids, 0 = background. [H, W] int32
+        Object ids, 0 = background, `UNKNOWN` where nothing is known. [H, W] int32
     """
     path = Path(path)
-    if not colors and _holds_indices(path):
-        return _read_indices(path)
-    pixels = images.read_png(path)
     if colors:
-        return _colors_to_ids(path, pixels, colors)
+        return _colors_to_ids(path, images.read_png(path), colors)
+    ids = _read_indices(path) if _holds_indices(path) else _read_gray(path)
+    ids[ids == unknown] = UNKNOWN
+    return ids
+
+
+def write(path: Path, ids: np.ndarray) -> None:
+    """Write an object id image, of 8 bits where that is enough, else 16; whole or not at all.
+
+    Args:
+        path: A PNG file; its folder is made where missing.
+        ids: Object ids, 0 to `MAX_ID`, and `UNKNOWN`. [H, W] integers
+
+    Raises:
+        DatasetError: There is an id that 16 bits cannot hold, or the file cannot be written.
+    """
+    low, high = int(ids.min(initial=0)), int(ids.max(initial=0))
+    if low < 0 or high > UNKNOWN:
+        raise errors.DatasetError(
+            f"{path}: expected object ids from 0 to {MAX_ID}, found {low if low < 0 else high}; number the objects anew"
+        )
+    images.write_png(path, ids.astype(np.uint8 if high < 256 else np.uint16))
+
+
+def _read_gray(path: Path) -> np.ndarray:
+    pixels = images.read_png(path)
     if pixels.shape[2] >= 3 and not _is_gray(pixels):
         raise errors.DatasetError(
             f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette"
@@ -62,29 +86,47 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
 
     Returns:
         Object id of each packed colour; empty where no mask of ``paths`` is coded by colour.
+
+    Raises:
+        DatasetError: What colours mean is open: they are blended ones, or masks of one channel and of colours are mixed
+            and do not share their colours.
     """
     found: set[int] = set()
-    gray = []
+    flat: set[int] = set()  # colours that fill a square of four pixels somewhere
+    gray, colored = [], Path()
     for path in map(Path, paths):
         header = _png_header(path)
         pixels = None if header is not None and header[3] in _ONE_CHANNEL else images.read_png(path)
         if pixels is None or pixels.shape[2] < 3 or _is_gray(pixels):
             gray.append(path)
         else:
-            _collect(path, pixels, found)
+            colored = path
+            _collect(path, pixels, found, flat)
     if not found:
         return {}
     for path in gray:
-        _collect(path, images.read_png(path), found)
+        shown = set(np.unique(_pack(path, images.read_png(path))).tolist())
+        if foreign := shown - found - {0}:
+            color = min(foreign)
+            raise errors.DatasetError(
+                f"{path}: shows ({color >> 16}, {color >> 8 & 255}, {color & 255}), which no mask of colours like "
+                f"{colored} does: does it hold ids or colours? Write all masks in one way, best with one channel of ids"
+            )
     return {0: 0} | {color: i + 1 for i, color in enumerate(sorted(found - {0}))}
 
 
-def _collect(path: Path, pixels: np.ndarray, found: set[int]) -> None:
-    found.update(np.unique(_pack(path, pixels)).tolist())
-    if len(found) > MAX_COLORS:
+def _collect(path: Path, pixels: np.ndarray, found: set[int], flat: set[int]) -> None:
+    packed = _pack(path, pixels)
+    found.update(np.unique(packed).tolist())
+    corner = packed[:-1, :-1]
+    equal = (corner == packed[1:, :-1]) & (corner == packed[:-1, 1:]) & (corner == packed[1:, 1:])
+    flat.update(np.unique(corner[equal]).tolist())
+    blended = len(found) - len(flat)
+    if len(found) > MAX_COLORS or (blended > MAX_BLENDED and blended > len(flat)):
         raise errors.DatasetError(
-            f"{path}: expected one flat colour per object, found over {MAX_COLORS} colours in the masks; "
-            "write them without anti-aliasing and without lossy compression"
+            f"{path}: expected one flat colour per object, found {len(found)} colours in the masks so far, {blended} "
+            "of which fill no area; write them without anti-aliasing and without lossy compression, or with one "
+            "channel of ids"
         )
 
 

@@ -196,3 +196,38 @@ def test_damaged_palette_masks_are_named(tmp_path):
         masks.read(tmp_path / "m.png")
     with pytest.raises(errors.DatasetError, match=r"gone\.png"):
         masks.read(tmp_path / "gone.png")
+
+
+@pytest.mark.parametrize(("highest", "kind"), [(7, np.uint8), (255, np.uint8), (256, np.uint16), (65535, np.uint16)])
+def test_masks_are_written_with_as_few_bits_as_hold_them(tmp_path, highest, kind):
+    ids = np.where(IDS == 7, highest, IDS)
+    masks.write(tmp_path / "deep" / "m.png", ids)
+    assert images.read_png(tmp_path / "deep" / "m.png").dtype == kind
+    np.testing.assert_array_equal(masks.read(tmp_path / "deep" / "m.png"), ids)
+
+
+def test_masks_of_ids_among_masks_of_colours_are_refused_as_what_they_mean_is_open(tmp_path):
+    rgb = np.zeros((6, 6, 3), np.uint8)
+    rgb[:3], rgb[3:] = (200, 0, 0), (90, 90, 90)
+    images.write_png(tmp_path / "rgb.png", rgb)
+    images.write_png(tmp_path / "ids.png", np.full((6, 6), 3, np.uint8))
+    with pytest.raises(errors.DatasetError, match=r"ids\.png: shows \(3, 3, 3\).*rgb\.png.*one channel of ids"):
+        masks.color_table([tmp_path / "ids.png", tmp_path / "rgb.png"])
+
+
+def test_soft_edges_of_coloured_masks_are_refused(tmp_path):
+    """Two discs drawn with anti-aliasing: few colours in all, but most of them fill no area."""
+
+    def discs(softness):
+        y, x = np.mgrid[:64, :64]
+        rgb = np.zeros((64, 64, 3))
+        for center, color in (((20, 20), (220, 30, 10)), ((44, 40), (20, 90, 210))):
+            share = np.clip((14.3 - np.hypot(y - center[0], x - center[1])) / softness, 0, 1)[..., None]
+            rgb = rgb * (1 - share) + share * np.array(color)
+        return np.round(rgb).astype(np.uint8)
+
+    images.write_png(tmp_path / "soft.png", discs(1.0))
+    with pytest.raises(errors.DatasetError, match="fill no area; write them without anti-aliasing"):
+        masks.color_table([tmp_path / "soft.png"])
+    images.write_png(tmp_path / "hard.png", discs(1e-9))
+    assert sorted(masks.color_table([tmp_path / "hard.png"]).values()) == [0, 1, 2]
