@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import motion_extrapolate, motion_objects
+from ..r5dgs_addon import motion_extrapolate, motion_objects, motion_replacement
 from ..r5dgs_core import errors
 
 STAYS = (
@@ -42,10 +42,10 @@ class R5DGS_OT_replace_motion(bpy.types.Operator):
                     "FIRST": times.frame(times.t_start),
                     "CURRENT": context.scene.frame_current_final,
                 }[self.stays]
-                plans.append(motion_objects.replacement(target, source, frame, times))
+                plans.append(motion_replacement.prepare(target, source, frame, times))
             motion_extrapolate.check(targets)
             for plan in plans:
-                motion_objects.replace(plan)
+                motion_replacement.apply(plan)
             motion_extrapolate.re_extrapolate(motion_extrapolate.followers(targets))
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
