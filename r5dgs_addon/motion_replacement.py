@@ -57,8 +57,8 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
     """What lets an anchor move as another one does, from the pose that it has at a frame.
 
     Its place moves by what the other's place moves, and it turns by what the other turns, about its own pivot: at
-    ``frame`` it is where it was. Its physics become the other's, its learned motion stays its own (*Reset to Learned* brings it
-    back). Curves of other channels stay.
+    ``frame`` it is where it was. Its physics become the other's, its learned motion stays its own, for *Reset to
+    Learned*. Curves of other channels stay.
 
     Args:
         target: The anchor that gets the motion.
