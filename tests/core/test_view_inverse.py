@@ -73,7 +73,7 @@ def test_light_below_nothing_reaches_more(of):
     wanted = mixed(light)
     found = of(mixed).scene_linear(wanted)
     assert (found[:, 2] < 0).mean() > 0.9
-    assert 5 * steps(mixed(found), wanted).mean() < steps(mixed(np.maximum(found, 0)), wanted).mean()
+    assert np.median(steps(mixed(found), wanted)) < 1 < 5 < np.median(steps(mixed(np.maximum(found, 0)), wanted))
 
 
 def test_what_is_out_of_reach_comes_as_near_as_it_can(of):
