@@ -15,6 +15,7 @@ from .running import Outcome, Step, Steps
 TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
 KEY_SHARE = 1.5  # of the keys' own tolerance that counts as none, too
 MOST_LATER = 64  # times past t_max that are looked at
+MOST_EARLIER = 16  # frames before the first observed time that are looked at
 _STILL = 1e-6  # how far from the identity a parent may be that turns nothing
 
 
@@ -53,7 +54,9 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
             "another one; load it again"
         )
     when = np.concatenate([source.track_times, _later(times)])
+    earlier = _earlier(context.scene, times)
     with export_frames.frame_kept(context.scene):
+        before = [_matrices(context, collection, members, frame) for frame in earlier]
         for number, t in enumerate(when):
             yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
@@ -64,6 +67,12 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
         len(when) + 1, len(when) + 2, f"packing {amounts.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
     )
     scene_file.write(result, path, exact=exact)
+    lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
+    if lost:
+        notes.append(
+            f"{', '.join(lost)}: what moves before frame {times.frame(times.t_start):.4g}, the first observed time, is "
+            "not in the file; move those keys behind it"
+        )
     if not _rests(collection):
         notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
     named = sum(item.id > 0 for item in result.objects)
@@ -89,6 +98,33 @@ def _later(times: timeline.Times) -> np.ndarray:
         return np.zeros(0)
     count = int(min(max(np.ceil(last - first), 8), MOST_LATER))
     return times.t_max + (times.t_end - times.t_max) * np.arange(1, count + 1) / count
+
+
+def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
+    """Frames of the timeline before the first observed time, of which a scene file knows nothing."""
+    first, end = scene.frame_start, int(np.ceil(times.frame(times.t_start) - 1e-6))
+    return sorted({int(frame) for frame in np.linspace(first, end - 1, MOST_EARLIER)}) if first < end else []
+
+
+def _matrices(
+    context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float
+) -> list[np.ndarray]:
+    """Where clouds are at a frame, in the world of the file. [4, 4] each"""
+    whole = int(np.floor(frame))
+    context.scene.frame_set(whole, subframe=min(float(frame - whole), 0.999999))
+    depsgraph = context.evaluated_depsgraph_get()
+    back = np.linalg.inv(visible.world_of(collection, depsgraph))
+    return [back @ _matrix(member.cloud, depsgraph) for member in members]
+
+
+def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allowed: float, extent: float) -> list[str]:
+    """Names of the clouds that are elsewhere before the first observed time than at it."""
+    names = []
+    for number, member in enumerate(members):
+        changes = [np.abs(matrices[number] - member.matrices[0]) for matrices in before]
+        if any(max(extent * change[:3, :3].max(), change[:3, 3].max()) > allowed for change in changes):
+            names.append(member.cloud.name)
+    return names
 
 
 def _members(collection: bpy.types.Collection) -> tuple[list[_Member], dict[int, tuple[str, int]]]:
@@ -123,12 +159,11 @@ def _look(
     context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float, bind: bool
 ) -> None:
     """Note where clouds are at a frame, in the world of the file; at t_max where their anchors stand, too."""
-    whole = int(np.floor(frame))
-    context.scene.frame_set(whole, subframe=min(float(frame - whole), 0.999999))
+    matrices = _matrices(context, collection, members, frame)
     depsgraph = context.evaluated_depsgraph_get()
     back = np.linalg.inv(visible.world_of(collection, depsgraph))
-    for member in members:
-        member.matrices.append(back @ _matrix(member.cloud, depsgraph))
+    for member, matrix in zip(members, matrices, strict=True):
+        member.matrices.append(matrix)
         if bind and member.anchor is not None:
             member.pivot = (back @ _matrix(member.anchor, depsgraph))[:3, 3]
             parent = member.anchor.parent

@@ -238,3 +238,31 @@ def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loade
     saved = save(blender, tmp_path / "b.r5dgs")
     assert saved.groups[3].model.kind == scene.groups[1].model.kind
     assert_same_motion(blender, loaded, load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
+
+
+@pytest.mark.parametrize("observed", [1, 4], ids=["still scene", "scene that begins late"])
+def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, scene, tmp_path, capfd, observed):
+    late = dataclasses.replace(
+        scene, track_times=scene.track_times[-observed:], track_poses=scene.track_poses[:, -observed:]
+    )
+    if observed == 1:
+        still = [dataclasses.replace(group, model=models.STATIC) for group in late.groups]
+        late = dataclasses.replace(late, groups=tuple(still))
+    collection = load(blender, scene_file.write(late, tmp_path / "late.r5dgs"))
+    first = blender.context.scene.frame_start
+    assert first > 20
+    blender.context.scene.frame_start = 1
+    save(blender, tmp_path / "a.r5dgs")
+    assert "first observed time" not in capfd.readouterr().out
+    anchor = cloud(collection, "mug").parent
+    blender.context.scene.frame_set(first)
+    place = anchor.location.copy()
+    for frame, x in ((5, 1.0), (20, 0.0)):
+        anchor.location = (place[0] + x, place[1], place[2])
+        anchor.keyframe_insert("location", frame=frame)
+    anchor.location = place
+    anchor.keyframe_insert("location", frame=first)
+    save(blender, tmp_path / "b.r5dgs")
+    said = capfd.readouterr().out
+    assert f"mug: what moves before frame {1 + 60 * late.track_times[0]:.4g}, the first observed time" in said
+    assert "red apple" not in said
