@@ -15,6 +15,7 @@ from . import (
     engine_cryptomatte,
     engine_passes,
     engine_settings,
+    engine_view,
     objects,
     picture,
     viewport,
@@ -68,6 +69,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         scene, layer = depsgraph.scene, depsgraph.view_layer
         if not objects.scene_collections():
             raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
+        inverse = engine_color.wait_for_inverse(scene, self.test_break)
         objections = engine_color.objections(scene)
         if objections:
             self.report(
@@ -92,7 +94,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         for one in passes[1:]:
             self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
         rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name)
-        filled = {one.name: engine_passes.pixels(one, arrays, seen, transparent) for one in passes}
+        filled = {one.name: engine_passes.pixels(one, arrays, seen, transparent, inverse) for one in passes}
         engine_passes.fill(rendered.layers[0], filled)
         self.end_result(rendered)
         if mattes:
@@ -135,6 +137,7 @@ def _leave(job: worker.Job) -> None:
 def register():
     """Register the settings and the engine, and let Blender's panels that are for all engines show for it."""
     engine_settings.register()
+    engine_view.register()
     bpy.utils.register_class(R5DGS_RenderEngine)
     for panel in compat.panels_of_all_engines():
         panel.COMPAT_ENGINES.add(ENGINE)
@@ -146,4 +149,5 @@ def unregister():
     for panel in compat.panels_of_all_engines():
         panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.utils.unregister_class(R5DGS_RenderEngine)
+    engine_view.unregister()
     engine_settings.unregister()

@@ -1,16 +1,21 @@
 """Colours of the worker as Blender's scene-linear ones, such that the view transform gives back what was trained.
 
 A picture of the core is display-referred sRGB. Blender's view transform *Standard* is sRGB's transfer function, so its
-inverse is what a render result has to hold; under others (AgX, Filmic), or with a look, an exposure or curves, a scene
-cannot come out as it was trained, and `objections` says so.
+inverse is what a render result has to hold. Under others (AgX, Filmic), or with a look, an exposure or curves, the
+inverse is a table of `engine_view`; where it is switched off or too coarse, `objections` says so.
 """
+
+from collections.abc import Callable
 
 import bpy
 import numpy as np
 
-from . import compat
+from ..r5dgs_core.scene import view_inverse
+from . import compat, engine_settings, engine_view
 
 STANDARD = "Standard"
+FAIR = 1.5  # colours that are farther off, of 255 steps, do not pass for those that were trained
+POOR = 25.0  # a view with such an inverse (*False Color*) has none worth the name
 
 # Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).
 _WORKING_SPACES = {
@@ -30,15 +35,17 @@ _WORKING_SPACES = {
 def scene_linear(
     color: np.ndarray,  # [H, W, 3]
     alpha: np.ndarray | None = None,  # [H, W]
+    inverse: view_inverse.Inverse | None = None,
 ) -> np.ndarray:  # [H, W, 4]
     """A picture as Blender's *Combined* pass, alpha premultiplied.
 
-    Colours over 1 stay over 1. The picture was blended as it is displayed; so the colour that is made linear is that
-    of the pixel without its alpha, which then saves as straight alpha with the picture's own bytes.
+    Colours over 1 stay over 1, without an inverse. The picture was blended as it is displayed; so the colour that is
+    made linear is that of the pixel without its alpha, which then saves as straight alpha with the picture's own bytes.
 
     Args:
         color: Display-referred sRGB, >= 0; multiplied by alpha where there is one. [H, W, 3]
         alpha: Coverage, or None for an opaque picture. [H, W]
+        inverse: Of the view transform; of *Standard* where None.
 
     Returns:
         Scene-linear RGBA, float32, rows as they came. [H, W, 4]
@@ -48,16 +55,48 @@ def scene_linear(
     if alpha is not None:
         result[..., 3] = np.clip(alpha, 0, 1)
         straight = straight / np.maximum(result[..., 3:], 1e-6)
-    linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
-    matrix = _WORKING_SPACES.get(compat.working_space())
-    if matrix is not None:
-        linear = linear @ np.array(matrix, np.float32).T
+    if inverse is not None:
+        linear = inverse.scene_linear(straight)
+    else:
+        linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+        matrix = _WORKING_SPACES.get(compat.working_space())
+        if matrix is not None:
+            linear = linear @ np.array(matrix, np.float32).T
     result[..., :3] = linear if alpha is None else linear * result[..., 3:]
     return result
 
 
+def inverts(scene: bpy.types.Scene) -> bool:
+    """Whether a scene's view is to be inverted by a table."""
+    return engine_settings.of(scene).as_trained and engine_view.can(scene) and bool(differences(scene))
+
+
+def inverse(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
+    """The inverse of a scene's view, or None: it needs none, has none, or has none yet, and then gets it soon."""
+    found = engine_view.want(scene) if inverts(scene) else None
+    return found if found is not None and found.error <= POOR else None
+
+
+def wait_for_inverse(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> view_inverse.Inverse | None:
+    """As `inverse`, and one that it has not yet is made or waited for, unless ``stopped`` says that nobody does."""
+    if inverts(scene):
+        engine_view.wait(scene, stopped)
+    return inverse(scene)
+
+
 def objections(scene: bpy.types.Scene) -> list[str]:
-    """Why colours do not come out as trained under a scene's colour management, in a few words each; else empty."""
+    """Why colours do not come out as trained under a scene's colour management, in a few words each; else empty.
+
+    While the inverse of a view is still to be made, the view is objected to.
+    """
+    found, made = differences(scene), inverse(scene)
+    if made is None:
+        return found
+    return [*found, f"off by {made.error:.0f} of 255 steps"] if made.error > FAIR else []
+
+
+def differences(scene: bpy.types.Scene) -> list[str]:
+    """What in a scene's colour management is not as *Standard* is by itself, in a few words each; else empty."""
     view, found = scene.view_settings, []
     if view.view_transform != STANDARD:
         found.append(f"view transform {view.view_transform}")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import cameras
+from ..r5dgs_core.scene import cameras, view_inverse
 from . import compat, engine_color, engine_cryptomatte, picture, visible
 
 NOTHING = 1e10  # depth where there is nothing, as Blender's own engines write it
@@ -52,7 +52,13 @@ def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
     return (*names, "alpha") if transparent or DEPTH in passes else tuple(names)
 
 
-def pixels(one: Pass, arrays: dict[str, np.ndarray], seen: picture.Shown, transparent: bool) -> np.ndarray:
+def pixels(
+    one: Pass,
+    arrays: dict[str, np.ndarray],
+    seen: picture.Shown,
+    transparent: bool,
+    inverse: view_inverse.Inverse | None = None,
+) -> np.ndarray:
     """What a pass holds.
 
     Args:
@@ -60,12 +66,13 @@ def pixels(one: Pass, arrays: dict[str, np.ndarray], seen: picture.Shown, transp
         arrays: The worker's answer, of what `wanted` names.
         seen: What was rendered.
         transparent: Whether the film is.
+        inverse: Of the view transform; of *Standard* where None.
 
     Returns:
         Rows from the top. [H, W, channels] float32
     """
     if one == COMBINED:
-        return engine_color.scene_linear(arrays["color"], arrays["alpha"] if transparent else None)
+        return engine_color.scene_linear(arrays["color"], arrays["alpha"] if transparent else None, inverse)
     if one == DEPTH:
         return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING))[..., None].astype(np.float32)
     if one.name.startswith(engine_cryptomatte.LAYER):

@@ -20,6 +20,12 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
         "is transparent",
         default=True,
     )
+    as_trained: BoolProperty(
+        name="Colors as Trained",
+        description="Invert the view transform, so that AgX, Filmic and others display the colors of Gaussians as they "
+        "were trained, and meshes as ever",
+        default=True,
+    )
     moving: EnumProperty(
         name="While Moving",
         description="Size of pictures in the viewport until it rests",

@@ -15,7 +15,7 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras
+from ..r5dgs_core.scene import cameras, view_inverse
 from . import amounts, engine_color, engine_settings, picture, views, visible, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by
@@ -36,18 +36,29 @@ class Wish:
         sky: Whether the sky lies behind everything.
         transparent: Whether the film is.
         moving: By what pictures are smaller while it moves.
+        inverse: Of the view transform; of *Standard* where None.
     """
 
-    def __init__(self, seen: picture.Shown, sky: bool, transparent: bool, moving: int):
+    def __init__(
+        self,
+        seen: picture.Shown,
+        sky: bool,
+        transparent: bool,
+        moving: int,
+        inverse: view_inverse.Inverse | None = None,
+    ):
         self.camera = seen.camera
         self.transparent = transparent
         self.moving = moving
+        self.inverse = inverse
         self.steps = picture.steps(seen, ("alpha",) if transparent else (), sky)
         self.since = time.monotonic()
 
     def same(self, other: "Wish | None") -> bool:
         """Whether another wish is for the same picture."""
-        return other is not None and (self.steps, self.transparent) == (other.steps, other.transparent)
+        if other is None or self.inverse is not other.inverse:
+            return False
+        return (self.steps, self.transparent) == (other.steps, other.transparent)
 
     def requests(self, smaller: int) -> list[tuple[str, str, dict[str, Any]]]:
         """The worker's requests for the picture, smaller by a factor."""
@@ -118,7 +129,8 @@ class Port:
         """Keep a picture of the worker for the next drawing."""
         result, arrays = answer
         milliseconds = result["ms_motion"] + result["ms_raster"]
-        linear = engine_color.scene_linear(arrays["color"], arrays["alpha"] if wish.transparent else None)
+        alpha = arrays["alpha"] if wish.transparent else None
+        linear = engine_color.scene_linear(arrays["color"], alpha, wish.inverse)
         self._pixels = np.ascontiguousarray(linear[::-1])
         self._shown = wish, smaller
         if smaller == FULL:
@@ -143,7 +155,8 @@ def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
     view = views.of_region(context.region, context.region_data, visible.points(instances))
     seen = picture.Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
     transparent = scene.render.film_transparent
-    return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving))
+    inverse = engine_color.inverse(scene)
+    return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving), inverse)
 
 
 def look() -> float | None:

@@ -37,6 +37,9 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
         settings = scene.r5dgs_render
         column = layout.column()
+        column.prop(settings, "as_trained")
+        if engine_color.inverse(scene) is not None and not objections:
+            column.label(text=f"{scene.view_settings.view_transform} is inverted for Gaussians", icon="CHECKMARK")
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")

@@ -268,7 +268,8 @@ def test_an_animation_is_its_frames(blender, loaded, tmp_path):
 def test_colour_management_that_changes_colours_is_named_and_put_right(blender, loaded):
     color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
     blend_scene = blender.context.scene
-    view = blend_scene.view_settings
+    view, settings = blend_scene.view_settings, blend_scene.r5dgs_render
+    settings.as_trained = False
     assert color.objections(blend_scene) == []
     view.view_transform, view.exposure, view.gamma, view.use_curve_mapping = "AgX", 0.5, 1.2, True
     view.look = "AgX - Punchy"
@@ -281,6 +282,73 @@ def test_colour_management_that_changes_colours_is_named_and_put_right(blender, 
     blender.ops.r5dgs.show_colors_as_trained()
     assert color.objections(blend_scene) == []
     assert "r5dgs.show_colors_as_trained" not in layouts.draw(blender, *panels.CLASSES)
+
+
+@pytest.mark.parametrize(
+    ("view", "look", "exposure"),
+    [("AgX", "None", 0), ("AgX", "AgX - Medium High Contrast", 1), ("Filmic", "None", -1.5), ("Standard", "None", 2)],
+)
+def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, view, look, exposure):
+    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    settings = blender.context.scene.view_settings
+    settings.view_transform, settings.exposure = view, exposure
+    settings.look = look
+    go_to(blender, 0.3)
+    expected = np.clip(core(scene, 0.3).color.numpy(), 0, 1)
+    saved = render_png(blender, tmp_path)
+    near = 255 * np.abs(saved - expected).max(axis=-1)
+    reached = np.ptp(expected, axis=-1) < 0.3 if view == "AgX" else np.full(near.shape, True)
+    assert reached.mean() > 0.2 and np.median(near[reached]) <= 1 and np.percentile(near[reached], 95) < 3
+    assert color.objections(blender.context.scene) == []
+    blender.context.scene.r5dgs_render.as_trained = False
+    assert np.abs(render_png(blender, tmp_path, "changed") - expected).mean() > 5 * np.abs(saved - expected).mean()
+
+
+def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene, tmp_path):
+    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    view = blender.context.scene.view_settings
+    view.use_curve_mapping = True
+    curve = view.curve_mapping.curves[3]
+    curve.points.new(0.4, 0.55)
+    view.curve_mapping.update()
+    go_to(blender, 0.0)
+    expected = np.clip(core(scene, 0.0).color.numpy(), 0, 1)
+    assert psnr(render_png(blender, tmp_path), expected) > 45 and color.objections(blender.context.scene) == []
+    curve.points[1].location = (0.4, 0.3)  # another curve is another view
+    view.curve_mapping.update()
+    assert psnr(render_png(blender, tmp_path), expected) > 45
+    view.use_curve_mapping, view.view_transform = False, "False Color"
+    render_png(blender, tmp_path)
+    assert color.objections(blender.context.scene) == ["view transform False Color"]
+
+
+def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    before = len(blender.data.scenes), len(blender.data.images)
+    blender.context.scene.view_settings.view_transform = "Filmic"
+    made = view_module.prepare(blender.context.scene)
+    assert (len(blender.data.scenes), len(blender.data.images)) == before
+    blender.context.scene.view_settings.exposure = 1
+    assert view_module.prepare(blender.context.scene).grid is made.grid  # an exposure is a factor
+    blender.context.scene.view_settings.exposure = 0
+    assert view_module.want(blender.context.scene) is made
+
+
+def test_what_a_viewport_wants_is_made_by_the_timer_when_it_rests(blender, loaded, monkeypatch):
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    settings = blender.context.scene.view_settings
+    made, now = [], [100.0]
+    monkeypatch.setattr(view_module, "_inverses", {})
+    monkeypatch.setattr(view_module, "_make", made.append)
+    monkeypatch.setattr(view_module.time, "monotonic", lambda: now[0])
+    for gamma in (1.1, 1.2, 1.3):
+        settings.gamma = gamma
+        assert view_module.want(blender.context.scene) is None
+        view_module.look()
+    assert made == []
+    now[0] += 1
+    view_module.look()
+    assert [one.gamma for one in made] == [settings.gamma]
 
 
 @pytest.mark.parametrize("space", ["Linear Rec.2020", "ACEScg"])
