@@ -27,12 +27,15 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
     def execute(self, context):
         anchors = motion_objects.chosen(context)
         try:
-            if self.observed:
-                motion_extrapolate.check(anchors)  # all of it is there and can be written before any of it is
+            if self.observed:  # all of it is there and can be written before any of it is
+                motion_extrapolate.check(anchors, curves=False)
                 members = motion_objects.by_scene(anchors)
-                paths = {collection: picture.scene_path(collection) for collection in members}
-                for collection, path in paths.items():
-                    motion_extrapolate.reload(members[collection], path)
+                sources = [
+                    motion_extrapolate.source(own, picture.scene_path(collection))
+                    for collection, own in members.items()
+                ]
+                for own, scene in zip(members.values(), sources, strict=True):
+                    motion_extrapolate.reload(own, scene)
             motion_extrapolate.reset(anchors)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))

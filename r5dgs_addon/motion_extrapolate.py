@@ -16,9 +16,8 @@ from ..r5dgs_core.motion import keyframes as reduction
 from ..r5dgs_core.motion import rotations
 from ..r5dgs_core.motion.keyframes import Keys
 from ..r5dgs_core.scene import scene_file
+from ..r5dgs_core.scene.scene import Scene
 from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
-
-LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
 
 
 @dataclass(frozen=True)
@@ -162,12 +161,7 @@ def extrapolate_until(
         ConfigError: The end is too far, or an anchor cannot be written; nothing was.
     """
     times = timeline.of_collection(collection)
-    longest = times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit)
-    if not t_end <= longest:
-        raise errors.ConfigError(
-            f"{collection.name}: expected an end up to {longest:.4g}, {LONGEST:g} times as long as was observed, found "
-            f"{t_end:.4g}"
-        )
+    timeline.check_end(collection.name, replace(times, t_end=t_end))
     anchors = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
     kept = [anchor for anchor in anchors if motion_physics.hand_edited(anchor, times)]
     plans = [_plan(anchor, t_end) for anchor in anchors if anchor not in kept]
@@ -194,17 +188,24 @@ def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
     return re_extrapolate(anchors)
 
 
-def check(anchors: list[bpy.types.Object]) -> None:
-    """Refuse, with a ConfigError, anchors that cannot be written, or that something follows which cannot."""
+def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
+    """Refuse, with a ConfigError, to reset anchors that cannot be written, or that something follows which cannot.
+
+    Args:
+        anchors: The anchors.
+        curves: Whether they keep their curves up to t_max, which have to be such as can be cut there.
+    """
     for anchor in [*anchors, *followers(anchors)]:
-        times_of(anchor)
-        motion_curves.place(anchor)
+        times, place = times_of(anchor), motion_curves.place(anchor)
+        if curves or anchor not in anchors:
+            motion_curves.pose_at(anchor, place, times.frame(times.t_max))
+        leader = anchor.r5dgs_motion.learned_leader if anchor in anchors else None
+        if leader is not None and leader not in anchors:
+            motion_physics.model(leader)
 
 
-def reload(anchors: list[bpy.types.Object], path: Path) -> None:
-    """Give anchors the curves of their scene file again, those of the observed time too, up to their scene's end.
-
-    Curves of location and rotation that the user made are replaced; others, such as of scale, stay.
+def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
+    """The scene that anchors were made from, for `reload`.
 
     Args:
         anchors: Anchors of one loaded scene.
@@ -222,6 +223,18 @@ def reload(anchors: list[bpy.types.Object], path: Path) -> None:
         pivot = np.float32(scene.groups[motion_id].pivot) if motion_id < len(scene.groups) else None
         if pivot is None or (motion_id and (np.array(anchor.r5dgs.pivot, np.float32) != pivot).any()):
             raise errors.SceneFileError(f"{path}: expected the scene of '{anchor.name}', found another; load it anew")
+    return scene
+
+
+def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
+    """Give anchors the curves of their scene file again, those of the observed time too, up to their scene's end.
+
+    Curves of location and rotation that the user made are replaced; others, such as of scale, stay.
+
+    Args:
+        anchors: Anchors of one loaded scene.
+        scene: What `source` gave for them.
+    """
     for anchor in anchors:
         times = times_of(anchor)
         motion_curves.make_own(anchor)

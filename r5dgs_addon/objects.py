@@ -96,13 +96,15 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
 
     Raises:
         SceneFileError: The scene has no Gaussians.
+        ConfigError: Extrapolation would end too far.
     """
     if len(scene.means) == 0:
         raise errors.SceneFileError(
             f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
         )
+    times = timeline.Times.of(scene, options.frame_zero, options.t_end)
+    timeline.check_end(path.name, times)
     with nothing_left_after_error():
-        times = timeline.Times.of(scene, options.frame_zero, options.t_end)
         collection = bpy.data.collections.new(table.fit(f"R5DGS {scene.name}"))
         context.scene.collection.children.link(collection)
         extent = scene.extent

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 
 import bpy
 
+from ..r5dgs_core import errors
 from ..r5dgs_core.scene.scene import Scene
 
 MARKER = "t_max"
+LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,24 @@ def default_end(scene: Scene) -> float:
     """End of the extrapolation unless the user says otherwise: a third of the observed span later, and at least 1."""
     start = float(scene.track_times[0])
     return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
+
+
+def check_end(name: str, times: Times) -> None:
+    """Refuse to extrapolate too far; what `default_end` gives is never too far.
+
+    Args:
+        name: What the message calls the scene.
+        times: Its times, with the end that is wanted.
+
+    Raises:
+        ConfigError: The end is no number, or too far.
+    """
+    longest = max(times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit), 1.0)
+    if not times.t_end <= longest:
+        raise errors.ConfigError(
+            f"{name}: expected an end up to {longest:.4g}, {LONGEST:g} times as long as was observed, found "
+            f"{times.t_end:.4g}; extrapolate less far"
+        )
 
 
 def fit(scene: bpy.types.Scene, times: Times) -> None:
