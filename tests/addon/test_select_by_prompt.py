@@ -238,6 +238,18 @@ def test_selecting_can_be_undone_and_redone(blender, loaded):
     assert selected_ids(blender) == {1} and blender.context.view_layer.objects.active.name == "mug anchor"
 
 
+def test_selecting_an_object_by_its_id_can_be_undone_and_redone(blender, loaded):
+    blender.ops.r5dgs.select_object(object_id=6)
+    blender.ops.ed.undo_push(message="before")
+    assert blender.ops.r5dgs.select_object(object_id=1, mode="ADD") == {"FINISHED"}
+    blender.ops.ed.undo_push(message="Select Object")
+    assert selected_ids(blender) == {1, 6}
+    blender.ops.ed.undo()
+    assert selected_ids(blender) == {6}
+    blender.ops.ed.redo()
+    assert selected_ids(blender) == {1, 6} and blender.context.view_layer.objects.active.name == "mug anchor"
+
+
 @pytest.fixture
 def meaningful(blender, tmp_path):
     """A loaded scene whose file knows what a "sour thing" is, and the file."""

@@ -184,3 +184,22 @@ def test_aliases_come_and_go_and_find_the_object(blender, loaded, table):
     assert words() == ["vehicle", "racer", "lorry"]
     blender.ops.ed.redo()
     assert words() == ["racer", "lorry"]
+
+
+def test_adding_and_removing_an_alias_can_be_undone_and_redone(blender, loaded, table):
+    def words():  # undoing may give all data new places in memory
+        collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
+        return [alias.name for alias in table.entry_of(collection, CAR).aliases]
+
+    blender.ops.ed.undo_push(message="before")
+    states = [words()]
+    for call in (blender.ops.r5dgs.add_alias, blender.ops.r5dgs.remove_alias):
+        assert call(word="lorry", object_id=CAR) == {"FINISHED"}
+        blender.ops.ed.undo_push(message="alias")
+        states.append(words())
+    assert states == [states[0], [*states[0], "lorry"], states[0]]
+    for expected in (states[1], states[0]):
+        blender.ops.ed.undo()
+        assert words() == expected
+    blender.ops.ed.redo()
+    assert words() == states[1]
