@@ -8,6 +8,7 @@ wish whole settles it; other wishes are asked of the embeddings, too (`meanings`
 from __future__ import annotations
 
 import difflib
+import functools
 import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
@@ -136,8 +137,18 @@ def wishes(text: str) -> list[list[str]]:
 
 def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
     """Row of the first word of a vocabulary that says a wish, None for none."""
-    wanted = list(wish)
-    return next((row for row, word in enumerate(vocabulary) if [wanted] == wishes(word)), None)
+    return _vocabulary_rows(tuple(vocabulary)).get(tuple(wish))
+
+
+@functools.lru_cache(maxsize=8)
+def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
+    """Row of each word that is one wish, by its normalised words."""
+    rows: dict[tuple[str, ...], int] = {}
+    for row, word in enumerate(vocabulary):
+        said = wishes(word)
+        if len(said) == 1:
+            rows.setdefault(tuple(said[0]), row)
+    return rows
 
 
 def words_of(text: str) -> list[str]:

@@ -1,0 +1,154 @@
+"""How well words find objects by their names: `python benchmarks/words.py --encoder DIR|text [--json FILE]`.
+
+Tables of names alone, without captions, are asked for things that are called otherwise, and for things that are not
+there. The prompts were written down before any threshold was looked at. For each table:
+
+    top1     prompts whose best match is a right one
+    all      prompts whose matches are exactly the right ones
+    nothing  prompts for absent things that find nothing
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.semantics import encoders, lookup_table, query
+
+NAMES = {
+    "kitchen": ("mug", "lemon", "apple", "donut", "cutting board", "bowl"),
+    "chessboard": (
+        "white king", "black queen", "white rook", "black rook", "white knight", "black bishop", "black pawn",
+        "white pawn",
+    ),
+    "darkroom": (
+        "film reel", "canister", "tray", "film strip", "cabinet door", "film can", "trolley", "developing tank",
+    ),
+    "dining": ("lamp", "chair", "stool", "plate", "orange", "teapot", "ball", "pepper mill"),
+    "factory": (
+        "red crate", "blue crate", "drum", "robot arm", "crane load", "gear", "pinion", "barrel", "cart", "press ram",
+        "toolbox",
+    ),
+    "nonrigid": ("flag", "balloon", "toy car", "wooden block", "vase"),
+    "toys": (
+        "lemon", "apple", "donut", "mug", "fork", "table", "sofa", "lamp", "wall", "floor", "rook", "knight", "book",
+        "ball", "car",
+    ),
+}  # fmt: skip
+PRESENT = {
+    "kitchen": {
+        "fruit": ("lemon", "apple"), "pastry": ("donut",), "citrus": ("lemon",), "doughnut": ("donut",),
+        "cup": ("mug",), "dish": ("bowl",), "crockery": ("mug", "bowl"), "something sour": ("lemon",),
+        "food": ("lemon", "apple", "donut"),
+    },
+    "chessboard": {
+        "castle": ("white rook", "black rook"), "horse": ("white knight",), "monarch": ("white king", "black queen"),
+    },
+    "darkroom": {
+        "movie reel": ("film reel",), "cupboard": ("cabinet door",), "wagon": ("trolley",),
+        "container": ("canister", "film can", "developing tank"),
+    },
+    "dining": {
+        "furniture": ("chair", "stool"), "seat": ("chair", "stool"), "fruit": ("orange",), "kettle": ("teapot",),
+        "light": ("lamp",), "crockery": ("plate", "teapot"), "toy": ("ball",), "spice grinder": ("pepper mill",),
+    },
+    "factory": {
+        "box": ("red crate", "blue crate", "toolbox"), "cogwheel": ("gear", "pinion"), "keg": ("barrel",),
+        "vehicle": ("cart",), "manipulator": ("robot arm",), "container": ("red crate", "blue crate", "drum", "barrel"),
+    },
+    "nonrigid": {
+        "banner": ("flag",), "vehicle": ("toy car",), "automobile": ("toy car",), "jar": ("vase",),
+        "piece of wood": ("wooden block",),
+    },
+    "toys": {
+        "fruit": ("lemon", "apple"), "pastry": ("donut",), "cutlery": ("fork",), "furniture": ("sofa", "table"),
+        "citrus": ("lemon",), "couch": ("sofa",), "board game piece": ("rook", "knight"), "vehicle": ("car",),
+        "light": ("lamp",), "something to read": ("book",),
+    },
+}  # fmt: skip
+ABSENT = (
+    "elephant", "aeroplane", "dinosaur", "bicycle", "piano", "shoe", "tree", "dog", "computer", "guitar", "bed",
+    "umbrella", "hammer", "shark", "cloud", "person", "tiger", "sword", "telephone", "boat", "sandwich", "window",
+)  # fmt: skip
+
+
+def named(names: tuple[str, ...]) -> Scene:
+    """A scene of one Gaussian for each name: words need no more."""
+    count = len(names)
+    objects = (
+        SceneObject(0, "background", (), "", (0.5, 0.5, 0.5), 0, 0),
+        *(SceneObject(k + 1, name, (), "", (0.5, 0.5, 0.5), k, 1) for k, name in enumerate(names)),
+    )
+    pinned = MotionGroup(0, 0, "pinned", -1, np.zeros(3), MotionModel())
+    return Scene(
+        name="names",
+        means=np.zeros((count, 3), np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.zeros((count, 3), np.float32),
+        opacity_logits=np.zeros(count, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        object_ids=np.arange(1, count + 1, dtype=np.int32),
+        motion_ids=np.zeros(count, np.int32),
+        track_times=np.zeros(1),
+        track_poses=np.array([[[1.0, 0, 0, 0, 0, 0, 0]]]),
+        objects=objects,
+        groups=(pinned,),
+        t_max=0.0,
+        frames_per_unit=60.0,
+        world_convention="blender",
+        cameras=(),
+        background_sh=np.zeros((1, 3), np.float32),
+    )
+
+
+def measure(name: str, encoder: encoders.Encoder) -> dict[str, Any]:
+    """One row: counts, and what went wrong."""
+    scene = lookup_table.make(named(NAMES[name]), encoder).scene
+    called = {item.id: item.name for item in scene.objects}
+    row: dict[str, Any] = {"table": name, "present": 0, "top1": 0, "all": 0, "absent": 0, "nothing": 0, "wrong": []}
+    for prompt, right in PRESENT[name].items():
+        found = [called[match.object_id] for match in query.find(scene, prompt, encoder)]
+        row["present"] += 1
+        row["top1"] += bool(found) and found[0] in right
+        row["all"] += set(found) == set(right)
+        if set(found) != set(right):
+            row["wrong"].append(f"{prompt}: {', '.join(found) or 'nothing'} instead of {', '.join(right)}")
+    for prompt in ABSENT:
+        found = [called[match.object_id] for match in query.find(scene, prompt, encoder)]
+        row["absent"] += 1
+        row["nothing"] += not found
+        if found:
+            row["wrong"].append(f"{prompt}: {', '.join(found)} instead of nothing")
+    return row
+
+
+def main() -> None:
+    """Measure all tables and print them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--encoder", default="text", help="folder, or text")
+    parser.add_argument("--json", type=Path, help="where the rows go")
+    args = parser.parse_args()
+    encoder = encoders.open_encoder(args.encoder)
+    rows = [measure(name, encoder) for name in NAMES]
+    print("| table | top-1 | exactly the right ones | nothing for absent things |\n|---|---|---|---|")
+    for row in rows:
+        print(f"| {row['table']} | {row['top1']}/{row['present']} | {row['all']}/{row['present']} "
+              f"| {row['nothing']}/{row['absent']} |")  # fmt: skip
+    total = {key: sum(row[key] for row in rows) for key in ("present", "top1", "all", "absent", "nothing")}
+    print(f"| all | {total['top1']}/{total['present']} | {total['all']}/{total['present']} "
+          f"| {total['nothing']}/{total['absent']} |\n")  # fmt: skip
+    for row in rows:
+        for line in row["wrong"]:
+            print(f"{row['table']}: {line}")
+    if args.json:
+        args.json.write_text(json.dumps({"encoder": encoder.card.name, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""CLIP and SigLIP by transformers, without torchvision: words and pictures in one space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import errors
+from ..scene.meanings import EncoderCard
+from . import encoders
+
+TEMPLATES = ("{}", "a photo of a {}", "a render of a {}")
+_BATCH = 16
+
+
+class ClipEncoder:
+    """A CLIP or SigLIP model of a folder.
+
+    Args:
+        folder: With config.json, model.safetensors, a tokenizer and preprocessor_config.json.
+        kind: "clip" or "siglip".
+    """
+
+    def __init__(self, folder: Path, kind: str):
+        try:
+            import torch
+            from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
+        except ImportError as error:
+            raise encoders.missing_package(error) from error
+        self._torch = torch
+        encoders.read_json(folder / "preprocessor_config.json")
+        paths = encoders.weights_of(folder)
+        try:
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
+            self._processor = AutoImageProcessor.from_pretrained(str(folder), local_files_only=True, backend="pil")
+            self._model, info = AutoModel.from_pretrained(
+                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+            )
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        encoders.check_loaded(folder, info)
+        self._model.eval()
+        text = self._model.config.text_config
+        self._longest = int(text.max_position_embeddings)
+        self._padding: Any = "max_length" if kind == "siglip" else True  # SigLIP was trained on one length
+        dimension = int(self._model.config.projection_dim if kind == "clip" else text.projection_size)
+        digest = encoders.digest_of(paths)
+        self.card = EncoderCard(kind, folder.name, digest, dimension, TEMPLATES, encoders.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoders.Encoder`."""
+        parts = [np.zeros((0, self.card.dimension), np.float32)]
+        for start in range(0, len(texts), _BATCH):
+            tokens = self._tokenizer(
+                list(texts[start : start + _BATCH]),
+                padding=self._padding,
+                truncation=True,
+                max_length=self._longest,
+                return_tensors="pt",
+            )
+            known = {name: tokens[name] for name in ("input_ids", "attention_mask") if name in tokens}
+            with self._torch.no_grad():
+                parts.append(_pooled(self._model.get_text_features(**known)))
+        return np.concatenate(parts)
+
+    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """See `encoders.Encoder`."""
+        parts = [np.zeros((0, self.card.dimension), np.float32)]
+        for start in range(0, len(images), _BATCH):
+            batch = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8) for image in images[start : start + _BATCH]]
+            pixels = self._processor(images=batch, return_tensors="pt")["pixel_values"]
+            with self._torch.no_grad():
+                parts.append(_pooled(self._model.get_image_features(pixel_values=pixels)))
+        return np.concatenate(parts)
+
+
+def _pooled(features: Any) -> np.ndarray:
+    """Unit rows of what transformers returns: an output with ``pooler_output``, a tensor before its version 5."""
+    return encoders.unit(getattr(features, "pooler_output", features).float().numpy())

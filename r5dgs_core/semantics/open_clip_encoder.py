@@ -1,0 +1,71 @@
+"""Folders of open_clip, such as Meta's Perception Encoder; needs the package open_clip, and so torchvision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .. import errors
+from ..scene.meanings import EncoderCard
+from . import encoders
+from .clip_encoder import TEMPLATES
+
+_BATCH = 16
+
+
+class OpenClipEncoder:
+    """A model of a folder with open_clip_config.json and open_clip_model.safetensors.
+
+    Args:
+        folder: The folder.
+    """
+
+    def __init__(self, folder: Path):
+        config = encoders.read_json(folder / "open_clip_config.json")
+        try:
+            import open_clip
+            import torch
+        except (ImportError, RuntimeError) as error:  # a torchvision for another torch is a RuntimeError
+            name = getattr(error, "name", None) or error
+            raise errors.BackendError(
+                f"{folder}: open_clip cannot be imported ({name}); install it with a torchvision that fits this torch: "
+                "pip install 'r5dgs[open_clip]'; or use a CLIP or SigLIP folder of transformers, which needs neither"
+            ) from error
+        self._torch = torch
+        paths = encoders.weights_of(folder, "open_clip_model*.safetensors")
+        where = f"local-dir:{folder.resolve()}"
+        try:
+            self._model, self._preprocess = open_clip.create_model_from_pretrained(where)
+            self._tokenizer = open_clip.get_tokenizer(where)
+            dimension = int(config["model_cfg"]["embed_dim"])
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        self._model.eval()
+        digest = encoders.digest_of(paths)
+        self.card = EncoderCard("open_clip", folder.name, digest, dimension, TEMPLATES, encoders.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoders.Encoder`."""
+        parts = [np.zeros((0, self.card.dimension), np.float32)]
+        for start in range(0, len(texts), _BATCH):
+            with self._torch.no_grad():
+                found = self._model.encode_text(self._tokenizer(list(texts[start : start + _BATCH])), normalize=True)
+            parts.append(encoders.unit(found.float().numpy()))
+        return np.concatenate(parts)
+
+    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """See `encoders.Encoder`."""
+        from PIL import Image
+
+        parts = [np.zeros((0, self.card.dimension), np.float32)]
+        for start in range(0, len(images), _BATCH):
+            batch = [
+                self._preprocess(Image.fromarray(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)))
+                for image in images[start : start + _BATCH]
+            ]
+            with self._torch.no_grad():
+                found = self._model.encode_image(self._torch.stack(batch), normalize=True)
+            parts.append(encoders.unit(found.float().numpy()))
+        return np.concatenate(parts)

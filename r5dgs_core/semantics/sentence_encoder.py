@@ -1,0 +1,91 @@
+"""Sentence models (MiniLM and its kin) by transformers: they know words, and cannot look at pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .. import errors
+from ..scene.meanings import EncoderCard
+from . import encoders
+
+# Sentences bring out what a thing is: such models learnt from pairs of captions that imply or contradict each other.
+# Those that name a person or a hand find persons and hands everywhere.
+TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
+_BATCH = 64
+_POOLING = Path("1_Pooling") / "config.json"
+
+
+class SentenceEncoder:
+    """A sentence model of a folder: the mean over the last layer's tokens, or its first one, as the folder says.
+
+    Args:
+        folder: With config.json, model.safetensors and a tokenizer.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            import torch
+            from transformers import AutoModel, AutoTokenizer
+        except ImportError as error:
+            raise encoders.missing_package(error) from error
+        self._torch = torch
+        config = encoders.read_json(folder / "config.json")
+        paths = encoders.weights_of(folder)
+        self._first = _takes_first(folder)
+        try:
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
+            self._model, info = AutoModel.from_pretrained(
+                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+            )
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        encoders.check_loaded(folder, info, unused=("pooler.",))
+        self._model.eval()
+        self._longest = min(int(config.get("max_position_embeddings", 512)), 512) - 2
+        dimension = int(self._model.config.hidden_size)
+        name = folder.parent.name if folder.name == "model" else folder.name
+        self.card = EncoderCard("text", name, encoders.digest_of(paths), dimension, TEMPLATES, encoders.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoders.Encoder`."""
+        torch = self._torch
+        parts = [np.zeros((0, self.card.dimension), np.float32)]
+        for start in range(0, len(texts), _BATCH):
+            tokens = self._tokenizer(
+                list(texts[start : start + _BATCH]),
+                padding=True,
+                truncation=True,
+                max_length=self._longest,
+                return_tensors="pt",
+            )
+            with torch.no_grad():
+                states = self._model(**tokens).last_hidden_state.float()
+            if self._first:
+                pooled = states[:, 0]
+            else:
+                present = tokens["attention_mask"][..., None].float()
+                pooled = (states * present).sum(1) / present.sum(1).clamp(min=1)
+            parts.append(encoders.unit(pooled.numpy()))
+        return np.concatenate(parts)
+
+    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Refused: a sentence model has no eyes."""
+        raise errors.BackendError(
+            f"encoder {self.card.name}: a sentence model cannot look at pixels; give a CLIP or SigLIP folder for that"
+        )
+
+
+def _takes_first(folder: Path) -> bool:
+    """Whether a sentence is the first token's state instead of the mean of all."""
+    if not (folder / _POOLING).is_file():
+        return False
+    modes = {name for name, on in encoders.read_json(folder / _POOLING).items() if name.startswith("pooling_") and on}
+    if modes - {"pooling_mode_mean_tokens", "pooling_mode_cls_token"} or len(modes) > 1:
+        raise errors.BackendError(
+            f"{folder / _POOLING}: expected pooling by the mean of tokens or by the first one, found "
+            f"{', '.join(sorted(modes))}; use another sentence model"
+        )
+    return modes == {"pooling_mode_cls_token"}
