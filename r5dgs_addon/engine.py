@@ -15,10 +15,12 @@ from . import (
     engine_cryptomatte,
     engine_passes,
     engine_settings,
+    engine_stereo,
     engine_view,
     objects,
     picture,
     viewport,
+    views,
     worker,
 )
 
@@ -66,6 +68,11 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         self._port.draw(self, context, depsgraph)
 
     def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
+        for view, eye in engine_stereo.eyes(self, depsgraph):
+            if not self.test_break():
+                self._render_view(depsgraph, view, eye)
+
+    def _render_view(self, depsgraph: bpy.types.Depsgraph, view: str, eye: views.Eye | None) -> None:
         scene, layer = depsgraph.scene, depsgraph.view_layer
         if not objects.scene_collections():
             raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
@@ -79,7 +86,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
             )
         passes, transparent = engine_passes.of_layer(layer), scene.render.film_transparent
         mattes = engine_cryptomatte.pass_names(layer)
-        seen = picture.shown(depsgraph)
+        seen = picture.shown(depsgraph, eye=eye)
         if seen.scenes:
             sky = engine_settings.of(scene).sky and not transparent
             steps = picture.steps(seen, engine_passes.wanted(passes, transparent), sky)
@@ -93,7 +100,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
             return
         for one in passes[1:]:
             self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
-        rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name)
+        rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name, view=view)
         filled = {one.name: engine_passes.pixels(one, arrays, seen, transparent, inverse) for one in passes}
         engine_passes.fill(rendered.layers[0], filled)
         self.end_result(rendered)

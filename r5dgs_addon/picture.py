@@ -5,6 +5,7 @@ sRGB, as trained. It is kept in an image of 8 bits per channel in the color spac
 they are, saves the same bytes, and linearises them where the compositor needs it.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,10 @@ class Shown:
 
 
 def shown(
-    depsgraph: bpy.types.Depsgraph, view: views.View | None = None, space: bpy.types.SpaceView3D | None = None
+    depsgraph: bpy.types.Depsgraph,
+    view: views.View | None = None,
+    space: bpy.types.SpaceView3D | None = None,
+    eye: views.Eye | None = None,
 ) -> Shown:
     """What Blender shows of its loaded scenes at the evaluated frame, sub-frame included.
 
@@ -51,6 +55,7 @@ def shown(
         depsgraph: Evaluated; one of a viewport hides what viewports hide, one of a render what renders hide.
         view: What looks, of `views`; the active camera where None.
         space: A 3D view whose local view hides the rest.
+        eye: What looks instead of the active camera, where no view is given.
 
     Returns:
         View, scenes and instances.
@@ -60,7 +65,7 @@ def shown(
     """
     scenes, instances = visible.instances(depsgraph, space)
     if view is None:
-        view = views.of_camera(depsgraph, visible.points(instances))
+        view = views.of_camera(depsgraph, visible.points(instances), eye=eye)
     return Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
 
 
@@ -109,7 +114,7 @@ def scene_path(collection: bpy.types.Collection) -> Path:
         if place.is_file():
             return place
     raise errors.SceneFileError(
-        f"{places[0]}: expected the scene that '{collection.name}' was loaded from, found no file; choose its new "
+        f"{os.path.normpath(places[0])}: expected the scene that '{collection.name}' was loaded from, found no file; choose its new "
         "place under 'Scene File' in the R5DGS tab"
     )
 

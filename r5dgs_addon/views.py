@@ -36,11 +36,27 @@ class View:
         }
 
 
+@dataclass(frozen=True)
+class Eye:
+    """One of the places that a stereoscopic camera sees from.
+
+    Attributes:
+        camera: The camera.
+        matrix_world: Where the eye is, to world, Blender's camera axes. [4, 4]
+        shift_x: Its shift, which is the camera's and that of the eye.
+    """
+
+    camera: bpy.types.Object
+    matrix_world: np.ndarray
+    shift_x: float
+
+
 def of_camera(
     depsgraph: bpy.types.Depsgraph,
     points: Callable[[], np.ndarray],  # [P, 3]
     camera: bpy.types.Object | None = None,
     border: bool = True,
+    eye: Eye | None = None,
 ) -> View:
     """The picture that Blender would render.
 
@@ -49,6 +65,7 @@ def of_camera(
         points: Gives points around what is seen, Blender's world; called for orthographic cameras alone.
         camera: The camera; the scene's active one where None.
         border: Whether a render border cuts the picture; else it is whole.
+        eye: What looks instead of the camera.
 
     Returns:
         The view.
@@ -57,6 +74,8 @@ def of_camera(
         ConfigError: There is no camera, or it is panoramic.
     """
     scene = depsgraph.scene
+    if eye is not None:
+        camera = eye.camera
     camera = scene.camera if camera is None else camera
     if camera is None or camera.type != "CAMERA":
         raise errors.ConfigError(f"{scene.name}: expected an active camera, found none; add one to the scene")
@@ -71,7 +90,16 @@ def of_camera(
     projection = evaluated.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
-    view = _view(projection, evaluated.matrix_world, width, height, points, camera.name, behind=False)
+    world = evaluated.matrix_world
+    if eye is not None:
+        projection = np.array(projection, np.float64)
+        shift = 2 * (eye.shift_x - evaluated.data.shift_x) * _fitted(camera.data, render, width, height) / width
+        if cameras.is_parallel(projection):
+            projection[0, 3] -= shift
+        else:
+            projection[0, 2] += shift
+        world = eye.matrix_world
+    view = _view(projection, world, width, height, points, camera.name, behind=False)
     if border and render.use_border:
         left, top, cut_width, cut_height = border_of(scene)
         return View(cameras.crop(view.camera, left, top, cut_width, cut_height), view.distance, view.near)
@@ -119,6 +147,13 @@ def border_of(scene: bpy.types.Scene) -> tuple[int, int, int, int]:
     left, right = int(render.border_min_x * width), int(render.border_max_x * width)
     bottom, top = int(render.border_min_y * height), int(render.border_max_y * height)
     return left, height - top, max(right - left, 1), max(top - bottom, 1)
+
+
+def _fitted(camera: bpy.types.Camera, render: bpy.types.RenderSettings, width: int, height: int) -> float:
+    """Pixels of width that a shift of 1 is: those of the side that the sensor is fitted to."""
+    across, up = render.pixel_aspect_x * width, render.pixel_aspect_y * height
+    horizontal = camera.sensor_fit == "HORIZONTAL" or camera.sensor_fit == "AUTO" and across >= up
+    return width if horizontal else up / render.pixel_aspect_x
 
 
 def _view(projection, matrix_world, width: int, height: int, points: Callable, name: str, behind: bool) -> View:
