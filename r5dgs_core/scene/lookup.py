@@ -201,8 +201,7 @@ def _fulfil(
 
 
 def _by_meaning(one: stored.Meant, said: str) -> Match:
-    sure = "" if one.relevancy is None else f", relevancy {one.relevancy:.2f}"
-    why = f"meaning of {said!r} (cosine {one.cosine:.2f}{sure})"
+    why = f"meaning of {said!r} ({one.cosine:.2f})"
     return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
 
 

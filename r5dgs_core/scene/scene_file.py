@@ -117,6 +117,20 @@ def read(path: str | Path) -> Scene:
     return scene
 
 
+def is_exact(path: str | Path) -> bool:
+    """Whether a file stores anything in the precision of memory that the compact form would round: who writes what was
+    read of it loses nothing with ``exact``."""
+    with _open(Path(path)) as archive:
+        listed = scene_json.words(_read_json(archive, str(path)), "arrays", f"{path}: {JSON_MEMBER}")
+        for name in (*FIXED_POINT, *_HALF):
+            if name in listed and f"{name}.npy" in archive.namelist():
+                with archive.open(f"{name}.npy") as stream:
+                    np.lib.format.read_magic(stream)
+                    if np.lib.format.read_array_header_1_0(stream)[2].itemsize == 4:
+                        return True
+    return False
+
+
 def read_meanings(path: str | Path) -> meanings.Meanings | None:
     """Only the stored embeddings of a scene, None where it has none. Raises as `read` does."""
     place = str(path)

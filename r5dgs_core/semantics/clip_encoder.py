@@ -30,6 +30,7 @@ class ClipEncoder:
             from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
         except ImportError as error:
             raise encoders.missing_package(error) from error
+        encoders.quieten()
         self._torch = torch
         encoders.read_json(folder / "preprocessor_config.json")
         paths = encoders.weights_of(folder)

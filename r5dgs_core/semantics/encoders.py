@@ -161,6 +161,14 @@ def digest_of(paths: Sequence[Path]) -> str:
     return found.hexdigest()
 
 
+def quieten() -> None:
+    """Let transformers say nothing by itself: what matters is checked and said here."""
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()
+    logging.set_verbosity_error()
+
+
 def missing_package(error: ImportError, extra: str = "encoders") -> errors.BackendError:
     """What to say where an optional package is missing."""
     return errors.BackendError(

@@ -31,6 +31,7 @@ class SentenceEncoder:
             from transformers import AutoModel, AutoTokenizer
         except ImportError as error:
             raise encoders.missing_package(error) from error
+        encoders.quieten()
         self._torch = torch
         config = encoders.read_json(folder / "config.json")
         paths = encoders.weights_of(folder)
