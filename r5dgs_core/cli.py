@@ -1,6 +1,6 @@
-"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, warm-up.
+"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, lookup, query, name, warm-up.
 
-What each sub-command does is in `commands`.
+What each sub-command does is in `commands` and its neighbours.
 """
 
 from __future__ import annotations
@@ -105,6 +105,28 @@ def parser() -> argparse.ArgumentParser:
     info.add_argument("file", type=Path, help=".r5dgs file")
     info.add_argument("--json", action="store_true", help="as JSON")
 
+    words = commands.add_parser("lookup", help="teach a scene what its objects are, by an encoder of words and pictures")
+    words.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file; the table is written into it")
+    words.add_argument("--encoder", required=True, metavar="DIR|text", help="folder of the encoder; text: a small one")
+    words.add_argument("--out", type=Path, metavar="FILE.r5dgs", help="scene file to write instead")
+    words.add_argument("--captions", type=Path, metavar="FILE.json", help="by id or name: captions, names, aliases")
+    words.add_argument("--words", type=Path, metavar="FILE.txt", help="more words to store, one a line")
+    add_progress(words)
+
+    query = commands.add_parser("query", help="say which objects a text names or means, or that none does")
+    query.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file")
+    query.add_argument("text", help="one or several things: 'red mug', 'mugs and lemon'")
+    query.add_argument("--encoder", metavar="DIR|text", help="that of the scene's table, for words it does not store")
+    query.add_argument("--threshold", type=float, metavar="SCORE", help="least score of a match, 0 to 1 (default: 0.5)")
+    query.add_argument("--json", action="store_true", help="as JSON")
+
+    name = commands.add_parser("name", help="name an object of a scene, and say what else it is called")
+    name.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
+    name.add_argument("object", help="id or name of the object")
+    name.add_argument("name", nargs="?", help="its new name")
+    name.add_argument("--alias", action="append", default=[], metavar="WORD", help="word that finds it; may be repeated")
+    name.add_argument("--caption", metavar="TEXT", help="a sentence about it")
+
     warm_up = commands.add_parser("warm-up", help="compile the kernels now, once, instead of at the first picture")
     add_progress(warm_up)
     return top
@@ -188,6 +210,17 @@ def _dispatch(args: argparse.Namespace) -> int:
             overrides=tuple(overrides),
         )
         benchmark.run_bench(plan, remeasure=args.remeasure, progress_kind=args.progress)
+    elif args.command in ("lookup", "query", "name"):
+        from . import commands_words
+
+        if args.command == "lookup":
+            options = {"out": args.out, "captions": args.captions, "words": args.words}
+            commands_words.run_lookup(args.file, args.encoder, **options, progress_kind=args.progress)
+        elif args.command == "query":
+            options = {"encoder": args.encoder, "threshold": args.threshold, "as_json": args.json}
+            commands_words.run_query(args.file, args.text, **options)
+        else:
+            commands_words.run_name(args.file, args.object, args.name, aliases=args.alias, caption=args.caption)
     elif args.command == "warm-up":
         commands.run_warm_up(progress_kind=args.progress)
     else:

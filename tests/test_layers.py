@@ -37,7 +37,8 @@ ALLOWED = {
         *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
         "importing",
     },
-    "cli": {"commands", "demo", "bench", "scene"},
+    "commands_words": {"scene", "semantics", "progress"},
+    "cli": {"commands", "commands_words", "demo", "bench", "scene"},
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
