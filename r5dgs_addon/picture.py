@@ -114,8 +114,8 @@ def scene_path(collection: bpy.types.Collection) -> Path:
         if place.is_file():
             return place
     raise errors.SceneFileError(
-        f"{os.path.normpath(places[0])}: expected the scene that '{collection.name}' was loaded from, found no file; choose its new "
-        "place under 'Scene File' in the R5DGS tab"
+        f"{os.path.normpath(places[0])}: expected the scene that '{collection.name}' was loaded from, found no file; "
+        "choose its new place under 'Scene File' in the R5DGS tab"
     )
 
 

@@ -2,10 +2,8 @@
 
 import importlib
 import inspect
-import os
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -308,106 +306,3 @@ def test_what_was_loaded_lives_on_without_the_extension_and_is_known_again_after
         extension.register()
     assert {obj.name for obj in blender.data.objects} == before
     assert plays(blender, loaded(blender), scene_path)
-
-
-# --- bad input ---
-
-
-@pytest.fixture
-def bad(tmp_path, scene_path):
-    """Makes a bad input of a kind; returns its path."""
-
-    def make(kind):
-        path = tmp_path / f"{kind}.r5dgs"
-        if kind == "newer":
-            with_json(scene_path, path, lambda text: text.replace('"format_version": 1', '"format_version": 99'))
-        elif kind == "folder":
-            path.mkdir()
-            (path / "r_000.png").write_bytes(b"\x89PNG")
-        elif kind == "image":
-            path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(500))
-        elif kind == "no Gaussians":
-            scene_file.write(scenes.make_scene(n=0, objects=0, unassigned=0, shadows=False), path)
-        elif kind == "half copied":
-            path.write_bytes(scene_path.read_bytes()[:-300])
-        return path
-
-    return make
-
-
-def with_json(source, target, change):
-    import zipfile
-
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
-        for name in old.namelist():
-            data = old.read(name)
-            if name == "scene.json":
-                changed = change(data.decode())
-                assert changed != data.decode()
-                data = changed.encode()
-            new.writestr(name, data)
-
-
-REMEDIES = {
-    "newer": "update R5DGS",
-    "folder": "expected a .r5dgs file, found a folder.*r5dgs train",
-    "image": "bake or copy it again",
-    "no Gaussians": "expected Gaussians, found none",
-    "half copied": "bake or copy it again",
-    "not there": "found nothing",
-}
-
-
-@pytest.mark.parametrize("kind", REMEDIES)
-def test_bad_input_says_what_to_do_and_changes_nothing(blender, bad, kind, tmp_path):
-    path = bad(kind)
-    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
-    before, selected = contents(blender), list(blender.context.selected_objects)
-    range_before = blender.context.scene.frame_end
-    with pytest.raises(RuntimeError, match=f"(?s){path.name}.*{REMEDIES[kind]}") as caught:
-        blender.ops.r5dgs.load_scene(filepath=str(path))
-    assert "Traceback" not in str(caught.value)
-    assert contents(blender) == before and list(blender.context.selected_objects) == selected
-    assert blender.context.scene.frame_end == range_before and not blender.context.scene.timeline_markers
-
-
-NEEDING_A_SCENE = (
-    "add_alias", "exact_mode", "export_masks", "export_ply", "export_scene", "extrapolate_until", "isolate", "preview",
-    "remove_alias", "rename_object", "select_by_prompt", "select_object", "set_display", "show_confidence",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("name", NEEDING_A_SCENE)
-def test_without_a_scene_every_action_asks_for_one(blender, name):
-    with pytest.raises(RuntimeError, match="Load an R5DGS scene first"):
-        getattr(blender.ops.r5dgs, name)()
-
-
-def test_no_file_at_all_is_asked_for(blender):
-    with pytest.raises(RuntimeError, match="choose a .r5dgs file"):
-        blender.ops.r5dgs.load_scene()
-
-
-def test_a_scene_of_background_alone_loads_and_says_so(blender, tmp_path, capfd):
-    path = scene_file.write(scenes.make_scene(n=50, objects=0, unassigned=0), tmp_path / "still.r5dgs")
-    collection = load(blender, path)
-    assert "no objects" in capfd.readouterr().out
-    assert plays(blender, collection, path)
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights to read are those of POSIX here")
-@pytest.mark.parametrize("what", ["file", "folder"])
-def test_without_the_right_to_read_it_says_so(blender, scene_path, what):
-    locked: Path = scene_path if what == "file" else scene_path.parent
-    locked.chmod(0)
-    is_root, before = os.geteuid() == 0, contents(blender)
-    if is_root:
-        os.seteuid(65534)  # who may read everything reads as nobody
-    try:
-        with pytest.raises(RuntimeError, match="cannot be read") as caught:
-            blender.ops.r5dgs.load_scene(filepath=str(scene_path))
-    finally:
-        if is_root:
-            os.seteuid(0)
-        locked.chmod(0o755)
-    assert "Traceback" not in str(caught.value) and contents(blender) == before
