@@ -105,7 +105,7 @@ def parser() -> argparse.ArgumentParser:
     info.add_argument("file", type=Path, help=".r5dgs file")
     info.add_argument("--json", action="store_true", help="as JSON")
 
-    words = commands.add_parser("lookup", help="teach a scene what its objects are, by an encoder of words and pictures")
+    words = commands.add_parser("lookup", help="teach a scene what words its objects mean")
     words.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file; the table is written into it")
     words.add_argument("--encoder", required=True, metavar="DIR|text", help="folder of the encoder; text: a small one")
     words.add_argument("--out", type=Path, metavar="FILE.r5dgs", help="scene file to write instead")
@@ -124,7 +124,7 @@ def parser() -> argparse.ArgumentParser:
     name.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
     name.add_argument("object", help="id or name of the object")
     name.add_argument("name", nargs="?", help="its new name")
-    name.add_argument("--alias", action="append", default=[], metavar="WORD", help="word that finds it; may be repeated")
+    name.add_argument("--alias", action="append", default=[], metavar="WORD", help="a word that finds it; repeatable")
     name.add_argument("--caption", metavar="TEXT", help="a sentence about it")
 
     warm_up = commands.add_parser("warm-up", help="compile the kernels now, once, instead of at the first picture")
