@@ -19,6 +19,7 @@ from torch import Tensor
 from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..raster import rasterize_splats
+from ..raster.segment_weights import segment_weights
 from ..scene.scene import IDENTITY_DIM
 from . import identity_losses
 from .config import Config
@@ -27,7 +28,6 @@ from .sections import IdentitySection
 from .views import TrainView, spread
 
 VOTE_VIEWS = 80
-VOTE_CLASSES = 32  # that vote in one pass, so that many objects take no more memory than some
 NEIGHBOURS_EVERY = 300  # steps after which neighbours are looked for anew, where the Gaussians are still the same
 
 
@@ -52,13 +52,8 @@ def vote(
         target = class_map(view, classes)
         with torch.no_grad():
             splats = pose(view)
-        for first in range(0, count, VOTE_CLASSES):
-            some = torch.arange(first, min(first + VOTE_CLASSES, count))
-            one_hot = (target[..., None] == some).float()
-            channels = torch.zeros(len(fallback), len(some), requires_grad=True)
-            image = _rasterize(splats, channels, view)
-            (gradient,) = torch.autograd.grad(image, channels, one_hot)
-            weights[:, some] += gradient
+        given = (splats.means, splats.quats, splats.scales, splats.opacities)
+        weights += segment_weights(*given, view.camera, target, count)
     return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
 
 
