@@ -90,9 +90,18 @@ def objections(scene: bpy.types.Scene) -> list[str]:
     While the inverse of a view is still to be made, the view is objected to.
     """
     found, made = differences(scene), inverse(scene)
-    if made is None:
-        return found
-    return [*found, f"off by {made.error:.0f} of 255 steps"] if made.error > FAIR else []
+    if made is not None:
+        found = [*found, f"off by {made.error:.0f} of 255 steps"] if made.error > FAIR else []
+    return found + (["the output's own color management"] if _saves_otherwise(scene) else [])
+
+
+def _saves_otherwise(scene: bpy.types.Scene) -> bool:
+    """Whether files are written with another view than the scene's (Output > Color Management > Override)."""
+    output, view = scene.render.image_settings, scene.view_settings
+    if output.color_management != "OVERRIDE":
+        return False
+    names = ("view_transform", "look", "exposure", "gamma", "use_curve_mapping")
+    return any(getattr(output.view_settings, name) != getattr(view, name) for name in names)
 
 
 def differences(scene: bpy.types.Scene) -> list[str]:
@@ -116,6 +125,7 @@ def differences(scene: bpy.types.Scene) -> list[str]:
 def show_as_trained(scene: bpy.types.Scene) -> None:
     """Set a scene's colour management such that it has no `objections`."""
     view = scene.view_settings
+    scene.render.image_settings.color_management = "FOLLOW_SCENE"
     view.view_transform, view.exposure, view.gamma, view.use_curve_mapping = STANDARD, 0.0, 1.0, False
     view.look = "None"  # after the view transform, which decides what looks there are
     if hasattr(view, "use_white_balance"):

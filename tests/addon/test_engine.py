@@ -322,6 +322,29 @@ def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene,
     assert color.objections(blender.context.scene) == ["view transform False Color"]
 
 
+def test_an_output_with_a_view_of_its_own_is_named(blender, loaded):
+    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    blend_scene = blender.context.scene
+    output = blend_scene.render.image_settings
+    output.color_management, output.view_settings.view_transform = "OVERRIDE", "Filmic"
+    assert color.objections(blend_scene) == ["the output's own color management"]
+    blender.ops.r5dgs.show_colors_as_trained()
+    assert color.objections(blend_scene) == []
+
+
+def test_a_transparent_film_has_straight_colours_as_trained_under_agx(blender, loaded, scene, tmp_path):
+    blender.context.scene.view_settings.view_transform = "AgX"
+    blender.context.scene.render.film_transparent = True
+    go_to(blender, 0.4)
+    expected = core(scene, 0.4, background=None)
+    alpha = expected.alpha.numpy()
+    straight = np.clip(expected.color.numpy() / np.maximum(alpha, 1e-6)[..., None], 0, 1)
+    saved = render_png(blender, tmp_path)
+    pale = (alpha > 0.1) & (np.ptp(straight, axis=-1) < 0.3)
+    assert psnr(saved[..., 3], alpha) > 45 and pale.sum() > 50
+    assert np.median(255 * np.abs(saved[pale][:, :3] - straight[pale]).max(axis=-1)) <= 1
+
+
 def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
     view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
     before = len(blender.data.scenes), len(blender.data.images)
