@@ -7,6 +7,7 @@ Needs ``xdotool``, and a worker's Python (`R5DGS_PYTHON`) where that is not foun
 named below, of which some may be asked for. Ends with exit code 1 where one fails.
 """
 
+import contextlib
 import inspect
 import sys
 import tempfile
@@ -19,7 +20,7 @@ from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
 import window as w  # noqa: E402
-from check_viewport import pixels  # noqa: E402
+from check_viewport import full_picture, pixels  # noqa: E402
 
 SIDEBAR = "R5DGS"
 
@@ -156,6 +157,70 @@ def rendering(path: Path, folder: Path):
     assert nothing_runs()
 
 
+def previewing(path: Path, folder: Path):
+    """Esc stops a preview while the worker draws, and the next one comes."""
+    render, worker = w.main_window().scene.render, w.service("worker")
+    for size in (320, 6000, 320):
+        render.resolution_x, render.resolution_y, render.resolution_percentage = size, size * 3 // 4, 100
+        yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
+        with w.inside():
+            bpy.ops.r5dgs.preview("INVOKE_DEFAULT")
+        if size == 6000:
+            yield 1.0
+            assert worker.busy(), "the preview was there before Esc"
+            yield from w.press("Escape")
+        yield from w.wait(nothing_runs, "preview")
+        yield 0.5
+        assert tuple(bpy.data.images["R5DGS Preview"].size) == (320, 240)
+
+
+def looking(path: Path, folder: Path):
+    """A border that is drawn with Ctrl+B cuts F12 and not the Rendered viewport; the eyes of a stereo render differ."""
+    scene, area = w.main_window().scene, w.area_of("VIEW_3D")
+    region, space, render = w.region_of(area), area.spaces[0], scene.render
+    with w.inside():
+        bpy.ops.r5dgs.use_engine()
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 320, 240, 100
+    space.region_3d.view_perspective, space.shading.type = "CAMERA", "RENDERED"
+    yield from w.hover(region)
+    yield from w.wait(full_picture, "viewport")
+    middle = np.array([region.width, region.height]) / 2
+    yield from w.press("ctrl+b")
+    yield from w.drag(region, tuple(middle * 0.9), tuple(middle * 1.2))
+    assert render.use_border and render.border_max_x - render.border_min_x < 0.7
+    yield 1.0
+    yield from w.wait(full_picture, "viewport")
+    camera = full_picture()[0].camera
+    assert (camera.width, camera.height) == (region.width, region.height)
+    space.shading.type, space.region_3d.view_perspective = "SOLID", "PERSP"
+    yield from render_by_key()
+    (seen,) = saved_pictures(scene, folder / "border")
+    assert 0.05 < (seen.max(axis=-1) > 0).mean() < 0.7, "the border does not cut F12"
+    render.use_border, render.use_multiview = False, True
+    yield from render_by_key()
+    left, right = saved_pictures(scene, folder / "stereo")
+    render.use_multiview = False
+    assert left.std() > 0.05 and np.abs(left - right).max() > 0.1, "both eyes see the same"
+
+
+def render_by_key():
+    """F12, until the picture is there, and back to the 3D view."""
+    yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
+    yield from w.press("F12")
+    yield from w.wait(lambda: not w.service("worker").busy() and not bpy.app.is_job_running("RENDER"), "F12")
+    yield 0.5
+    yield from w.press("Escape")
+
+
+def saved_pictures(scene: bpy.types.Scene, stem: Path) -> list[np.ndarray]:
+    """What Blender saves of the last render, a picture for each view. [H, W, 3] each"""
+    settings = scene.render.image_settings
+    settings.file_format, settings.views_format = "PNG", "INDIVIDUAL"
+    with contextlib.suppress(RuntimeError):  # 4.3 misses the file without a view's name
+        bpy.data.images["Render Result"].save_render(f"{stem}.png", scene=scene)
+    return [pixels(bpy.data.images.load(str(file))) for file in sorted(stem.parent.glob(f"{stem.name}*.png"))]
+
+
 def exporting(path: Path, folder: Path):
     """Esc stops exports: what was finished stays, nothing else, and the frame is as before."""
     scene = w.main_window().scene
@@ -277,7 +342,7 @@ def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
     tree.links.new(combine.outputs[0], output)
 
 
-CHECKS = (browsing, typing, clicking, rendering, exporting, capturing, merging)
+CHECKS = (browsing, typing, clicking, rendering, previewing, looking, exporting, capturing, merging)
 
 
 def checks(path: Path, chosen: list):
