@@ -15,6 +15,7 @@ from . import compat, engine_settings, engine_view
 
 STANDARD = "Standard"
 FAIR = 1.5  # colours that are farther off, of 255 steps, do not pass for those that were trained
+WIDE = 0.9  # a view that reaches less of the table leaves saturated colours pale
 POOR = 25.0  # a view with such an inverse (*False Color*) has none worth the name
 
 # Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).

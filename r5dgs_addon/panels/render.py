@@ -38,8 +38,11 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         settings = scene.r5dgs_render
         column = layout.column()
         column.prop(settings, "as_trained")
-        if engine_color.inverse(scene) is not None and not objections:
+        inverse = engine_color.inverse(scene)
+        if inverse is not None and not objections:
             column.label(text=f"{scene.view_settings.view_transform} is inverted for Gaussians", icon="CHECKMARK")
+            if inverse.reach < engine_color.WIDE:
+                column.label(text="Very saturated colors stay paler")
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")

@@ -38,12 +38,14 @@ class Inverse:
         grid: Codes of the scene-linear colours at the nodes. [SIZE, SIZE, SIZE, 3] float32
         scale: By what decoded colours are multiplied.
         error: How far off colours within reach come out, of 255 steps: 95 % of them are nearer.
+        reach: Share of the grid's nodes, from greys to the most saturated, that the view can display.
     """
 
     curves: np.ndarray
     grid: np.ndarray
     scale: float
     error: float
+    reach: float
 
     def scene_linear(self, display: np.ndarray) -> np.ndarray:
         """The colours that are displayed as wanted, or as near to that as the view can.
@@ -90,12 +92,13 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
     start = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     codes, found = _solve(shown, wanted, start, rounds=5)
     codes, found = _retry(shown, wanted, codes, found, rounds=3)
-    grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), _far(found, wanted) < SOLVED)
+    solved = _far(found, wanted) < SOLVED
+    grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), solved)
     display = np.linspace(0, 1, _CODES)
     tiny = 1e-9 * np.arange(len(greys))  # np.interp asks for values that rise
     curves = [np.interp(display, rising[:, channel] + tiny, greys) for channel in range(3)]
     curves = (np.stack(curves) / _TOP * (SIZE - 1)).astype(np.float32)
-    made = Inverse(curves, grid.astype(np.float32), scale, 0.0)
+    made = Inverse(curves, grid.astype(np.float32), scale, 0.0, float(solved.mean()))
     return replace(made, error=_error(forward, made))
 
 

@@ -72,6 +72,7 @@ def test_light_below_nothing_reaches_more(of):
     light[:, 2] = -0.04 * light[:, 0]
     wanted = mixed(light)
     found = of(mixed).scene_linear(wanted)
+    assert of(mixed).reach < 0.8 and of(film).reach > 0.95
     assert (found[:, 2] < 0).mean() > 0.9
     assert np.median(steps(mixed(found), wanted)) < 1 < 5 < np.median(steps(mixed(np.maximum(found, 0)), wanted))
 
