@@ -1,0 +1,214 @@
+"""Masks are made video by video, and what is made is neither made again nor lost."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from r5dgs_core import commands_masks, errors
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data import images, mask_notes, masks
+from r5dgs_core.semantics import mask_folders, mask_making, videos
+
+
+class Numbered:
+    """A backend that gives every video ids of its own; breaks off where it is told to."""
+
+    name, numbering = "numbered", mask_notes.VIDEO
+
+    def __init__(self, stop_at=None, kind=1):
+        self.made_with = {"kind": kind}
+        self.stop_at = stop_at
+        self.asked = []
+
+    def label(self, video, room, report):
+        self.asked.append(video.name)
+        for k, view in enumerate(video.views):
+            if (video.name, k) == self.stop_at:
+                raise KeyboardInterrupt
+            yield np.full((view.camera.height, view.camera.width), k + 1, np.int32)
+            report((k + 1) / len(video.views))
+
+
+@pytest.fixture
+def views(tiny):
+    return datasets.read(tiny.root).train
+
+
+def test_the_images_of_a_camera_are_a_video_in_the_order_of_time(views):
+    found = videos.of(tuple(reversed(views)))
+    assert len(found) == 6 and sorted(v.name for v in views) == sorted(v.name for x in found for v in x.views)
+    for video in found:
+        assert len({view.camera.name for view in video.views}) == 1
+        assert [view.t for view in video.views] == sorted(view.t for view in video.views)
+        assert video.image(0).shape == (36, 48, 3) and video.image(0).dtype == np.uint8
+
+
+def moving(views, names, turn):
+    """Views of one time each from a camera that goes around the scene."""
+    made = []
+    for k, name in enumerate(names):
+        angle = k * turn
+        spin = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        first = views[0].camera
+        T = first.T_cam_world.copy()
+        T[:3, :3] = T[:3, :3] @ spin
+        camera = dataclasses.replace(first, T_cam_world=T, name=name)
+        made.append(dataclasses.replace(views[0], name=f"train/m_{k}", camera=camera, t=0.1 * k))
+    return made
+
+
+def test_a_camera_in_motion_is_one_video_as_long_as_it_does_not_leap(views):
+    hand_held = moving(views, [f"cam{k}" for k in range(8)], np.radians(5))
+    assert [len(video.views) for video in videos.of(hand_held)] == [8]
+    leaping = moving(views, [f"cam{k}" for k in range(8)], np.radians(40))
+    assert [len(video.views) for video in videos.of(leaping)] == [1] * 8
+    named = moving(views, ["phone", *(f"phone@{k}" for k in range(1, 8))], np.radians(40))
+    assert [(video.name, len(video.views)) for video in videos.of(named)] == [("phone", 8)]
+
+
+def test_what_is_made_can_be_read_back_and_is_told(views, tmp_path):
+    events = []
+    made = mask_making.make(views, Numbered(), tmp_path / "m", progress=events.append)
+    assert (made.images, made.videos, made.kept, made.objects) == (36, 6, 0, 36)
+    notes = mask_notes.read(tmp_path / "m")
+    assert notes.finished and notes.numbering == mask_notes.VIDEO and notes.backend == "numbered"
+    for name, video in notes.videos.items():
+        assert video.ids == (1, 2, 3, 4, 5, 6) and len(video.images) == 6, name
+        assert [int(masks.read(tmp_path / "m" / f"{image}.png")[0, 0]) for image in video.images] == [1, 2, 3, 4, 5, 6]
+    assert [event["done"] for event in events] == sorted(event["done"] for event in events)
+    assert events[-1]["done"] == events[-1]["total"] == 36 and events[-1]["seconds_left"] == 0
+
+
+def test_a_stop_loses_the_video_that_was_being_made_and_no_other(views, tmp_path):
+    names = [video.name for video in videos.of(views)]
+    with pytest.raises(KeyboardInterrupt):
+        mask_making.make(views, Numbered(stop_at=(names[2], 3)), tmp_path)
+    assert not mask_notes.read(tmp_path).finished
+    assert list(mask_notes.read(tmp_path).videos) == names[:2]
+    again = Numbered()
+    made = mask_making.make(views, again, tmp_path)
+    assert again.asked == names[2:] and made.kept == 2 and made.images == 36
+    assert mask_notes.read(tmp_path).finished
+    third = Numbered()
+    assert mask_making.make(views, third, tmp_path).kept == 6 and third.asked == []
+
+
+def test_a_mask_that_was_deleted_is_made_again(views, tmp_path):
+    mask_making.make(views, Numbered(), tmp_path)
+    (tmp_path / f"{views[4].name}.png").unlink()
+    again = Numbered()
+    mask_making.make(views, again, tmp_path)
+    assert again.asked == [views[4].camera.name] and (tmp_path / f"{views[4].name}.png").exists()
+
+
+def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views, tmp_path, tiny):
+    with pytest.raises(errors.DatasetError, match="holds 36 masks that nobody says how they were made.*--overwrite"):
+        mask_making.make(views, Numbered(), tiny.root / "object_mask")
+    mask_making.make(views, Numbered(), tmp_path)
+    with pytest.raises(errors.DatasetError, match=r"other settings \(kind\).*--out.*--overwrite"):
+        mask_making.make(views, Numbered(kind=2), tmp_path)
+    assert mask_making.make(views, Numbered(kind=2), tmp_path, overwrite=True).kept == 0
+    assert mask_notes.read(tmp_path).made_with == {"kind": 2}
+
+
+def test_ids_of_one_video_are_the_folders_own(views, tmp_path):
+    alone = [view for view in views if view.camera.name == views[0].camera.name]
+    mask_making.make(alone, Numbered(), tmp_path)
+    assert json.loads((tmp_path / "objects.json").read_text())["3"] == "object 3"
+
+
+@pytest.fixture
+def copied(tiny, tmp_path):
+    shutil.copytree(tiny.root, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def test_masks_of_a_folder_are_taken_over_as_ids(copied, tmp_path, capsys):
+    """Colours become ids, other sizes the images' own, 255 unknown; names by path or by the file alone."""
+    source = tmp_path / "theirs"
+    truth = {}
+    for view in datasets.read(copied).train:
+        ids = datasets.load_mask(view)
+        ids[0] = 255
+        truth[view.name] = np.where(ids == 255, masks.UNKNOWN, ids)
+        big = np.repeat(np.repeat(ids, 2, 0), 2, 1)
+        masks.write(source / f"{view.name.split('/')[1]}.png", big)
+    shutil.rmtree(copied / "object_mask" / "train")
+    made = commands_masks.run_masks(copied, source=source, unknown=255)
+    assert (made.images, made.objects, made.numbering) == (36, 2, "scene")
+    assert made.unknown == pytest.approx(1 / 36)
+    assert "36 of 36 training images, 2 objects" in (told := capsys.readouterr().out)
+    assert "nothing is known of 2.8 % of the pixels" in told
+    dataset = datasets.read(copied)
+    dataset.require_one_numbering()
+    for view in dataset.train:
+        np.testing.assert_array_equal(datasets.load_mask(view), truth[view.name])
+
+
+def test_coloured_masks_of_a_folder_become_ids(copied, tmp_path):
+    palette = np.array([(0, 0, 0), (250, 10, 10), (10, 10, 250)], np.uint8)
+    for view in datasets.read(copied).train:
+        images.write_png(tmp_path / "rgb" / f"{view.name}.png", palette[datasets.load_mask(view)])
+    commands_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "ids")
+    view = datasets.read(copied).train[7]
+    got = masks.read(tmp_path / "ids" / f"{view.name}.png")
+    np.testing.assert_array_equal(got, np.array([0, 2, 1])[datasets.load_mask(view)])
+
+
+def test_masks_in_their_place_are_checked_and_left_alone(copied, capsys):
+    before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
+    for backend in ("precomputed", "blender"):
+        made = commands_masks.run_masks(copied, backend=backend)
+        assert (made.images, made.objects, made.unknown) == (36, 2, 0)
+        assert "nothing was written" in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()} == before
+
+
+def test_a_capture_names_every_id_and_has_every_mask(copied):
+    views = datasets.read(copied).train
+    first = views[0].mask_path
+    masks.write(first, np.full((36, 48), 9))
+    with pytest.raises(errors.DatasetError, match=r"id 9 has no name in objects\.json.*precomputed"):
+        commands_masks.run_masks(copied, backend="blender")
+    first.unlink()
+    with pytest.raises(errors.DatasetError, match=r"train/r_000 has no mask.*precomputed"):
+        commands_masks.run_masks(copied, backend="blender")
+    assert commands_masks.run_masks(copied).images == 35
+
+
+def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, tmp_path):
+    view = datasets.read(copied).train[3]
+    shutil.copytree(copied / "object_mask", tmp_path / "theirs")
+    masks.write(tmp_path / "theirs" / f"{view.name}.png", np.ones((36, 36), np.int32))
+    with pytest.raises(errors.DatasetError, match=r"r_003\.png: the mask is 36x36, its image 48x36"):
+        commands_masks.run_masks(copied, source=tmp_path / "theirs", out=tmp_path / "ids")
+    assert not mask_notes.read(tmp_path / "ids").finished
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"backend": "deva"}, "--backend deva: expected one of precomputed, blender, sam2"),
+        ({"backend": "sam2"}, "--backend sam2: name the folder of the model with --model"),
+        ({"model": "m"}, "--model: is not for --backend precomputed"),
+        ({"points": 8}, "--points: is not for --backend precomputed"),
+        ({"backend": "sam2", "model": "m", "unknown": 255}, "--unknown: is not for --backend sam2"),
+        ({"backend": "sam2", "model": "m", "points": 0}, "--points 0: expected a number from 1 to 1024"),
+        ({"backend": "sam2", "model": "m", "score": 2.0}, "--score 2.0: expected a share from 0 to 1"),
+        ({"unknown": 254}, "--unknown 254: expected 255 or 65535"),
+    ],
+)
+def test_options_that_do_not_belong_together_are_refused(tiny, options, message):
+    with pytest.raises(errors.ConfigError, match=message):
+        commands_masks.run_masks(tiny.root, **options)
+
+
+def test_a_folder_without_masks_is_named(tiny, tmp_path):
+    views = datasets.read(tiny.root).train
+    with pytest.raises(errors.DatasetError, match=r"expected masks such as train/r_000\.png"):
+        mask_folders.Precomputed(tmp_path, views)
+    with pytest.raises(errors.DatasetError, match="expected a folder of masks"):
+        mask_folders.Precomputed(tmp_path / "gone", views)
