@@ -19,7 +19,7 @@ class Step:
         done: Steps so far.
         total: Steps in all.
         what: What was just done, or is done next.
-        slow: What is done next takes so long that the window shows these words first.
+        slow: What is done next may take long, in one go; the window shows these words first.
     """
 
     done: int
@@ -138,7 +138,8 @@ class Running:
         elif getattr(self, "_timer", None) is not None:
             context.window_manager.progress_update(step.done / max(step.total, 1))
             rest = f", {left:.0f} s left" if step.done else ""
-            _say(context, f"{self.work}: {step.what}, {step.done} of {step.total}{rest}; Esc stops")
+            stands = "" if step.slow else f", {step.done} of {step.total}{rest}; Esc stops"
+            _say(context, f"{self.work}: {step.what}{stands}")
 
     def _end(self, context):
         context.window_manager.event_timer_remove(self._timer)

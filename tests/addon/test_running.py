@@ -1,0 +1,126 @@
+"""Long work in a window goes on step by step, says where it stands, and ends tidily however it ends."""
+
+import importlib
+from types import SimpleNamespace
+
+import pytest
+
+from r5dgs_core import errors
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+
+
+class Window:
+    """A stand-in for a context with a window, which the bpy module lacks: notes what an operator does to it."""
+
+    def __init__(self):
+        self.said, self.done, self.timers = [], [], 0
+        self.window = object()
+        self.workspace = SimpleNamespace(status_text_set=self.said.append)
+        self.window_manager = SimpleNamespace(
+            progress_begin=lambda low, high: self.done.append("begin"),
+            progress_update=self.done.append,
+            progress_end=lambda: self.done.append("end"),
+            modal_handler_add=lambda operator: None,
+            event_timer_add=self._add,
+            event_timer_remove=self._remove,
+        )
+
+    def _add(self, seconds, window):
+        self.timers += 1
+        return "timer"
+
+    def _remove(self, timer):
+        self.timers -= 1
+
+
+@pytest.fixture
+def running(blender, extension, monkeypatch):
+    module = importlib.import_module("r5dgs.r5dgs_addon.running")
+    monkeypatch.setattr(module, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=blender.types))
+    return module
+
+
+def begin(running, steps):
+    """An operator that runs steps in a window, and the window."""
+    window, reports = Window(), []
+    members = {"steps": lambda self, context: steps, "suggest": lambda self, context: True}
+    operator = type("Operator", (running.Running,), members)()
+    operator.report = lambda kind, text: reports.append((*kind, text))
+    assert operator.invoke(window, None) == {"RUNNING_MODAL"} and window.timers == 1
+    return operator, window, reports
+
+
+def blink(operator, window, kind="TIMER"):
+    return operator.modal(window, SimpleNamespace(type=kind))
+
+
+def tidy(window):
+    return window.timers == 0 and window.said[-1] is None and window.done[-1] == "end"
+
+
+def test_the_end_is_reported_with_what_was_not_as_expected(running):
+    def steps():
+        for number in range(3):
+            yield running.Step(number, 3, f"file {number}")
+        return running.Outcome("3 files", ["one is odd"])
+
+    operator, window, reports = begin(running, steps())
+    assert blink(operator, window, "MOUSEMOVE") == {"RUNNING_MODAL"}
+    assert blink(operator, window) == {"FINISHED"}
+    assert reports == [("INFO", "3 files"), ("WARNING", "one is odd")] and tidy(window)
+    assert "file 2, 2 of 3" in window.said[-2] and window.done == ["begin", 0, 1 / 3, 2 / 3, "end"]
+
+
+def test_the_window_shows_what_takes_long_before_that_is_done(running):
+    packed = []
+
+    def steps():
+        yield running.Step(0, 2, "frame")
+        yield running.Step(1, 2, "packing", slow=True)
+        packed.append(True)
+        return running.Outcome("done")
+
+    operator, window, _ = begin(running, steps())
+    assert blink(operator, window) == {"RUNNING_MODAL"}
+    assert window.said[-1] == "Export: packing" and not packed
+    assert blink(operator, window) == {"FINISHED"} and packed
+
+
+def test_esc_closes_the_steps(running):
+    closed = []
+
+    def steps():
+        try:
+            while True:
+                yield running.Step(0, 9, "frame", slow=True)
+        finally:
+            closed.append(True)
+
+    operator, window, reports = begin(running, steps())
+    assert blink(operator, window) == {"RUNNING_MODAL"} and not closed
+    assert blink(operator, window, "ESC") == {"CANCELLED"} and closed
+    assert tidy(window) and "stopped" in reports[0][1]
+
+
+@pytest.mark.parametrize("error", [errors.ConfigError("expected another"), ZeroDivisionError()])
+def test_an_error_leaves_the_window_as_it_was(running, error):
+    def steps():
+        yield running.Step(0, 2, "frame")
+        raise error
+
+    operator, window, reports = begin(running, steps())
+    if isinstance(error, errors.R5dgsError):
+        assert blink(operator, window) == {"CANCELLED"} and reports == [("ERROR", "expected another")]
+    else:
+        with pytest.raises(ZeroDivisionError):
+            blink(operator, window)
+    assert tidy(window)
+
+
+def test_the_mouse_shows_how_far_loading_is_and_is_itself_again_after_an_error(running):
+    window = Window()
+    with pytest.raises(ZeroDivisionError), running.cursor(window) as progress:
+        progress(0.4)
+        raise ZeroDivisionError
+    assert window.done == ["begin", 40.0, "end"]
