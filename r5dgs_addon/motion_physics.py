@@ -34,10 +34,10 @@ KINDS = (
     ("free_top", "Tumble", "Flies and spins freely, as a body of its shape does that nothing touches"),
 )
 RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")
-FIELDS = {
+FIELDS = {  # beside the point and the axis that it turns about, `motion_pivot`
     "static": (),
     "translation": ("velocity", "acceleration", "frequency"),
-    "ballistic_spin": RATES + ("frequency",),
+    "ballistic_spin": RATES[:4] + ("frequency",),
     "constant_twist": ("velocity", "angular_velocity"),
     "world_twist": RATES[:4],
     "free_top": ("velocity", "acceleration", "angular_velocity"),
@@ -52,7 +52,8 @@ def units_per_second(state: bpy.types.PropertyGroup) -> float:
     return render.fps / render.fps_base / state.frames_per_unit
 
 
-def _write_at_once(state, _):
+def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
+    """Re-extrapolate an anchor whose fields have changed, where that is wanted: their ``update``."""
     if state.at_once:
         from . import motion_extrapolate  # which stands on this module
 
@@ -72,7 +73,7 @@ def _vector(name: str):
         factor = units_per_second(state) ** power
         setattr(state, f"stored_{name}", [value / factor for value in values])
 
-    return {"get": read, "set": write, "size": 3, "update": _write_at_once, "options": set()}
+    return {"get": read, "set": write, "size": 3, "update": write_at_once, "options": set()}
 
 
 def _read_swing(state):
@@ -99,7 +100,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         name="Write at Once", description="Re-extrapolate whenever a number is changed here", options=set()
     )
     kind: EnumProperty(
-        name="Motion", description="How the object moves on", items=KINDS, update=_write_at_once, options=set()
+        name="Motion", description="How the object moves on", items=KINDS, update=write_at_once, options=set()
     )
     stored_velocity: _stored()
     stored_acceleration: _stored()
@@ -107,6 +108,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     stored_angular_acceleration: _stored()
     stored_center_offset: _stored()
     stored_frequency: FloatProperty(options={"HIDDEN"})
+    stored_pivot: _stored()  # point chosen on an axis, seen from the anchor
     velocity: FloatVectorProperty(
         name="Velocity",
         description="Velocity at the last observed time, per second, along the axes of the parent",
@@ -145,7 +147,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         description="How often a second the motion swings to and fro; 0 moves steadily",
         get=_read_swing,
         set=_write_swing,
-        update=_write_at_once,
+        update=write_at_once,
         options=set(),
     )
     learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
@@ -238,6 +240,7 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
     for name in RATES:
         setattr(state, f"stored_{name}", getattr(model, name))
     state.stored_frequency = model.frequency
+    state.stored_pivot = (0.0, 0.0, 0.0)
 
 
 def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
@@ -255,7 +258,7 @@ def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -
         base = replace(base, inertia=back @ base.inertia @ back.T)
     taker.taken = json.dumps(base.to_dict())
     taker.kind, taker.leader = giver.kind, None
-    for name in (*RATES, "frequency"):
+    for name in (*RATES, "frequency", "pivot"):
         setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
 
 

@@ -2,7 +2,8 @@
 
 import bpy
 
-from .. import motion_confidence, motion_curves, motion_objects, motion_physics, objects
+from ...r5dgs_core import errors
+from .. import motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, objects
 from . import sidebar
 
 
@@ -44,6 +45,8 @@ def _physics(layout, anchor) -> None:
         layout.label(text="Moves with what it follows", icon="LINKED")
         return
     layout.prop(state, "kind")
+    if not refused:
+        _pivot(layout, anchor)
     for name in motion_physics.FIELDS[state.kind]:
         layout.prop(state, name)
     layout.prop(state, "at_once")
@@ -53,6 +56,20 @@ def _physics(layout, anchor) -> None:
         layout.label(text="Edited", icon="GREASEPENCIL")
     else:
         layout.label(text="As learned", icon="CHECKMARK")
+
+
+def _pivot(layout, anchor) -> None:
+    """What the motion turns or swings about, where it does."""
+    try:
+        point = motion_pivot.point(anchor)
+    except errors.R5dgsError:  # an action says why
+        point = None
+    if point is not None:
+        column = layout.column(align=True)
+        column.prop(anchor.r5dgs_pivot, "point")
+        column.operator("r5dgs.pivot_to_cursor", text="Use 3D Cursor", icon="PIVOT_CURSOR")
+    if motion_pivot.axis(anchor) is not None:
+        layout.prop(anchor.r5dgs_pivot, "axis")
 
 
 def _scene(layout, collection) -> None:

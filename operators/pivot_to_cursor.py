@@ -1,0 +1,36 @@
+"""Pivot to 3D Cursor: let the active object turn or swing about where the 3D cursor is."""
+
+import bpy
+
+from ..r5dgs_addon import motion_objects, motion_physics, motion_pivot
+from ..r5dgs_core import errors
+
+
+class R5DGS_OT_pivot_to_cursor(bpy.types.Operator):
+    """Let the active object turn or swing about the 3D cursor after the last observed time, from Re-Extrapolate on"""
+
+    bl_idname = "r5dgs.pivot_to_cursor"
+    bl_label = "Pivot to 3D Cursor"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if motion_objects.active_anchor(context) is None:
+            cls.poll_message_set("Select an object of an R5DGS scene first")
+            return False
+        return True
+
+    def execute(self, context):
+        anchor = motion_objects.active_anchor(context)
+        try:
+            motion_pivot.move(anchor, motion_pivot.to_parent(anchor, context.scene.cursor.location))
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        motion_physics.write_at_once(anchor.r5dgs_motion, context)
+        then = "" if motion_physics.is_written(anchor) else "; Re-Extrapolate writes it to the keys"
+        self.report({"INFO"}, f"{anchor.name}: pivot at the 3D cursor{then}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_pivot_to_cursor,)
