@@ -44,27 +44,18 @@ class ClipEncoder:
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         encoders.check_loaded(folder, info)
         self._model.eval()
-        text = self._model.config.text_config
-        self._longest = int(text.max_position_embeddings)
-        self._padding: Any = "max_length" if kind == "siglip" else True  # SigLIP was trained on one length
-        dimension = int(self._model.config.projection_dim if kind == "clip" else text.projection_size)
+        self._longest = int(self._model.config.text_config.max_position_embeddings)
+        # SigLIP was trained on texts of one length, and looks at their padding.
+        self._padding: Any = "max_length" if kind == "siglip" else True
+        self._inputs = ("input_ids",) if kind == "siglip" else ("input_ids", "attention_mask")
+        dimension = self._texts(["object"]).shape[1]
         digest = encoders.digest_of(paths)
         self.card = EncoderCard(kind, folder.name, digest, dimension, TEMPLATES, encoders.SCALE)
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
         """See `encoders.Encoder`."""
         parts = [np.zeros((0, self.card.dimension), np.float32)]
-        for start in range(0, len(texts), _BATCH):
-            tokens = self._tokenizer(
-                list(texts[start : start + _BATCH]),
-                padding=self._padding,
-                truncation=True,
-                max_length=self._longest,
-                return_tensors="pt",
-            )
-            known = {name: tokens[name] for name in ("input_ids", "attention_mask") if name in tokens}
-            with self._torch.no_grad():
-                parts.append(_pooled(self._model.get_text_features(**known)))
+        parts += [self._texts(texts[start : start + _BATCH]) for start in range(0, len(texts), _BATCH)]
         return np.concatenate(parts)
 
     def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
@@ -76,6 +67,13 @@ class ClipEncoder:
             with self._torch.no_grad():
                 parts.append(_pooled(self._model.get_image_features(pixel_values=pixels)))
         return np.concatenate(parts)
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        tokens = self._tokenizer(
+            list(texts), padding=self._padding, truncation=True, max_length=self._longest, return_tensors="pt"
+        )
+        with self._torch.no_grad():
+            return _pooled(self._model.get_text_features(**{name: tokens[name] for name in self._inputs}))
 
 
 def _pooled(features: Any) -> np.ndarray:
