@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 MANIFEST = tomllib.loads((ROOT / "blender_manifest.toml").read_text())
 # Extras that this project does not test; what they bring is not pinned.
-UNTESTED_EXTRAS = {"encoders", "cuda"}
+UNTESTED_EXTRAS = {"open_clip", "cuda"}
 
 
 def pins() -> dict[str, Version]:
