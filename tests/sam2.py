@@ -15,7 +15,7 @@ def write_model(folder: Path, seed: int = 0) -> Path:
     torch.manual_seed(seed)
     model = Sam2VideoModel(Sam2VideoConfig(**_sizes()))
     with torch.no_grad():  # chance would have it that objects are gone from most images
-        list(model.mask_decoder.pred_obj_score_head.parameters())[-1].fill_(5.0)
+        model.mask_decoder.pred_obj_score_head.proj_out.bias.fill_(5.0)
     model.save_pretrained(folder)
     return folder
 
@@ -24,6 +24,7 @@ def _sizes() -> dict:
     wide = 128  # the memory's attention asks for a multiple of 64 larger than it, and for 64 channels of the memory
     return {
         "image_size": SIZE,
+        "initializer_range": 0.2,  # ten times the usual one, so that what is remembered makes a difference
         "vision_config": {
             "model_type": "sam2_vision_model",
             "backbone_config": {
