@@ -166,9 +166,12 @@ class Worker:
 
     def _death(self) -> errors.BackendError:
         self.close()
-        said = " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
+        code = self._process.returncode
+        killed = -code in (signal.SIGTERM, getattr(signal, "SIGKILL", None))  # its last words are of something else
+        said = "" if killed else " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
+        why = "stopped from outside; perhaps memory ran out" if killed else f"exit code {code}"
         return errors.BackendError(
-            f"worker: {self.python} ended unexpectedly (exit code {self._process.returncode})"
+            f"worker: {self.python} ended unexpectedly ({why})"
             + (f": {said}" if said else "")
             + ("; the next request starts it again" if self.hello else f" before it answered; {REMEDY}")
         )

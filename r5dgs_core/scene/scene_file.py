@@ -154,8 +154,10 @@ def read_meanings(path: str | Path) -> meanings.Meanings | None:
 def _open(path: Path) -> zipfile.ZipFile:
     try:
         if not path.is_file():
-            found = "a folder; 'r5dgs train' makes a scene from a folder of images" if path.is_dir() else "nothing"
-            raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found {found}")
+            found = "a folder; 'r5dgs train' makes a scene from a folder of images" if path.is_dir() else None
+            raise errors.SceneFileError(
+                f"{path}: expected a .r5dgs file, found {found or 'nothing; look for its new place, or bake it again'}"
+            )
         return zipfile.ZipFile(path)
     except PermissionError as error:
         raise errors.SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error

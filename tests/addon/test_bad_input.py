@@ -136,7 +136,7 @@ REMEDIES = {
     "truncated at the end": "bake or copy it again",
     "truncated in the middle": "bake or copy it again",
     "truncated to nothing": "bake or copy it again",
-    "not there": "found nothing",
+    "not there": "found nothing; look for its new place",
 }
 
 
@@ -281,6 +281,9 @@ def dying(loaded):
 def test_a_worker_that_is_killed_in_mid_render_is_told_and_the_next_picture_comes(loaded, dying):
     assert f12(loaded)
     for act in (lambda: f12(loaded), loaded.ops.r5dgs.preview):
-        with dying(), refused(loaded, "worker: .* ended unexpectedly .*the next request starts it again"):
+        with (
+            dying(),
+            refused(loaded, r"worker: \S+ ended unexpectedly \(stopped from outside.*; the next request starts"),
+        ):
             act()
         assert f12(loaded) and loaded.ops.r5dgs.preview() == {"FINISHED"}
