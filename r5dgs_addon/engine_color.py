@@ -18,20 +18,6 @@ FAIR = 1.5  # colours that are farther off, of 255 steps, do not pass for those 
 WIDE = 0.9  # a view that reaches less of the table leaves saturated colours pale
 POOR = 25.0  # a view with such an inverse (*False Color*) has none worth the name
 
-# Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).
-_WORKING_SPACES = {
-    "Linear Rec.2020": (
-        (0.6274039, 0.3292830, 0.0433131),
-        (0.0690973, 0.9195404, 0.0113623),
-        (0.0163914, 0.0880133, 0.8955953),
-    ),
-    "ACEScg": (
-        (0.6130974, 0.3395231, 0.0473795),
-        (0.0701937, 0.9163539, 0.0134524),
-        (0.0206156, 0.1095698, 0.8698146),
-    ),
-}
-
 
 def scene_linear(
     color: np.ndarray,  # [H, W, 3]
@@ -60,9 +46,7 @@ def scene_linear(
         linear = inverse.scene_linear(straight)
     else:
         linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
-        matrix = _WORKING_SPACES.get(compat.working_space())
-        if matrix is not None:
-            linear = linear @ np.array(matrix, np.float32).T
+    linear = engine_view.in_space(linear, compat.working_space())
     result[..., :3] = linear if alpha is None else linear * result[..., 3:]
     return result
 

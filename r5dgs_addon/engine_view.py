@@ -30,6 +30,20 @@ _WIDTH = 512  # of images of samples
 _CURVES = ("tone", "extend", "use_clip")
 _LEVELS = ("black_level", "white_level")
 
+# Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).
+_WORKING_SPACES = {
+    "Linear Rec.2020": (
+        (0.6274039, 0.3292830, 0.0433131),
+        (0.0690973, 0.9195404, 0.0113623),
+        (0.0163914, 0.0880133, 0.8955953),
+    ),
+    "ACEScg": (
+        (0.6130974, 0.3395231, 0.0473795),
+        (0.0701937, 0.9163539, 0.0134524),
+        (0.0206156, 0.1095698, 0.8698146),
+    ),
+}
+
 
 @dataclass(frozen=True)
 class Management:
@@ -94,6 +108,12 @@ def of(scene: bpy.types.Scene) -> Management:
     device = scene.display_settings.display_device
     settings = (view.view_transform, view.look, view.exposure, view.gamma)
     return Management(compat.working_space(), device, *settings, curves, balance)
+
+
+def in_space(linear: np.ndarray, space: str) -> np.ndarray:
+    """Linear Rec.709, in which inverses are made and given, in a scene-linear space of a .blend. [..., 3]"""
+    matrix = _WORKING_SPACES.get(space)
+    return linear if matrix is None else linear @ np.array(matrix, np.float32).T
 
 
 _inverses: dict[Management, view_inverse.Inverse] = {}
@@ -194,11 +214,11 @@ class _Sampler:
         settings.color_mode, settings.color_depth = "RGB", "16"
 
     def displayed(self, colors: np.ndarray) -> np.ndarray:
-        """Display colours of scene-linear ones. [N, 3] both"""
+        """Display colours of linear Rec.709, in which views of single channels are such. [N, 3] both"""
         path = str(Path(self._folder.name) / "samples.tif")
         height = -(-len(colors) // _WIDTH)
         pixels = np.ones((height * _WIDTH, 4), np.float32)
-        pixels[: len(colors), :3] = colors
+        pixels[: len(colors), :3] = in_space(colors, self._space)
         image = bpy.data.images.new("R5DGS view", _WIDTH, height, alpha=True, float_buffer=True)
         try:
             image.colorspace_settings.name = self._space

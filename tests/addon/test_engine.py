@@ -377,11 +377,13 @@ def test_what_a_viewport_wants_is_made_by_the_timer_when_it_rests(blender, loade
     assert [one.gamma for one in made] == [settings.gamma]
 
 
+@pytest.mark.parametrize("view", ["Standard", "Filmic"])
 @pytest.mark.parametrize("space", ["Linear Rec.2020", "ACEScg"])
-def test_other_working_spaces_show_the_same_bytes(blender, loaded, scene, tmp_path, space):
+def test_other_working_spaces_show_the_same_bytes(blender, loaded, scene, tmp_path, space, view):
     if not hasattr(blender.data, "colorspace"):
         pytest.skip("this Blender has one scene-linear space only")
     blender.ops.wm.set_working_color_space(working_space=space, convert_colors=False)
+    blender.context.scene.view_settings.view_transform = view
     go_to(blender, 0.0)
     assert psnr(render_png(blender, tmp_path), np.clip(core(scene, 0.0).color.numpy(), 0, 1)) > 45
 
