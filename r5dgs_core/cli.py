@@ -1,4 +1,5 @@
-"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, lookup, query, name, warm-up.
+"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, objects, lookup, query, name,
+warm-up.
 
 What each sub-command does is in `commands` and its neighbours.
 """
@@ -9,6 +10,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from . import __version__, commands, errors
 from .bench import variants
@@ -105,6 +107,19 @@ def parser() -> argparse.ArgumentParser:
     info.add_argument("file", type=Path, help=".r5dgs file")
     info.add_argument("--json", action="store_true", help="as JSON")
 
+    def add_picture(p: argparse.ArgumentParser) -> None:
+        p.add_argument("--camera", metavar="N", help="name or number of the picture's camera (default: the best)")
+        p.add_argument("--time", type=float, metavar="T", help="scene time of the picture, past t_max too")
+        p.add_argument("--mode", default="rigid", metavar="MODE", help="playback mode (default: rigid)")
+        p.add_argument("--size", type=int, metavar="PIXELS", help="of the picture along its longer side")
+
+    objects = commands.add_parser("objects", help="say which id is what, in a table and a picture")
+    objects.add_argument("target", type=Path, metavar="SCENE", help="run folder or .r5dgs file")
+    objects.add_argument("--data", type=Path, metavar="DIR", help="data set to count pixels in (default: the run's)")
+    objects.add_argument("--legend", type=Path, metavar="FILE.png", help="picture of the scene with ids and names")
+    objects.add_argument("--json", action="store_true", help="as JSON")
+    add_picture(objects)
+
     words = commands.add_parser("lookup", help="teach a scene what words its objects mean")
     words.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file; the table is written into it")
     words.add_argument("--encoder", required=True, metavar="DIR|text", help="folder of the encoder; text: a small one")
@@ -119,6 +134,9 @@ def parser() -> argparse.ArgumentParser:
     query.add_argument("--encoder", metavar="DIR|text", help="that of the scene's table, for words it does not store")
     query.add_argument("--threshold", type=float, metavar="SCORE", help="least score of a match, 0 to 1 (default: 0.5)")
     query.add_argument("--json", action="store_true", help="as JSON")
+    query.add_argument("--render", type=Path, metavar="FILE.png", help="picture of what was found, alone, with alpha")
+    query.add_argument("--context", action="store_true", help="in that picture, show the rest too, dimmed")
+    add_picture(query)
 
     name = commands.add_parser("name", help="name an object of a scene, and say what else it is called")
     name.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
@@ -210,6 +228,10 @@ def _dispatch(args: argparse.Namespace) -> int:
             overrides=tuple(overrides),
         )
         benchmark.run_bench(plan, remeasure=args.remeasure, progress_kind=args.progress)
+    elif args.command == "objects":
+        from . import commands_objects
+
+        commands_objects.run_objects(args.target, args.data, legend=args.legend, as_json=args.json, **_picture(args))
     elif args.command in ("lookup", "query", "name"):
         from . import commands_words
 
@@ -217,8 +239,11 @@ def _dispatch(args: argparse.Namespace) -> int:
             options = {"out": args.out, "captions": args.captions, "words": args.words}
             commands_words.run_lookup(args.file, args.encoder, **options, progress_kind=args.progress)
         elif args.command == "query":
+            from . import commands_objects
+
             options = {"encoder": args.encoder, "threshold": args.threshold, "as_json": args.json}
-            commands_words.run_query(args.file, args.text, **options)
+            picture = {"render": args.render, "context": args.context, **_picture(args)}
+            commands_objects.run_query(args.file, args.text, options, **picture)
         else:
             commands_words.run_name(args.file, args.object, args.name, aliases=args.alias, caption=args.caption)
     elif args.command == "warm-up":
@@ -226,6 +251,11 @@ def _dispatch(args: argparse.Namespace) -> int:
     else:
         commands.run_info(args.file, as_json=args.json)
     return 0
+
+
+def _picture(args: argparse.Namespace) -> dict[str, Any]:
+    """What a command was told of its picture."""
+    return {"camera": args.camera, "t": args.time, "mode": args.mode, "size": args.size}
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ def run_evaluate(
         except ValueError:
             raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
     _check_json(json_path)
-    scene, dataset = _open(target, data)
+    scene, dataset = open_target(target, data)
     if dataset is None:
         raise errors.DatasetError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
     default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
@@ -175,7 +175,7 @@ def run_stability(json_path: Path | None = None, *, progress_kind: str = "none")
     return all(row.passed for row in rows)
 
 
-def _open(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]:
+def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]:
     """The scene of a run folder or a scene file, and the data set: of a file only where it is named."""
     from .data import dataset as datasets
     from .scene import scene_file
@@ -238,7 +238,7 @@ def run_report(
         raise errors.ConfigError(f"--repeats {rounds}: expected 1 or more")
     if out.exists() and not out.is_dir():
         raise errors.ConfigError(f"--out {out}: expected a folder, or nothing yet; found a file")
-    scene, dataset = _open(target, data)
+    scene, dataset = open_target(target, data)
     if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
         given = " ".join(tasks)
         raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from ..data import dataset as datasets
 from ..data import images
 from ..scene.scene import Scene
-from . import metrics
+from . import metrics, overlap
 from .evaluate import Rendering, render, truth_background
 
 COLUMNS = 4
@@ -126,7 +126,7 @@ def draw(
             axes.set_xticks([])
             axes.set_yticks([])
             if row == 3 and mask is not None:
-                for object_id in np.unique(mask[mask > 0]):
+                for object_id in np.unique(mask[overlap.objects_of(mask)]):
                     axes.contour(mask == object_id, levels=[0.5], colors="white", linewidths=0.8)
             if column == 0:
                 axes.set_ylabel(rows[row], fontsize=11)

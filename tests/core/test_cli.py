@@ -174,7 +174,7 @@ def test_help_of_bench_names_every_variant(capsys):
 
 def test_the_module_of_the_command_line_names_every_command():
     (commands,) = [action.choices for action in cli.parser()._actions if isinstance(action.choices, dict)]
-    named = cli.__doc__.splitlines()[0].partition(": ")[2].rstrip(".").split(", ")
+    named = " ".join(cli.__doc__.split("\n\n")[0].split()).partition(": ")[2].rstrip(".").split(", ")
     assert sorted(named) == sorted(commands)
 
 

@@ -1,0 +1,244 @@
+"""Which id is what: one row per object of a scene, with how well it is seen, how it moves and how sure its label is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from ..data import dataset as datasets
+from ..scene import playback
+from ..scene.scene import MotionGroup, Scene
+from ..semantics import standpoints
+from . import evaluate, overlap
+
+MOST_VIEWS = 24  # that pixels are counted in
+_KINDS = {  # as the sidebar in Blender calls them
+    "static": "rests",
+    "translation": "slide",
+    "ballistic_spin": "throw+spin",
+    "constant_twist": "screw",
+    "world_twist": "orbit",
+    "free_top": "tumble",
+}
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """One object.
+
+    Attributes:
+        id: Object id; 0 is the background, -1 what is unassigned.
+        name: Its name.
+        aliases: Other words for it.
+        caption: A sentence about it, or "".
+        gaussians: Its members.
+        pixels: Mean number of pixels that it has in the views.
+        views: Views that show it.
+        motion: How it moves, in words.
+        rigid_rms: Root mean square distance of its members from its rigid motion, as a share of its radius; None where
+            its members move rigidly by construction, so that there is nothing to measure.
+        confidence: Mean probability that the classifier gives its members' encodings for this object, weighted by their
+            opacities; None where the scene stores no encodings.
+        strays: Members that move with another object's group than their own.
+        iou: Overlap with the true masks of the views, same ids; None without masks that show it.
+    """
+
+    id: int
+    name: str
+    aliases: tuple[str, ...]
+    caption: str
+    gaussians: int
+    pixels: float
+    views: int
+    motion: str
+    rigid_rms: float | None
+    confidence: float | None
+    strays: int
+    iou: float | None
+
+
+def measure(
+    scene: Scene, views: Sequence[datasets.View | standpoints.Standpoint], mode: str = "rigid", *, backend: str = "auto"
+) -> list[ObjectRow]:
+    """Look at a scene from some views and describe its objects.
+
+    Args:
+        scene: The scene.
+        views: Where from and when; those of a data set are compared with their masks.
+        mode: Way to move past t_max.
+        backend: Rasterizer.
+
+    Returns:
+        A row per object of the scene's table.
+    """
+    player = playback.Player(scene, mode)
+    tally = overlap.Overlap([item.id for item in scene.objects if item.id > 0])
+    pixels = {item.id: 0 for item in scene.objects}
+    seen = dict.fromkeys(pixels, 0)
+    for view in views:
+        ids = evaluate.draw(scene, view.camera, view.t, player.frame, backend=backend).ids
+        for object_id, count in zip(*(found.tolist() for found in np.unique(ids, return_counts=True)), strict=True):
+            pixels[object_id] = pixels.get(object_id, 0) + count
+            seen[object_id] = seen.get(object_id, 0) + 1
+        mask = datasets.load_mask(view) if isinstance(view, datasets.View) else None
+        if mask is not None:
+            tally.add(ids, mask)
+    found = tally.result()
+    known, sure, astray = found["iou_objects"] or {}, confidences(scene), strays(scene)
+    rows = []
+    for item in scene.objects:
+        groups = [group for group in scene.groups if group.object_id == item.id and group.role == "body"]
+        row = ObjectRow(
+            id=item.id,
+            name=item.name,
+            aliases=item.aliases,
+            caption=item.caption,
+            gaussians=item.count,
+            pixels=pixels[item.id] / max(len(views), 1),
+            views=seen[item.id],
+            motion=motion_of(scene, groups),
+            rigid_rms=_residual(scene, groups),
+            confidence=sure.get(item.id),
+            strays=astray.get(item.id, 0),
+            iou=known.get(str(item.id)) if item.id > 0 else found["iou_background"] if item.id == 0 else None,
+        )
+        rows.append(row)
+    return rows
+
+
+def spread(views: Sequence[Any], most: int = MOST_VIEWS) -> list[Any]:
+    """At most so many of some views, evenly."""
+    at = np.unique(np.linspace(0, max(len(views) - 1, 0), min(most, len(views))).round())
+    return [views[int(k)] for k in at]
+
+
+def own_views(scene: Scene, most: int = MOST_VIEWS) -> list[standpoints.Standpoint]:
+    """Views of a scene's own cameras, each at another observed time; where it stores none, an overview at some."""
+    first = float(scene.track_times[0])
+    cameras = spread(scene.cameras, most) or [standpoints.overview(scene)] * 3
+    # Steps of the golden ratio: neither the order of the cameras nor that of the times shows in the pairs.
+    shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
+    times = first + shares * (scene.t_max - first)
+    return [standpoints.Standpoint(camera, float(t)) for camera, t in zip(cameras, times, strict=True)]
+
+
+def confidences(scene: Scene) -> dict[int, float]:
+    """Mean probability that the classifier gives to the label of an object's members, weighted by their opacities.
+
+    Returns:
+        By object id; empty where the scene stores no encodings or no classifier, without objects that have no members.
+    """
+    if scene.identities is None or scene.classifier_weight is None or scene.classifier_bias is None:
+        return {}
+    opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+    found = {}
+    for k, item in enumerate(item for item in scene.objects if item.id >= 0):
+        rows = slice(item.start, item.start + item.count)
+        answers = scene.identities[rows].astype(np.float64) @ scene.classifier_weight.T + scene.classifier_bias
+        answers -= answers.max(axis=1, keepdims=True, initial=-np.inf)
+        shares = np.exp(answers)
+        total = float(opacities[rows].sum())
+        if total > 0:
+            found[item.id] = float((opacities[rows] * shares[:, k] / shares.sum(axis=1)).sum() / total)
+    return found
+
+
+def strays(scene: Scene) -> dict[int, int]:
+    """How many members of each object go with another one's group, or rest where theirs moves. A shadow is background
+    that follows its caster, and counts as resting."""
+    bodies = {group.id: group.object_id for group in scene.groups if group.role == "body"}
+    owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.motion_ids]
+    labels = np.maximum(scene.object_ids, 0)
+    # What has no group of its own rests with the background, as it should.
+    away = (owner != labels) & ((owner > 0) | np.isin(labels, list(bodies.values())))
+    ids, counts = np.unique(scene.object_ids[away], return_counts=True)
+    return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+
+
+def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
+    """How an object moves past t_max, by its motion models, in words; "pinned" where no group of it can move."""
+    words = []
+    for group in groups:
+        poses = scene.track_poses[group.id]
+        if (poses == poses[-1]).all() and group.model.is_static:
+            words.append("still")
+        else:
+            words.append(_KINDS[group.model.kind])
+    return ", ".join(dict.fromkeys(words)) or "pinned"
+
+
+def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
+    """The rows as a table for the terminal.
+
+    Args:
+        scene: The scene.
+        rows: Of `measure`.
+        views: Number of views that were looked at.
+    """
+    shown = Table(title=f"objects of {scene.name}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    measured, compared = (any(getattr(row, key) is not None for row in rows) for key in ("rigid_rms", "iou"))
+    numbers = (*(["bends"] if measured else []), "sure", "strays", *(["IoU"] if compared else []))
+    for name in ("id", "name", "count", "pixels", "views", "motion", *numbers):
+        left = name in ("name", "motion")
+        shown.add_column(name, justify="left" if left else "right", no_wrap=name != "name", overflow="fold")
+    for row in rows:
+        cells = [str(row.id), ", ".join([row.name, *row.aliases]), str(row.gaussians), f"{row.pixels:.0f}"]
+        cells += [str(row.views), row.motion]
+        cells += ["-" if row.rigid_rms is None else f"{100 * row.rigid_rms:.2g} %"] if measured else []
+        cells += ["-" if row.confidence is None else f"{row.confidence:.3f}", str(row.strays)]
+        cells += ["-" if row.iou is None else f"{row.iou:.3f}"] if compared else []
+        shown.add_row(*map(Text, cells))  # without markup: names may hold brackets
+    shown.caption, shown.caption_justify = _caption(scene, rows, views), "left"
+    return shown
+
+
+def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
+    """The same in JSON types: ``{"scene", "views", "hygiene", "objects": [ObjectRow, ...]}``."""
+    objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
+    return {"scene": scene.name, "views": views, "hygiene": hygiene(scene), "objects": objects}
+
+
+def hygiene(scene: Scene) -> dict[str, Any] | None:
+    """What the cleaning of motion labels changed in training, as `train.bake` recorded it; None where it did not run.
+
+    Returns:
+        ``moving``, Gaussians that were asked, and how many of them went elsewhere: ``to_bodies``, ``to_shadows``,
+        ``to_rest`` (`train.groups.Moves`).
+    """
+    found = scene.provenance.get("regrouping")
+    return dict(found) if isinstance(found, dict) else None
+
+
+def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
+    parts = [f"count: Gaussians; pixels: mean over {views} views"]
+    if any(row.rigid_rms is not None for row in rows):
+        parts.append("bends: rms distance from the rigid motion, of the radius; - where rigid by construction")
+    else:
+        parts.append("all members move rigidly by construction: no residual")
+    if any(row.confidence is not None for row in rows):
+        parts.append("sure: mean probability of the members' own id, by the classifier")
+    else:
+        parts.append("sure: -, as the scene stores no identity encodings")
+    parts.append("strays: members that move with another object")
+    if any(row.iou is not None for row in rows):
+        parts.append("IoU: with the true masks of these views, same ids")
+    found = hygiene(scene)
+    if found is not None:
+        moved = sum(int(found.get(key, 0)) for key in ("to_bodies", "to_shadows", "to_rest"))
+        parts.append(f"label hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
+    return "; ".join(parts)
+
+
+def _residual(scene: Scene, groups: Sequence[MotionGroup]) -> float | None:
+    """Share of the radius, by members; None where none of the groups was found to move otherwise than rigidly."""
+    if not any(group.rigid_max > 0 for group in groups):
+        return None
+    counts = np.array([max(int((scene.motion_ids == group.id).sum()), 1) for group in groups])
+    squares = np.array([(group.rigid_rms / max(group.model.radius, 1e-12)) ** 2 for group in groups])
+    return float(np.sqrt(np.average(squares, weights=counts)))
