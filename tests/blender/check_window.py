@@ -226,6 +226,8 @@ def exporting(path: Path, folder: Path):
     scene = w.main_window().scene
     scene.render.resolution_x, scene.render.resolution_y = 320, 240
     scene.frame_set(7)
+    running = w.service("running")
+    blink, running.BLINK_S = running.BLINK_S, 1e-4  # the window is drawn after each step: there is time for Esc
     for operator, name in (("export_masks", ""), ("export_ply", "a.ply"), ("export_scene", "b.r5dgs")):
         target = folder / operator
         target.mkdir()
@@ -239,7 +241,6 @@ def exporting(path: Path, folder: Path):
         yield from w.wait(lambda: w.main_window().modal_operators, operator)
         if wanted:
             yield from w.wait(lambda: len(finished()) > 2, operator)  # noqa: B023
-        yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
         yield from w.press("Escape")
         yield from w.wait(nothing_runs, operator)
         yield 1.0
@@ -249,6 +250,7 @@ def exporting(path: Path, folder: Path):
         assert scene.frame_current == 7 and count < frames
         others = [p for p in target.rglob("*") if p.is_file() and p.suffix not in (*wanted, ".json")]
         assert not others, others
+    running.BLINK_S = blink
     with w.inside():
         bpy.ops.r5dgs.export_scene("INVOKE_DEFAULT", filepath=str(folder / "c.r5dgs"))
     yield from choose(folder, "c.r5dgs")
@@ -351,6 +353,7 @@ def checks(path: Path, chosen: list):
     view.filebrowser_display_type = view.render_display_type = "SCREEN"
     with tempfile.TemporaryDirectory(prefix="r5dgs-window-") as folder:
         bpy.data.objects.remove(bpy.data.objects["Cube"])
+        bpy.ops.ed.undo_push(message="Remove Cube")  # else Ctrl+Z brings it back
         yield 1.0
         for check in chosen:
             if check != browsing:
