@@ -177,25 +177,27 @@ def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
 
 
 def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
+    """The best that an object's embeddings say, None where it has none."""
     rows, thresholds = _rows(meanings, row)
-    if len(rows) == 0:
-        return None
-    cosines = rows @ np.asarray(query, np.float64)
     table, canonical = meanings.table, meanings.canonical_embeddings
-    if table is None or canonical is None or len(canonical) == 0:
-        passed, certain = cosines - thresholds, 1 - thresholds
-        scores = np.where(passed >= 0, PASS + (_BEST - PASS) * passed / certain, PASS * cosines / thresholds)
-        best = int(np.argmax(scores))
-        return Meant(meanings.object_ids[row], _bounded(scores[best]), float(cosines[best]), None)
     answers = []
-    for cosine, threshold, beside in zip(cosines, thresholds, rows @ canonical.astype(np.float64).T, strict=True):
-        found, least = (relevancy(value, beside, table.encoder.scale) for value in (cosine, threshold))
-        if found >= least:
-            score = PASS + (_BEST - PASS) * (found - least) / max(1 - least, 1e-9)
+    for own, threshold in zip(rows, thresholds.tolist(), strict=True):
+        cosine = float(np.clip(own @ np.asarray(query, np.float64), -1, 1))
+        if table is None or canonical is None or len(canonical) == 0:
+            found, score = None, _score(0.5 + 0.5 * cosine, 0.5 + 0.5 * threshold)
         else:
-            score = PASS * found / least
-        answers.append(Meant(meanings.object_ids[row], _bounded(score), float(cosine), found))
-    return max(answers, key=lambda one: one.score)
+            beside = canonical.astype(np.float64) @ own
+            found = relevancy(cosine, beside, table.encoder.scale)
+            score = _score(found, relevancy(threshold, beside, table.encoder.scale))
+        answers.append(Meant(meanings.object_ids[row], score, cosine, found))
+    return max(answers, key=lambda one: one.score, default=None)
+
+
+def _score(found: float, least: float) -> float:
+    """From what was found and what is least needed, both in [0, 1]: 0 for nothing, `PASS` at the least."""
+    if found >= least:
+        return PASS + (_BEST - PASS) * (found - least) / max(1 - least, 1e-9)
+    return PASS * found / least
 
 
 def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +213,3 @@ def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:
         count = len(table.views[row])
         return np.asarray(views[row, :count], np.float64), np.array([view.threshold for view in table.views[row]])
     return np.asarray(meanings.embeddings[row], np.float64)[None], np.array([threshold])
-
-
-def _bounded(score: float) -> float:
-    return float(min(max(score, 0.0), _BEST))
