@@ -111,6 +111,12 @@ def _far(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.abs(found - wanted).max(axis=-1)
 
 
+def _squared(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Squared distance of colours. [...]"""
+    off = found - wanted
+    return np.einsum("...k,...k->...", off, off)  # a sum over three is slow
+
+
 def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """Codes that are displayed as wanted, by Levenberg-Marquardt steps with differences for derivatives.
 
@@ -138,7 +144,7 @@ def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -
         step = np.linalg.solve(normal, -np.einsum("nki,nk->ni", jacobian, miss)[..., None])[..., 0]
         there = np.clip(here + np.clip(step, -1, 1), -_TOP, _TOP)
         then = shown(there)
-        better = np.square(then - wanted[rows]).sum(-1) < np.square(miss).sum(-1)
+        better = _squared(then, wanted[rows]) < _squared(found[rows], wanted[rows])
         codes[rows[better]], found[rows[better]] = there[better], then[better]
         damping[rows] = np.where(better, np.maximum(0.1 * damping[rows], 1e-9), 10 * damping[rows])
     return codes, found
@@ -152,19 +158,19 @@ def _retry(
     shape = (SIZE, SIZE, SIZE)
     nearest = np.where(solved, np.arange(len(codes)), -1).reshape(shape)
     goal = wanted.reshape(*shape, 3)
-    gap = np.where(solved.reshape(shape), np.square(found - wanted).sum(-1).reshape(shape), np.inf)
+    gap = np.where(solved.reshape(shape), _squared(found, wanted).reshape(shape), np.inf)
     for _ in range(SIZE):  # from node to node, like a flood
         changed = False
         for into, out_of in _neighbours():
             candidate = nearest[out_of]
-            distance = np.where(candidate >= 0, np.square(found[candidate] - goal[into]).sum(-1), np.inf)
+            distance = np.where(candidate >= 0, _squared(found[candidate], goal[into]), np.inf)
             closer = distance < gap[into]
             changed |= bool(closer.any())
             nearest[into] = np.where(closer, candidate, nearest[into])
             gap[into] = np.where(closer, distance, gap[into])
         if not changed:
             break
-    rows = np.flatnonzero(gap.ravel() < np.square(found - wanted).sum(-1))
+    rows = np.flatnonzero(gap.ravel() < _squared(found, wanted))
     codes, found = codes.copy(), found.copy()
     if len(rows):
         codes[rows], found[rows] = _solve(shown, wanted[rows], codes[nearest.ravel()[rows]], rounds)
