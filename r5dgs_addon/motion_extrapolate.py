@@ -13,11 +13,13 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.motion import keyframes as reduction
-from ..r5dgs_core.motion import rotations
+from ..r5dgs_core.motion import models, rotations
 from ..r5dgs_core.motion.keyframes import Keys
 from ..r5dgs_core.scene import scene_file
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
+
+MOST_STEPS = 1024  # of integration over as long as was observed: beyond are orbits about places far out of sight
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def _plan(anchor: bpy.types.Object, t_end: float | None) -> Plan:
     tails = {}
     if times.t_end > times.t_max:
         allowed, reach = motion_physics.key_error(anchor)
-        sample = _sampler(anchor, location, quat, times.t_max)
+        sample = _sampler(anchor, location, quat, times)
         nearest = keyframes.NEAREST / times.frames_per_unit
         future = reduction.reduce(sample, times.t_max, times.t_end, allowed, reach, nearest=nearest)
         tails = {
@@ -115,8 +117,14 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
     return times if t_end is None else replace(times, t_end=max(t_end, times.t_max))
 
 
-def _sampler(anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, t_max: float) -> reduction.Sampler:
-    """Poses past t_max that continue one at t_max: quaternions as long as that is, as keys may be."""
+def _sampler(
+    anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times
+) -> reduction.Sampler:
+    """Poses past t_max that continue one at t_max: quaternions as long as that is, as keys may be.
+
+    Raises:
+        ConfigError: The motion cannot be, or would take minutes to integrate.
+    """
     state = anchor.r5dgs_motion
     follow = motion_physics.follow_matrix(state)
     mover = anchor if follow is None else state.leader
@@ -124,7 +132,12 @@ def _sampler(anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, t
     if follow is None and model.inertia is not None:
         turn = rotations.quats_to_rotmats(rotations.normalize(quat))
         model = replace(model, inertia=turn @ model.inertia @ turn.T)
-    poses = reduction.model_sampler(model, t_max)
+    span = min(times.t_end - times.t_max, max(times.t_max - times.t_start, 1 / times.frames_per_unit))
+    if models.steps_needed(model, np.array([span]))[0] > MOST_STEPS:
+        raise errors.ConfigError(
+            f"{mover.name}: an orbit this fast or far off cannot be integrated; take smaller rates, or Throw and Spin"
+        )
+    poses = reduction.model_sampler(model, times.t_max)
 
     def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         quats, displacements, quat_slopes, slopes = poses(at)

@@ -17,6 +17,8 @@ from ..r5dgs_core.motion import centers
 from ..r5dgs_core.motion.models import MotionModel
 from . import motion_curves, motion_extrapolate, motion_physics
 
+_ON_AXIS = 1e-4  # of a point's distance: rates are float32
+
 
 def point(anchor: bpy.types.Object) -> np.ndarray | None:
     """The point about which an anchor turns or swings, or None where its motion has none. [3]
@@ -102,8 +104,8 @@ def _model(anchor: bpy.types.Object) -> MotionModel | None:
 def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
     """The point about which an anchor turns, seen from it. [3]
 
-    Any point of the axis of a screw or an orbit is one: it is the one that was chosen, and nearest to the anchor unless
-    one was.
+    Any point of the axis of a screw or an orbit is one: it is the one that was chosen, if the axis still goes through
+    that, else the one nearest to the anchor.
     """
     model = _model(anchor)
     found = None if model is None else centers.center(model)
@@ -111,7 +113,9 @@ def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
         return found
     along = centers.axis(model)
     assert along is not None  # what has a center and is no spring turns
-    return found + along * (along @ np.array(anchor.r5dgs_motion.stored_pivot, np.float64))
+    chosen = np.array(anchor.r5dgs_motion.stored_pivot, np.float64)
+    on_axis = found + along * (along @ chosen)
+    return on_axis if np.linalg.norm(on_axis - chosen) <= _ON_AXIS * np.linalg.norm(chosen) else found
 
 
 def _store(anchor: bpy.types.Object, model: MotionModel) -> None:

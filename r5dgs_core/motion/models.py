@@ -389,8 +389,7 @@ def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
     """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
-    tolerance = _STEP_TOLERANCE * model.radius
-    needed = se3.steps_needed(w, v, eps, a, flat, model.radius, tolerance)
+    needed = steps_needed(model, flat)
     steps = np.minimum(1 << np.ceil(np.log2(needed)).astype(np.int64), _MOST_STEPS)
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
     hopeless = needed >= se3.MOST_STEPS
@@ -400,3 +399,11 @@ def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
         for block in np.array_split(rows, max(1, len(rows) * int(n) >> 18)):
             quats[block], displacements[block] = se3.integrate(w, v, eps, a, flat[block], int(n))
     return quats.reshape(*tau.shape, 4), displacements.reshape(*tau.shape, 3)
+
+
+def steps_needed(model: MotionModel, tau: np.ndarray) -> np.ndarray:
+    """Steps of integration that poses of a motion take; 1 where there is a closed form. [S] -> [S]"""
+    if model.kind != "world_twist":
+        return np.ones(len(tau), np.int64)
+    v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
+    return se3.steps_needed(w, v, eps, a, tau, model.radius, _STEP_TOLERANCE * model.radius)

@@ -238,3 +238,16 @@ def test_a_pivot_beyond_all_measure_does_no_harm(blender, loaded, mug):
         assert motions.keys(mug, LAST) == observed
     blender.ops.r5dgs.reset_motion()
     assert not motions.addon("motion_physics").edited(mug.r5dgs_motion)
+
+
+@pytest.mark.parametrize("far", [1e9, 1e30])
+def test_an_orbit_that_cannot_be_integrated_is_refused_and_nothing_changes(blender, loaded, mug, far):
+    set_up(mug.r5dgs_motion, "world_twist", **SPIN)
+    mug.r5dgs_pivot.point = (far, far, 0.0)
+    before = motions.keys(mug)
+    with pytest.raises(RuntimeError, match="mug anchor: an orbit this fast"):
+        blender.ops.r5dgs.re_extrapolate()
+    assert motions.keys(mug) == before
+    set_up(mug.r5dgs_motion, "world_twist", **SPIN)
+    mug.r5dgs_pivot.point = PIVOT
+    assert blender.ops.r5dgs.extrapolate_until(t_end=3.0) == {"FINISHED"}
