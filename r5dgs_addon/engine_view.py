@@ -6,6 +6,7 @@ With a window a timer makes the table when it is wanted, and a render, in a thre
 """
 
 import functools
+import logging
 import tempfile
 import threading
 import time
@@ -26,6 +27,7 @@ REST_S = 0.3  # what a viewport wants is made when it has wanted nothing else fo
 WAIT_S = 30.0  # a render waits no longer
 KEPT = 4  # tables, of half a megabyte and curves of one
 
+_log = logging.getLogger(__name__)
 _WIDTH = 512  # of images of samples
 _CURVES = ("tone", "extend", "use_clip")
 _LEVELS = ("black_level", "white_level")
@@ -116,7 +118,7 @@ def in_space(linear: np.ndarray, space: str) -> np.ndarray:
     return linear if matrix is None else linear @ np.array(matrix, np.float32).T
 
 
-_inverses: dict[Management, view_inverse.Inverse] = {}
+_inverses: dict[Management, view_inverse.Inverse | None] = {}  # None where Blender could not display samples
 _wanted: dict[Management, float] = {}  # what the timer shall make, and from when on
 
 
@@ -125,22 +127,17 @@ def can(scene: bpy.types.Scene) -> bool:
     return scene.display_settings.display_device == DISPLAY
 
 
-def ready(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
-    """The inverse of a scene's view where it is made already; for any thread."""
-    return _ready(of(scene))
-
-
 def want(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
     """The inverse where it is made already; where it is not, the timer makes it when nothing else is wanted.
 
     No data is written, so drawing may call it.
     """
     management = of(scene)
-    found, neutral = _ready(management), _neutral(management)
-    if found is None and neutral not in _wanted:
+    neutral = _neutral(management)
+    if neutral not in _inverses and neutral not in _wanted:
         _wanted.clear()
         _wanted[neutral] = time.monotonic() + REST_S
-    return found
+    return _ready(management)
 
 
 def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> view_inverse.Inverse | None:
@@ -151,23 +148,23 @@ def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> view_inverse.In
         stopped: Whether to wait no longer; called often.
 
     Returns:
-        The inverse; None where it was not made in time.
+        The inverse; None where it was not made, or not in time.
     """
     management = of(scene)
+    neutral = _neutral(management)
     if bpy.app.background or threading.current_thread() is threading.main_thread():
         return prepare(scene)
-    end, found = time.monotonic() + WAIT_S, _ready(management)
-    while found is None and time.monotonic() < end and not stopped():
-        _wanted.setdefault(_neutral(management), 0.0)
+    end = time.monotonic() + WAIT_S
+    while neutral not in _inverses and time.monotonic() < end and not stopped():
+        _wanted.setdefault(neutral, 0.0)
         time.sleep(0.02)
-        found = _ready(management)
-    return found
+    return _ready(management)
 
 
-def prepare(scene: bpy.types.Scene) -> view_inverse.Inverse:
-    """Make the inverse of a scene's view now, where it is not; for Blender's own thread."""
+def prepare(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
+    """Make the inverse of a scene's view now, where it was not; for Blender's own thread."""
     management = of(scene)
-    if _ready(management) is None:
+    if _neutral(management) not in _inverses:
         _make(_neutral(management))
     return _ready(management)
 
@@ -190,11 +187,16 @@ def _exposed(inverse: view_inverse.Inverse, exposure: float) -> view_inverse.Inv
 
 
 def _make(management: Management) -> None:
-    sampler = _Sampler(management)
+    """Make an inverse; where that fails, as on a full disk, the console says why and it is not tried again."""
+    made = None
     try:
-        made = view_inverse.invert(sampler.displayed, 2.0**-management.exposure)
-    finally:
-        sampler.close()
+        sampler = _Sampler(management)
+        try:
+            made = view_inverse.invert(sampler.displayed, 2.0**-management.exposure)
+        finally:
+            sampler.close()
+    except (OSError, RuntimeError) as error:
+        _log.warning("R5DGS: no inverse of the view %s: %s", management.transform, error)
     while len(_inverses) >= KEPT:
         del _inverses[next(iter(_inverses))]
     _inverses[management] = made

@@ -360,6 +360,24 @@ def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
     assert view_module.want(blender.context.scene) is made
 
 
+def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blender, loaded, tmp_path, monkeypatch):
+    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    blender.context.scene.view_settings.view_transform = "Filmic"
+    tried, before = [], len(blender.data.scenes)
+
+    def full(self, colors):
+        tried.append(len(colors))
+        raise RuntimeError("the disk is full")
+
+    monkeypatch.setattr(view_module, "_inverses", {})
+    monkeypatch.setattr(view_module._Sampler, "displayed", full)
+    render_png(blender, tmp_path)
+    render_png(blender, tmp_path)
+    assert len(tried) == 1 and len(blender.data.scenes) == before
+    assert color.objections(blender.context.scene) == ["view transform Filmic"]
+
+
 def test_what_a_viewport_wants_is_made_by_the_timer_when_it_rests(blender, loaded, monkeypatch):
     view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
     settings = blender.context.scene.view_settings
