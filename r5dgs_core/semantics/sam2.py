@@ -85,7 +85,7 @@ def _transformers() -> Any:
         _ = transformers.Sam2VideoModel, transformers.Sam2Model
     except (ImportError, AttributeError) as error:
         raise errors.BackendError(
-            f"SAM2 needs transformers 5 or later: pip install 'r5dgs[masks]' ({error})"
+            f"SAM2 needs transformers 5 or later: pip install 'r5dgs[encoders]' ({error})"
         ) from error
     except RuntimeError as error:  # transformers imports what else is installed
         raise errors.BackendError(

@@ -24,7 +24,6 @@ from ..scene.scene import IDENTITY_DIM
 from . import identity_losses
 from .config import Config
 from .posing import Splats
-from .sections import IdentitySection
 from .views import TrainView, spread
 
 VOTE_VIEWS = 80
@@ -62,7 +61,8 @@ def train_encodings(
     pose: Callable[[TrainView], Splats],
     classes: dict[int, int],
     labels: Tensor,
-    section: IdentitySection,
+    config: Config,
+    means: Tensor,
     generator: torch.Generator,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -75,16 +75,20 @@ def train_encodings(
         pose: Splats of a view.
         classes: Class of each object id.
         labels: Class of each Gaussian to start from. [N]
-        section: Steps and rates.
+        config: Of the run: steps, rates and the weights of the losses.
+        means: Centres whose neighbours should agree. [N, 3]
         generator: Source of the draws.
         progress: Called with step and loss.
 
     Returns:
         Encodings [N, 16], classifier weight [C, 16] and bias [C].
 
-    Source: Gaussian Grouping (Ye et al. 2024), Eq. 2 to 4: pixel cross-entropy divided by ln C; without its 3D losses,
-        which cost accuracy where masks are clean.
+    Source: Gaussian Grouping (Ye et al. 2024), Eq. 2 to 4: pixel cross-entropy divided by ln C. Its 3D losses weigh
+        nothing unless asked for: where masks are clean they cost accuracy.
     """
+    section = config.identity
+    agreement = Agreement(config)
+    neighbourhood = identity_losses.Neighbourhood(means) if agreement.counts else None
     masked = [v for v in views if v.mask is not None]
     count = max(classes.values()) + 1
     weight, bias = _distinct_classes(count, generator)
@@ -107,12 +111,64 @@ def train_encodings(
             splats = pose(view)
         image = _rasterize(splats, encodings, view)
         loss = identity_losses.pixel_cross_entropy(image, weight, bias, target)
+        if neighbourhood is not None and step % section.regularise_every == 0:
+            loss = loss + agreement.loss(encodings, weight, bias, neighbourhood, generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
         if progress is not None:
             progress(step + 1, float(loss.detach()))
     return encodings.detach(), weight.detach(), bias.detach()
+
+
+class Agreement:
+    """L_3d and L_major of some Gaussians with their neighbours, weighted.
+
+    Args:
+        config: The run's configuration.
+
+    Attributes:
+        counts: Whether either weighs anything.
+    """
+
+    def __init__(self, config: Config):
+        section, paper = config.identity, config.train.representation == "field"
+        self._section = section
+        self._majority = section.majority if not paper or config.field.variant == "r5dgs_extra" else 0.0
+        self._include_self = paper if section.include_self == "auto" else section.include_self == "on"
+        self.counts = max(section.spatial, self._majority) > 0
+
+    def loss(
+        self,
+        encodings: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        neighbourhood: identity_losses.Neighbourhood,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """What it adds to a step's loss; the classifier is asked of the drawn Gaussians and their neighbours alone.
+
+        Args:
+            encodings: Of all Gaussians. [N, 16]
+            weight: Of the classifier. [C, 16]
+            bias: Of the classifier. [C]
+            neighbourhood: Of all Gaussians.
+            generator: Source of the draws.
+        """
+        rows = torch.randint(len(encodings), (self._section.samples,), generator=generator)
+        found = neighbourhood.nearest(rows, self._section.neighbours)
+        both = torch.cat([rows[:, None], found], dim=1)
+        # index_select sums its gradients in the same order on any number of threads; indexing does not.
+        answers = encodings.index_select(0, both.reshape(-1)) @ weight.T + bias
+        probabilities = answers.softmax(dim=1).reshape(*both.shape, -1)
+        queries, neighbours = probabilities[:, 0], probabilities[:, 1:]
+        total = queries.new_zeros(())
+        if self._section.spatial > 0:
+            divergence = identity_losses.spatial_divergence(queries, neighbours, include_self=self._include_self)
+            total = total + self._section.spatial * divergence
+        if self._majority > 0:
+            total = total + self._majority * identity_losses.majority_distance(queries, neighbours)
+        return total
 
 
 def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -> JointIdentity | None:
@@ -153,9 +209,7 @@ class JointIdentity:
         self._section = config.identity
         self._generator = generator
         self.with_geometry = config.identity.training == "joint"
-        paper = config.train.representation == "field"
-        self._majority = config.identity.majority if not paper or config.field.variant == "r5dgs_extra" else 0.0
-        self._include_self = paper
+        self._agreement = Agreement(config)
         count = max(classes.values()) + 1
         if self.with_geometry:
             spread_of_rows = 1 / math.sqrt(IDENTITY_DIM)
@@ -224,27 +278,11 @@ class JointIdentity:
                 target = class_map(view, self._classes)
                 weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
                 terms.append(section.weight * identity_losses.pixel_cross_entropy(features, weight, bias, target))
-        if iteration % section.regularise_every == 0 and max(section.spatial, self._majority) > 0:
-            terms.append(self._regularisation(gaussians, iteration))
+        if iteration % section.regularise_every == 0 and self._agreement.counts:
+            weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
+            near = self._neighbours(gaussians, iteration)
+            terms.append(self._agreement.loss(gaussians.identities, weight, bias, near, self._generator))
         return sum(terms[1:], terms[0]) if terms else None
-
-    def _regularisation(self, gaussians: Gaussians, iteration: int) -> Tensor:
-        """L_3d and L_major on some Gaussians, weighted."""
-        rows = torch.randint(len(gaussians), (self._section.samples,), generator=self._generator)
-        found = self._neighbours(gaussians, iteration).nearest(rows, self._section.neighbours)
-        both = torch.cat([rows[:, None], found], dim=1)
-        # index_select sums its gradients in the same order on any number of threads; indexing does not.
-        encodings = gaussians.identities.index_select(0, both.reshape(-1))
-        answers = encodings @ self.params["classifier.weight"].T + self.params["classifier.bias"]
-        probabilities = answers.softmax(dim=1).reshape(*both.shape, -1)
-        queries, neighbours = probabilities[:, 0], probabilities[:, 1:]
-        total = queries.new_zeros(())
-        if self._section.spatial > 0:
-            divergence = identity_losses.spatial_divergence(queries, neighbours, include_self=self._include_self)
-            total = total + self._section.spatial * divergence
-        if self._majority > 0:
-            total = total + self._majority * identity_losses.majority_distance(queries, neighbours)
-        return total
 
     def _neighbours(self, gaussians: Gaussians, iteration: int) -> identity_losses.Neighbourhood:
         stale = not self._current(gaussians) or iteration - self._found_at >= NEIGHBOURS_EVERY

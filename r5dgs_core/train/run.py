@@ -256,7 +256,6 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
 
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})
         extra["labels"] = identity.vote(trainer.views, pose, classes, fallback)
-        section = trainer.config.identity
         steps, started = _identity_steps(trainer), time.monotonic()
         if trainer.identity is not None:
             extra |= trainer.identity.outcome(trainer.gaussians)
@@ -271,7 +270,14 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
             # A generator of its own: a run resumed here draws what an unbroken one draws.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
             encodings, weight, bias = identity.train_encodings(
-                trainer.views, pose, classes, extra["labels"], section, draws, report
+                trainer.views,
+                pose,
+                classes,
+                extra["labels"],
+                trainer.config,
+                trainer.gaussians.means.detach(),
+                draws,
+                report,
             )
             extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
     _save(trainer, run, began, finished=True, extra=extra)

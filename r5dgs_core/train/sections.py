@@ -18,6 +18,7 @@ IDENTITY_TRAINING = ("after", "joint", "detached", "off")
 BACKGROUNDS = ("auto", "learned", "white", "black")
 STRATEGIES = ("share", "default", "mcmc")
 NEEDS = ("auto", "on", "off")
+INCLUDE_SELF = ("auto", "on", "off")
 
 
 @dataclass(frozen=True)
@@ -372,6 +373,8 @@ class IdentitySection:
         majority: Weight of the distance from the neighbours' mean class (L_major); 0 for none.
         regularise_every: Steps between two evaluations of these two (tau_reg).
         neighbours: Neighbours that are compared.
+        include_self: Whether L_3d counts a Gaussian among its own neighbours, as Gaussian Grouping does; "auto" does
+            in a ``field``.
         samples: Gaussians that are compared with theirs each time.
     """
 
@@ -385,6 +388,7 @@ class IdentitySection:
     majority: float = 0.0
     regularise_every: int = 2
     neighbours: int = 5
+    include_self: str = "auto"
     samples: int = 1000
 
 

@@ -14,7 +14,6 @@ from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.train import config, identity, identity_losses
 from r5dgs_core.train.posing import Splats
-from r5dgs_core.train.sections import IdentitySection
 from r5dgs_core.train.views import TrainView
 
 
@@ -58,14 +57,15 @@ def test_ids_without_a_class_do_not_vote():
 def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
     view, splats = row_of_blobs()
     wrong = torch.tensor([0, 2, 2])
-    section = IdentitySection(iterations=steps, rate=0.1, classifier_rate=0.05)
+    settings = {"identity.iterations": steps, "identity.rate": 0.1, "identity.classifier_rate": 0.05}
     losses = []
     encodings, weight, bias = identity.train_encodings(
         [view],
         lambda _: splats,
         CLASSES,
         wrong,
-        section,
+        config.Config().replace(**settings),
+        splats.means,
         torch.Generator().manual_seed(0),
         lambda _, loss: losses.append(loss),
     )
@@ -78,9 +78,9 @@ def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
 def test_more_classes_than_dimensions_are_no_obstacle():
     view, splats = row_of_blobs()
     many = {0: 0, 3: 18, 5: 19} | {i: i - 99 for i in range(100, 117)}
-    section = IdentitySection(iterations=1)
+    labels, settings = torch.tensor([0, 19, 18]), config.Config().replace(**{"identity.iterations": 1})
     _, weight, _ = identity.train_encodings(
-        [view], lambda _: splats, many, torch.tensor([0, 19, 18]), section, torch.Generator().manual_seed(0)
+        [view], lambda _: splats, many, labels, settings, splats.means, torch.Generator().manual_seed(0)
     )
     assert weight.shape == (20, scene.IDENTITY_DIM) and torch.isfinite(weight).all()
 
@@ -232,6 +232,45 @@ def test_of_the_variants_only_the_one_with_extra_losses_has_the_majority(represe
     changes = {"train.representation": representation, "field.variant": variant, "identity.weight": 0.0}
     identities = make_joint(view, gaussians, "joint", **changes, **{"identity.majority": 0.5})
     assert (identities.loss(gaussians, posed(gaussians), view, 0) is not None) == active
+
+
+def test_after_the_run_too_neighbours_teach_what_no_pixel_shows():
+    view, gaussians = wall()
+    truth, wrong = gaussians.motion_ids, torch.arange(300) % 12 == 0
+    with torch.no_grad():
+        gaussians.opacity_logits[wrong] = -12.0
+    start = torch.where(wrong, (truth + 1) % 3, truth)
+    right = []
+    for spatial in (0.0, 5.0):
+        changes = {"identity.iterations": 100, "identity.spatial": spatial, "identity.rate": 0.05}
+        encodings, weight, bias = identity.train_encodings(
+            [view],
+            lambda _: posed(gaussians),
+            CLASSES,
+            start,
+            config.Config().replace(**changes),
+            gaussians.means.detach(),
+            torch.Generator().manual_seed(0),
+        )
+        answers = (encodings @ weight.T + bias).argmax(1)
+        right.append(float((answers == truth)[wrong].float().mean()))
+        assert (answers == truth)[~wrong].float().mean() > 0.95
+    assert right[0] == 0 and right[1] > 0.8
+
+
+@pytest.mark.parametrize(
+    ("representation", "asked", "counted"),
+    [("field", "auto", True), ("tracks", "auto", False), ("tracks", "on", True), ("field", "off", False)],
+)
+def test_a_gaussian_counts_among_its_neighbours_as_asked(representation, asked, counted):
+    """Counting it takes the farthest of k away: with one neighbour nothing is left to differ from."""
+    changes = {"train.representation": representation, "identity.include_self": asked, "identity.neighbours": 1}
+    agreement = identity.Agreement(config.Config().replace(**changes, **{"identity.spatial": 1.0}))
+    points = identity_losses.Neighbourhood(torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
+    draws = torch.Generator().manual_seed(1)
+    encodings, weight = torch.randn(50, 16, generator=draws), torch.randn(3, 16, generator=draws)
+    loss = agreement.loss(encodings, weight, torch.zeros(3), points, draws)
+    assert (float(loss) == 0) == counted
 
 
 def test_losses_come_at_their_intervals():

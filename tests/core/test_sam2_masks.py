@@ -288,7 +288,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 @pytest.mark.parametrize("package", ["transformers", "safetensors"])
 def test_without_transformers_one_error_names_what_to_install(folder, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(errors.BackendError, match=r"pip install 'r5dgs\[masks\]'"):
+    with pytest.raises(errors.BackendError, match=r"pip install 'r5dgs\[encoders\]'"):
         sam2.Sam2(folder)
 
 

@@ -12,7 +12,6 @@ from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.scene import playback
 from r5dgs_core.train import config, hull, identity, normalization, scatter, sweep, triangulation, views
 from r5dgs_core.train.posing import Splats
-from r5dgs_core.train.sections import IdentitySection
 from tests import datasets as tiny_datasets
 
 CLASSES = {0: 0, tiny_datasets.BRICK: 1, tiny_datasets.BALL: 2}
@@ -87,8 +86,10 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
             v if (k + k // 6) % 3 == 0 else marked(v, v.mask == tiny_datasets.BALL, missed) for k, v in enumerate(seen)
         ]
         labels = identity.vote(some, pose, CLASSES, fallback)
+        settings = config.load(None, ["identity.iterations=60"])
+        means = torch.from_numpy(tiny.truth.means)
         encodings, weight, bias = identity.train_encodings(
-            some, pose, CLASSES, labels, IdentitySection(iterations=60), torch.Generator().manual_seed(0)
+            some, pose, CLASSES, labels, settings, means, torch.Generator().manual_seed(0)
         )
         return labels, (encodings @ weight.T + bias).argmax(1)
 
