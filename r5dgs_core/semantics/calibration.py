@@ -48,8 +48,7 @@ def for_words(rows: np.ndarray, nouns: np.ndarray, objects: int) -> Calibration:
     """
     words, things = common_nouns.words(), common_nouns.things()
     places = [words.index(thing) for thing in things]
-    false = np.array([[not common_nouns.related(thing, word) for word in words] for thing in things])
-    limit = _limit(standardize(nouns[places], nouns)[false], objects)
+    limit = _limit(standardize(nouns[places], nouns)[~common_nouns.relations()[places]], objects)
     return _calibration(rows, nouns, limit)
 
 
@@ -67,7 +66,7 @@ def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[s
     for row, own in enumerate(names):
         known = [noun for name in own if (noun := common_nouns.known(name)) is not None]
         if known:
-            false[row] = [not any(common_nouns.related(noun, word) for noun in known) for word in words]
+            false[row] = ~common_nouns.relations()[[words.index(noun) for noun in known]].any(0)
         else:
             false[row, np.argsort(above[row])[len(words) - round(_LIKELY_TRUE * len(words)) :]] = False
     return _calibration(rows, nouns, _limit(above[false], len(rows)))

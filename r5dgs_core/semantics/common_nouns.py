@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
+
 from ..scene import lookup
 
 _KINDS = """\
@@ -138,15 +140,29 @@ def things() -> tuple[str, ...]:
 
 def related(one: str, other: str) -> bool:
     """Whether two nouns are the same, one is a kind of the other, or both are of one kind."""
-    above = broader()
-    return bool(({one} | above.get(one, frozenset())) & ({other} | above.get(other, frozenset())))
+    rows = _rows()
+    return bool(relations()[rows[one], rows[other]])
+
+
+@functools.cache
+def relations() -> np.ndarray:
+    """Whether each two of `words` are related. [W, W] bool"""
+    rows, above = _rows(), np.eye(len(_rows()), dtype=np.float32)
+    for word, kinds in broader().items():
+        above[rows[word], [rows[kind] for kind in kinds]] = 1
+    return above @ above.T > 0
 
 
 def known(phrase: str) -> str | None:
     """The noun that a phrase says: itself, or its last words, as "blue crate" is a crate; None for none."""
-    rows = _by_words()
+    nouns = _by_words()
     said = lookup.words_of(phrase)
-    return next((rows[tuple(said[k:])] for k in range(len(said)) if tuple(said[k:]) in rows), None)
+    return next((nouns[tuple(said[k:])] for k in range(len(said)) if tuple(said[k:]) in nouns), None)
+
+
+@functools.cache
+def _rows() -> dict[str, int]:
+    return {word: row for row, word in enumerate(words())}
 
 
 @functools.cache
