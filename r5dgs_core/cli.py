@@ -1,4 +1,4 @@
-"""The ``r5dgs`` command: demo, train, bake, import, evaluate, report, bench, info, objects, lookup, query, name,
+"""The ``r5dgs`` command: demo, train, masks, bake, import, evaluate, report, bench, info, objects, lookup, query, name,
 warm-up.
 
 What each sub-command does is in `commands` and its neighbours.
@@ -51,6 +51,26 @@ def parser() -> argparse.ArgumentParser:
     shown = "masks of the training views (default: DATA/object_mask); 'none': without"
     train.add_argument("--masks", metavar="FOLDER", help=shown)
     add_training(train)
+
+    masks = commands.add_parser("masks", help="make masks of the training images, or check those that stand")
+    masks.add_argument("data", type=Path, help="data set folder")
+    made = "precomputed (a folder; the default), blender (of the capture) or sam2"
+    masks.add_argument("--backend", default="precomputed", metavar="NAME", help=made)
+    masks.add_argument("--from", dest="source", type=Path, metavar="FOLDER", help="folder of masks, or of a capture")
+    masks.add_argument("--model", type=Path, metavar="DIR", help="folder of SAM2")
+    masks.add_argument("--out", type=Path, metavar="FOLDER", help="where masks go (default: DATA/object_mask)")
+    key_frames = "images of each video in which sam2 looks for everything (default: 3)"
+    masks.add_argument("--key-frames", type=int, metavar="N", help=key_frames)
+    masks.add_argument("--points", type=int, metavar="N", help="points per side that sam2 asks at (default: 32)")
+    masks.add_argument("--score", type=float, metavar="SHARE", help="least quality that sam2 foretells (default: 0.8)")
+    stability = "least IoU of a mask at two thresholds (default: 0.95)"
+    masks.add_argument("--stability", type=float, metavar="SHARE", help=stability)
+    max_area = "larger masks are background, as a share of the image (default: 0.4)"
+    masks.add_argument("--max-area", type=float, metavar="SHARE", help=max_area)
+    masks.add_argument("--device", metavar="NAME", help="cpu (the default) or cuda, for sam2")
+    masks.add_argument("--unknown", type=int, metavar="VALUE", help="255: value in the folder's masks for 'unknown'")
+    masks.add_argument("--overwrite", action="store_true", help="begin anew where there are other masks")
+    add_progress(masks)
 
     bake = commands.add_parser("bake", help="turn a run into a scene file")
     bake.add_argument("run", type=Path, help="run folder")
@@ -191,6 +211,12 @@ def _dispatch(args: argparse.Namespace) -> int:
             from .demo import run_demo
 
             run_demo(args.out, **options)
+    elif args.command == "masks":
+        from . import commands_masks
+
+        names = ("backend", "model", "source", "out", "key_frames", "points", "score", "stability", "max_area")
+        options = {name: getattr(args, name) for name in (*names, "device", "unknown", "overwrite")}
+        commands_masks.run_masks(args.data, **options, progress_kind=args.progress)
     elif args.command == "bake":
         commands.run_bake(args.run, args.out, args.data, overrides)
     elif args.command == "import":
