@@ -103,10 +103,10 @@ def middle(mask: np.ndarray) -> tuple[float, float, float]:
     Returns:
         Column and row of its pixel's centre, and its distance from the edge in pixels.
     """
-    parts, count = ndimage.label(mask)
+    parts, count = ndimage.label(mask)  # type: ignore[misc]
     if count > 1:
         mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    depth = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(depth)), mask.shape)
     return float(column) + 0.5, float(row) + 0.5, float(depth[row, column])
 
@@ -123,9 +123,9 @@ def _painted(color: np.ndarray, ids: np.ndarray, listed: Sequence[SceneObject], 
             continue
         own = np.asarray(item.color, np.float32)
         picture[mask] = (1 - TINT) * picture[mask] + TINT * own
-        seam = ndimage.binary_dilation(mask, square, line) & ~known
+        seam = np.asarray(ndimage.binary_dilation(mask, square, line), bool) & ~known
         picture[seam] *= 0.35
-        inner = ndimage.binary_erosion(mask, square, line, border_value=True)
+        inner = np.asarray(ndimage.binary_erosion(mask, square, line, border_value=True), bool)
         picture[mask & ~inner] = own
     return picture
 

@@ -71,7 +71,7 @@ class Overlap:
             return dict.fromkeys(KEYS)
         table, present = metrics.ious(self.counts), metrics.present(self.counts)
         chosen = metrics.matched(self.counts)
-        rows = np.flatnonzero(present)
+        rows = np.flatnonzero(present).tolist()
         return {
             "miou": _finite(metrics.miou(self.counts)),
             "miou_matched": _finite(metrics.miou_matched(self.counts)),
