@@ -6,6 +6,7 @@ import importlib
 import numpy as np
 import pytest
 
+from r5dgs_core.data import images
 from r5dgs_core.raster import scene_render, stage
 from r5dgs_core.scene import cameras, playback, scene_file
 from tests import datasets, scenes
@@ -321,3 +322,14 @@ def test_a_view_of_a_region_is_the_cameras_where_it_looks_through_it(blender, pi
         np.testing.assert_allclose(view.camera.intrinsics, expected.camera.intrinsics, rtol=1e-5, atol=1e-3)
         np.testing.assert_allclose(view.camera.T_cam_world, expected.camera.T_cam_world, rtol=1e-5, atol=1e-5)
         assert view.near is None and (view.distance == 0) == (kind == "PERSP")
+
+
+def test_the_previews_image_saves_its_own_bytes_under_every_view(blender, picture, tmp_path):
+    color = np.random.default_rng(0).integers(0, 256, (20, 30, 3)) / 255
+    image = picture.write_image(picture.IMAGE, color)
+    assert not image.use_view_as_render
+    image.file_format = "PNG"
+    for view in ("AgX", "Filmic", "Standard"):
+        blender.context.scene.view_settings.view_transform = view
+        image.save(filepath=str(tmp_path / f"{view}.png"))
+        np.testing.assert_allclose(images.read(tmp_path / f"{view}.png")[..., :3], color, atol=1e-6)
