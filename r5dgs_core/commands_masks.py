@@ -54,6 +54,7 @@ def run_masks(
 
     Raises:
         ConfigError, DatasetError, BackendError: As their messages say.
+        Interrupted: Ctrl-C; what is done is kept.
     """
     from .data import dataset as datasets
     from .progress import make
@@ -87,7 +88,12 @@ def run_masks(
         if in_place:
             made = mask_making.check(views, maker, folder, progress=progress)
         else:
-            made = mask_making.make(views, maker, folder, overwrite=overwrite, progress=progress)
+            try:
+                made = mask_making.make(views, maker, folder, overwrite=overwrite, progress=progress)
+            except KeyboardInterrupt as stop:
+                raise errors.Interrupted(
+                    f"stopped; videos that are done stay in {folder}, the same command goes on after them"
+                ) from stop
         if progress_kind == "json":
             progress({"event": "masked", "path": str(folder), "images": made.images, "objects": made.objects})
     if progress_kind != "json":
