@@ -18,6 +18,7 @@ from ..semantics import standpoints
 from . import evaluate, overlap
 
 MOST_VIEWS = 24  # that pixels are counted in
+STILL = 0.05  # of its radius: less than this is no motion
 _KINDS = {  # as the sidebar in Blender calls them
     "static": "rests",
     "translation": "slide",
@@ -165,12 +166,18 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
     """How an object moves past t_max, by its motion models, in words; "pinned" where no group of it can move."""
     words = []
     for group in groups:
-        poses = scene.track_poses[group.id]
-        if (poses == poses[-1]).all() and group.model.is_static:
+        if group.model.kind == "static" and _moved(scene, group) <= STILL * group.model.radius:
             words.append("still")
         else:
             words.append(_KINDS[group.model.kind])
     return ", ".join(dict.fromkeys(words)) or "pinned"
+
+
+def _moved(scene: Scene, group: MotionGroup) -> float:
+    """The way that a member at the group's radius makes at most in the observed time, world units."""
+    poses = scene.track_poses[group.id]
+    chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
+    return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
 
 
 def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
