@@ -38,9 +38,10 @@ import numpy as np
 
 from . import __version__, errors
 from . import serve_requests as asked
-from .scene import lookup, playback, quality, scene_file
+from .scene import playback, quality, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
+from .semantics import encoders, query
 
 PROTOCOL = 3
 NEEDED = ("torch", "numba")
@@ -105,11 +106,13 @@ class Server:
         self._numbers: list[int] = []  # which of them each path of the last load is
         self._errors: list[quality.Quality] = []  # what is known of theirs
         self._players: dict[int, playback.Player] = {}  # of each scene, from the first time that is asked for
+        self._encoder: tuple[str, encoders.Encoder] | None = None  # the last one, by what it was asked for as
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
             "render": self._render,
             "query": self._query,
+            "embed": self._embed,
             "warm_up": self._warm_up,
             "check": self._check,
         }
@@ -257,10 +260,34 @@ class Server:
         return {**warm, "versions": versions, **dataclasses.asdict(found)}, {}
 
     def _query(self, request: dict[str, Any]) -> Answer:
-        """``text``: ranked objects of a loaded ``scene``, the first one where left out."""
-        scenes = self._loaded()
-        found = lookup.search(scenes[asked.number_of(request, self._numbers)], asked.need(request, "text", str))
-        return {"matches": [{"object_id": m.object_id, "score": m.score, "why": m.why} for m in found]}, {}
+        """``text``: ranked objects of a loaded ``scene``, the first one where left out.
+
+        ``encoder``: folder of the encoder that made the scene's lookup table, or "text", for words that the scene does
+        not store; null for none.
+        """
+        scene = self._loaded()[asked.number_of(request, self._numbers)]
+        text = asked.need(request, "text", str)
+        encoder = None if request.get("encoder") is None else self._opened(request)
+        found = query.find(scene, text, encoder)
+        return {"matches": [dataclasses.asdict(match) for match in found]}, {}
+
+    def _embed(self, request: dict[str, Any]) -> Answer:
+        """``texts``: embeddings of phrases by an ``encoder`` as in ``query``, and what that is."""
+        texts = asked.need(request, "texts", list)
+        if not all(isinstance(text, str) for text in texts):
+            raise errors.ConfigError(f"worker: 'embed' needs texts, found {texts!r}")
+        encoder = self._opened(request)
+        card = encoder.card
+        known = {"kind": card.kind, "name": card.name, "digest": card.digest, "dimension": card.dimension}
+        return {"encoder": known}, {"embeddings": encoders.embed_phrases(encoder, texts)}
+
+    def _opened(self, request: dict[str, Any]) -> encoders.Encoder:
+        """The encoder that is asked for; the last one stays open."""
+        where = asked.need(request, "encoder", str)
+        if self._encoder is None or self._encoder[0] != where:
+            self._encoder = None  # its memory first
+            self._encoder = where, encoders.open_encoder(where)
+        return self._encoder[1]
 
     def _loaded(self) -> list[Scene]:
         if not self._scenes:

@@ -15,7 +15,8 @@ from r5dgs_core import serve  # noqa: E402
 from r5dgs_core.raster import compile as compilation  # noqa: E402
 from r5dgs_core.raster import scene_render, stage, warming  # noqa: E402
 from r5dgs_core.scene import playback, scene_file  # noqa: E402
-from tests import scenes  # noqa: E402
+from r5dgs_core.semantics import encoders, lookup_table  # noqa: E402
+from tests import encoder_folders, scenes  # noqa: E402
 from tests.core.test_scene_render import matrix  # noqa: E402
 
 CAMERA = scenes.orbit_camera(0.2, 32, 24)
@@ -263,6 +264,28 @@ def test_a_check_tells_versions_device_and_speed():
 def test_words_find_objects(path):
     _, (header, _) = talk(load(path), {"command": "query", "text": "mug"})
     assert header["result"]["matches"][0]["object_id"] == 1
+
+
+def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
+    pytest.importorskip("transformers")
+    folder = encoder_folders.sentences(tmp_path / "tiny")
+    encoder = encoders.open_encoder(folder)
+    made = lookup_table.make(scenes.make_scene(n=120, objects=2), encoder).scene
+    file = scene_file.write(made, tmp_path / "words.r5dgs")
+    ask = {"encoder": str(folder)}
+    _, (embedded, arrays), (found, _), (other, _), (wrong, _), (last, _) = talk(
+        load(file),
+        {"command": "embed", "texts": ["a mug", "zeppelin"], **ask},
+        {"command": "query", "text": "mug", **ask},
+        {"command": "embed", "texts": ["mug"], "encoder": str(tmp_path)},
+        {"command": "embed", "texts": [3], **ask},
+        {"command": "embed", "texts": [], **ask},
+    )
+    assert embedded["result"]["encoder"]["digest"] == made.lookup.encoder.digest
+    np.testing.assert_array_equal(arrays["embeddings"], encoders.embed_phrases(encoder, ["a mug", "zeppelin"]))
+    assert found["result"]["matches"][0]["object_id"] == 1 and found["result"]["matches"][0]["score"] == 1
+    assert not other["ok"] and "config.json" in other["error"]["message"]
+    assert not wrong["ok"] and "needs texts" in wrong["error"]["message"] and last["ok"]
 
 
 def test_the_process_keeps_its_output_clean_and_ends_with_its_input(path):
