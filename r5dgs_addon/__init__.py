@@ -11,6 +11,7 @@ from . import (
     motion_physics,
     motion_pivot,
     panels,
+    phrases,
     preferences,
     properties,
     table,
@@ -33,6 +34,7 @@ MODULES = (
     handlers,
     click,
     worker,
+    phrases,
     live_preview,
 )
 

@@ -1,4 +1,4 @@
-"""The add-on's preferences: which Python runs the worker.
+"""The add-on's preferences: which Python runs the worker, and which encoder it has.
 
 Preferences are read and written in Blender's main thread alone; other threads get a `Choice` that was made there. The
 search for a Python touches none of Blender's data, so it runs where there is time for it.
@@ -18,6 +18,8 @@ from .. import __package__ as base_package
 from . import pythons
 
 ENVIRONMENT = "R5DGS_PYTHON"
+ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
+INSTALLED = "text"  # in place of a folder: the package of a small text encoder
 ROOT = Path(__file__).resolve().parent.parent
 
 _found: str | None = None  # what the search found in this session, "" for nothing; None before it
@@ -48,6 +50,12 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         subtype="TIME_ABSOLUTE",
         update=_remember,
     )
+    text_encoder: StringProperty(
+        name="Text Encoder",
+        description="Folder of the encoder that made the scenes' lookup tables, for words that they do not store; "
+        "'text' for the installed package",
+        subtype="DIR_PATH",
+    )
     found_python: StringProperty(
         name="Found Python", description="What the search for a Python found last", options={"HIDDEN"}
     )
@@ -61,6 +69,10 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         elif not self.worker_python and self.found_python:
             layout.label(text=f"Found: {self.found_python}", icon="INFO")
         layout.prop(self, "worker_timeout")
+        layout.prop(self, "text_encoder")
+        if os.environ.get(ENCODER_ENVIRONMENT):
+            wins = f"{ENCODER_ENVIRONMENT} is set and wins: {os.environ[ENCODER_ENVIRONMENT]}"
+            layout.label(text=wins, icon="INFO")
         layout.operator("r5dgs.check_worker", icon="PLAY")
 
 
@@ -137,6 +149,15 @@ def worker_python() -> str:
     found = choice().python()
     keep_found()
     return found
+
+
+def text_encoder() -> str:
+    """The encoder for words that scenes do not store: the environment's, or the user's; "" for none."""
+    preferences = get()
+    chosen = os.environ.get(ENCODER_ENVIRONMENT, "").strip()
+    if not chosen and preferences is not None:
+        chosen = preferences.text_encoder.strip()
+    return _absolute(chosen) if chosen not in ("", INSTALLED) else chosen
 
 
 def keep_found() -> None:

@@ -1,20 +1,22 @@
 """Words to objects, by the table that the .blend keeps and by the embeddings that the scene file stores.
 
 Names and aliases need neither the scene file nor torch. Embeddings of words are read from the file when it is first
-asked, and kept until it changes. An encoder, which knows words that the file does not, belongs in the worker: its
-answers would join the others in `search`.
+asked, and kept until it changes. Words that the file does not know are left to the encoder of the preferences, which
+the worker opens (`phrases`); its answers join the others.
 """
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import lookup, scene_file
-from . import picture, selection, table
+from . import phrases, picture, selection, table
 
 HISTORY = 12  # prompts kept
+STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
 _meanings: dict[Path, tuple[tuple[int, int], lookup.Meanings | None]] = {}  # by file, with its time and size
 
 
@@ -37,11 +39,13 @@ class Answer:
         matches: Best first.
         meant: Names that may have been meant where nothing matches.
         notes: Sentences: matches that were deleted, files that were not found.
+        missing: Phrases that the encoder of the preferences could answer, and was not asked for yet.
     """
 
     matches: list[Match]
     meant: list[str]
     notes: list[str]
+    missing: tuple[str, ...] = ()
 
     @property
     def objects(self) -> list[selection.Wanted]:
@@ -60,7 +64,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
     Returns:
         The answer; equal scores are in the order of ``loaded``.
     """
-    matches, deleted, notes, known = [], [], [], []
+    matches, deleted, notes, known, missing = [], [], [], [], []
     for collection in loaded:
         labels = table.labels(collection)
         there = table.present(collection)
@@ -68,7 +72,14 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
         known += [label for label in labels if label.object_id in there]
         meanings, note = _stored_meanings(collection)
         notes += [note] if note else []
-        for found in lookup.search_labels(labels, text, threshold, meanings):
+        embed = None
+        if meanings is not None and meanings.table is not None:
+            card, unknown = meanings.table.encoder, lookup.unknown(labels, text, meanings)
+            missing += phrases.missing(unknown)
+            other = phrases.stranger(unknown, card)
+            notes += [STRANGER.format(collection.name, card.name, other)] if other else []
+            embed = functools.partial(phrases.of, card=card)
+        for found in lookup.search_labels(labels, text, threshold, meanings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
             else:
@@ -77,7 +88,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     matches.sort(key=lambda match: -round(match.score, 6))
     meant = [] if matches or not text.strip() else list(dict.fromkeys(lookup.suggest(known, text)))
-    return Answer(matches, meant, notes)
+    return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)))
 
 
 def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:
@@ -88,10 +99,51 @@ def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answe
 
 
 def ask(context: bpy.types.Context, text: str) -> Answer:
-    """Search as the sidebar's settings say, show the answer there, and remember a prompt that found something."""
+    """Search as the sidebar's settings say, show the answer there, and remember a prompt that found something.
+
+    Words that only an encoder knows are waited for where there is no window; in one, the answer without them is shown,
+    and theirs when it comes.
+    """
     text = text.strip()
+    answer = _answer(context, text)
+    if answer.missing:
+        answer = _with_encoder(context, text, answer)
+    return _told(context, text, answer)
+
+
+def _answer(context: bpy.types.Context, text: str) -> Answer:
+    return search(scope(context), text, context.scene.r5dgs_words.threshold) if text else Answer([], [], [])
+
+
+def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
+    """The answer once the encoder has said its part, or with a note that it is being asked, or why it cannot be."""
+    asked = " and ".join(repr(phrase) for phrase in answer.missing)
+    if not bpy.app.background and bpy.context.window_manager.windows:
+        phrases.begin(answer.missing, functools.partial(_join, text))
+        return replace(answer, notes=[*answer.notes, f"Asking the text encoder for {asked}"])
+    try:
+        phrases.fetch(answer.missing)
+    except errors.R5dgsError as error:
+        return replace(answer, notes=[*answer.notes, f"Text encoder: {error}"])
+    return _answer(context, text)
+
+
+def _join(text: str, wrong: str) -> None:
+    """Show the answer again, now that the encoder has said its part."""
+    windows = bpy.context.window_manager.windows
+    if not windows or bpy.context.window_manager.r5dgs_words.asked != text:
+        return
+    with bpy.context.temp_override(window=windows[0]):
+        answer = _answer(bpy.context, text)
+        _told(bpy.context, text, replace(answer, notes=[*answer.notes, f"Text encoder: {wrong}"]) if wrong else answer)
+    for window in windows:
+        for area in window.screen.areas:
+            area.tag_redraw()
+
+
+def _told(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
+    """The answer, shown and remembered."""
     settings = context.scene.r5dgs_words
-    answer = search(scope(context), text, settings.threshold) if text else Answer([], [], [])
     _show(context.window_manager.r5dgs_words, text, answer)
     if answer.matches:
         _keep(settings.history, text)

@@ -21,7 +21,7 @@ from .meanings import Meanings
 from .scene import Scene
 
 THRESHOLD = stored.PASS
-Embed = Callable[[str], np.ndarray]  # embedding of a phrase, unit [D]
+Embed = Callable[[str], np.ndarray | None]  # embedding of a phrase, unit [D]; None where it cannot be had
 _SETTLED = 0.9  # of a name that says the wish whole
 _TYPO_RATIO = 0.75
 _LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
@@ -189,15 +189,16 @@ def _fulfil(
     if meanings is None or any(match.score >= _SETTLED for match in named):
         return named
     row = vocabulary_row(meanings.vocabulary, wish)
-    if row is None and embed is None:
+    query = meanings.vocabulary_embeddings[row] if row is not None else embed(said) if embed is not None else None
+    if query is None:
         return named
-    query = embed(said) if row is None and embed is not None else meanings.vocabulary_embeddings[row or 0]
     known = {label.object_id: label for label in labels}
     meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
     if row is not None:  # a word of its own is neither a typo nor the beginning of another: "car" is no "cart"
         fitting = {one.object_id for one in meant if one.score >= stored.PASS}
         named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
-    return [*named, *(_by_meaning(one, said) for one in meant)]
+    word = said if row is None else meanings.vocabulary[row]
+    return [*named, *(_by_meaning(one, word) for one in meant)]
 
 
 def _by_meaning(one: stored.Meant, said: str) -> Match:

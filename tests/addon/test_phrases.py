@@ -1,0 +1,114 @@
+"""Prompts in words that no scene stores: the worker embeds them with the encoder of the preferences."""
+
+import importlib
+import sys
+import time
+
+import pytest
+
+from r5dgs_core.scene import scene_file
+from tests import encoder_folders, scenes
+
+pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
+pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
+pytest.importorskip("transformers", reason="transformers is not installed in this Python, which runs the worker here")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """An encoder, a stranger, and a scene file with the first one's table; its object 2 means zorb."""
+    from r5dgs_core.semantics import encoders, lookup_table
+
+    folder = tmp_path_factory.mktemp("phrases")
+    own = encoder_folders.sentences(folder / "own")
+    other = encoder_folders.sentences(folder / "other", seed=1)
+    scene = scenes.make_scene(n=200, objects=3)
+    encoder = encoders.open_encoder(own)
+    made = lookup_table.make(scene, encoder).scene
+    row = [item.id for item in made.objects].index(2)
+    made.view_embeddings[row, 0] = encoders.embed_phrases(encoder, ["zorb"])[0]
+    return own, other, scene_file.write(made, folder / "words.r5dgs")
+
+
+@pytest.fixture
+def loaded(blender, folders, monkeypatch):
+    monkeypatch.setenv("R5DGS_PYTHON", sys.executable)
+    monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[0]))
+    importlib.import_module("r5dgs.r5dgs_addon.phrases").forget()
+    blender.ops.r5dgs.load_scene(filepath=str(folders[2]))
+    return blender
+
+
+def prompt():
+    return importlib.import_module("r5dgs.r5dgs_addon.prompt")
+
+
+def ask(bpy, text):
+    return bpy.ops.r5dgs.select_by_prompt(text=text, mode="SET")
+
+
+def notes(bpy):
+    return [note.name for note in bpy.context.window_manager.r5dgs_words.notes]
+
+
+def test_the_encoder_of_the_preferences_knows_other_words(loaded):
+    assert ask(loaded, "zorb") == {"FINISHED"}
+    (match,) = [m for m in loaded.context.window_manager.r5dgs_words.matches if m.object_id == 2]
+    assert "meaning of 'zorb'" in match.why and match.score >= 0.5 and notes(loaded) == []
+
+
+def test_a_phrase_is_embedded_once_and_names_need_nobody(loaded, monkeypatch):
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    asked, run = [], worker.run
+    monkeypatch.setattr(worker, "run", lambda steps: asked.append(steps[0][2]["texts"]) or run(steps))
+    ask(loaded, "zorb")
+    ask(loaded, "zorb and mug")
+    ask(loaded, "mug")
+    ask(loaded, "fruit")
+    assert asked == [["zorb"]]
+
+
+def test_without_an_encoder_other_words_find_nothing(loaded, monkeypatch):
+    monkeypatch.delenv("R5DGS_TEXT_ENCODER")
+    assert ask(loaded, "zorb") == {"CANCELLED"} and notes(loaded) == []
+
+
+def test_another_encoder_is_named_with_the_remedy(loaded, folders, monkeypatch):
+    monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[1]))
+    assert ask(loaded, "zorb") == {"CANCELLED"}
+    assert "made by the encoder 'own'; the preferences' 'other' cannot be asked" in notes(loaded)[0]
+
+
+def test_a_damaged_encoder_is_said_and_names_are_searched_all_the_same(loaded, tmp_path, monkeypatch):
+    monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(tmp_path))
+    assert ask(loaded, "mug and zorb") == {"FINISHED"}
+    assert f"Text encoder: {tmp_path}/config.json: expected in the folder of an encoder" in notes(loaded)[0]
+
+
+def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
+    phrases, told = importlib.import_module("r5dgs.r5dgs_addon.phrases"), []
+    phrases.begin(["zorb", "glorp"], told.append)
+    assert phrases.missing(["zorb", "glorp"]) == ["zorb", "glorp"]
+    deadline = time.monotonic() + 60
+    while phrases.look() is not None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert told == [""] and phrases.missing(["zorb", "glorp", "other"]) == ["other"]
+    monkeypatch.setenv("R5DGS_TEXT_ENCODER", "/nowhere")
+    phrases.begin(["zorb"], told.append)
+    while phrases.look() is not None:
+        time.sleep(0.02)
+    assert "expected the folder of an encoder, found nothing" in told[1]
+
+
+def test_an_answer_that_comes_later_is_shown_where_its_prompt_still_stands(loaded):
+    session, phrases = loaded.context.window_manager.r5dgs_words, importlib.import_module("r5dgs.r5dgs_addon.phrases")
+    phrases.fetch(["zorb"])
+    ask(loaded, "mug")
+    prompt()._join("zorb", "")
+    assert session.asked == "mug"
+    session.asked = session.prompt = "zorb"
+    session.matches.clear()
+    prompt()._join("zorb", "it is gone")
+    shown = {match.object_id for match in session.matches}
+    assert 2 in shown and notes(loaded) == ["Text encoder: it is gone"]
