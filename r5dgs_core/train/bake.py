@@ -46,7 +46,8 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     dataset = dataset if dataset is not None else datasets.read(run.data(), run.config.data.masks)
     state = checkpoint.load(run.folder)
     tensors, wanted = state.tensors, run.config.needs
-    found = mask_stack.NAME in tensors  # objects that nobody named: their ids mean nothing to the data set
+    # Objects that nobody named: their ids mean nothing to the data set.
+    found = mask_stack.NAME in tensors or mask_stack.LABELS in tensors
     if found:
         dataset = dataclasses.replace(dataset, object_names={}, object_aliases={})
     norm = Normalization(np.array(state.origin), state.scale)

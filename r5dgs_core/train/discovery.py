@@ -103,21 +103,47 @@ def _short(config: Config, last: float) -> Config:
 
 @torch.no_grad()
 def parts(trainer: Trainer, config: Config) -> np.ndarray:
-    """Rigidly moving part of each Gaussian of a field, -1 for none. [N]"""
+    """Rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
+    gaussians = trainer.gaussians
+    rows, opacities = _movers(trainer)
+    rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
+    rng = np.random.default_rng(config.train.seed)
+    found = motion_clusters.find(_paths(trainer, rows), opacities, TOLERANCE, config.discovery.fewest, rng)
+    labels = np.full(len(gaussians), -1)
+    labels[rows] = found
+    return needed(trainer, labels)
+
+
+def sort(trainer: Trainer) -> np.ndarray:
+    """Rigidly moving part of each Gaussian of a trained field, -1 for none: `parts`, with faint ones that go along. [N]
+
+    Args:
+        trainer: A finished run of a field.
+    """
+    labels = parts(trainer, trainer.config)
+    rows, opacities = _movers(trainer)
+    labels[rows] = motion_clusters.attach(_paths(trainer, rows), opacities, TOLERANCE, labels[rows])
+    return labels
+
+
+@torch.no_grad()
+def _movers(trainer: Trainer) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians that a field moves, and their opacities. [R], [R]"""
     motion, gaussians = trainer.motion, trainer.gaussians
     assert isinstance(motion, FieldRepresentation)
     rows = motion.movers(gaussians)
-    opacities = torch.sigmoid(gaussians.opacity_logits[rows])
-    rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
-    means = gaussians.means[rows]
-    paths = torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1)
-    rng = np.random.default_rng(config.train.seed)
-    found = motion_clusters.find(
-        paths.double().numpy(), opacities.double().numpy(), TOLERANCE, config.discovery.fewest, rng
+    return rows.numpy(), torch.sigmoid(gaussians.opacity_logits[rows]).double().numpy()
+
+
+@torch.no_grad()
+def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
+    """Where a field's Gaussians are at the observed times. [R, S, 3]"""
+    motion = trainer.motion
+    assert isinstance(motion, FieldRepresentation)
+    means = trainer.gaussians.means[torch.from_numpy(rows)]
+    return (
+        torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1).double().numpy()
     )
-    labels = np.full(len(gaussians), -1)
-    labels[rows.numpy()] = found
-    return needed(trainer, labels)
 
 
 @torch.no_grad()

@@ -252,6 +252,7 @@ class FieldRepresentation:
             ),
             labels,
             object_ids,
+            int(tensors["field.bodies"]) + len(tensors["field.casters"]),
             observed,
             tensors["field.times"].numpy(),
             tensors["field.casters"].tolist(),

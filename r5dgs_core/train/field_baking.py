@@ -34,6 +34,7 @@ def observed_motion(
     movers: Tensor,
     labels: np.ndarray,
     object_ids: np.ndarray,
+    alone: int,
     seen: np.ndarray,
     times: np.ndarray,
     shadows: Sequence[int],
@@ -49,6 +50,7 @@ def observed_motion(
         movers: Rows that the networks move. [R]
         labels: Class of each Gaussian. [N]
         object_ids: Object id of each class. [B]
+        alone: Motion id of movers that belong to no group.
         seen: Knots of the training at which each object was placed by its masks. [B - 1, K] bool
         times: These knots. [K]
         shadows: Caster, a class, of each group from B on.
@@ -81,7 +83,7 @@ def observed_motion(
         bind[name][rows.numpy()] = value
     motion_ids = np.zeros(len(labels), np.int64)
     own = gaussians["motion_ids"].numpy()[rows.numpy()]
-    own = np.where(own == len(object_ids) + len(shadows), labels[rows.numpy()], own)  # what moves in no group
+    own = np.where(own == alone, labels[rows.numpy()], own)
     if not own.any():  # nobody said what belongs to what before training: the labels do
         own = labels[rows.numpy()].astype(np.int64)
     motion_ids[rows.numpy()] = own

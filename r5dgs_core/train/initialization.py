@@ -125,7 +125,7 @@ def start(
     by_field = config.train.representation == "field" and not still
     if unmasked and not still:
         if by_field:
-            log.warning("no masks: the field moves every Gaussian, and there are no objects. %s", MASKS)
+            log.warning("no masks: the field moves every Gaussian, objects are what moves as one in the end. %s", MASKS)
         else:
             log.warning(
                 "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS

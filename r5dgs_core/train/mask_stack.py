@@ -12,6 +12,7 @@ from torch import Tensor
 from ..errors import CheckpointError
 
 NAME = "discovery.masks"  # of the tensor in a checkpoint
+LABELS = "discovery.labels"  # of the one that stands there where Gaussians were sorted after the run instead
 
 
 def pack(masks: Sequence[np.ndarray]) -> Tensor:

@@ -10,6 +10,7 @@ Notation: R points, S times, H proposals, K neighbours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,7 @@ def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, 
     if len(paths) < max(fewest, 4) or paths.shape[1] < 2:
         return labels
     reference = paths.shape[1] // 2
-    allowed = tolerance + SHARE * np.linalg.norm(paths - paths.mean(1, keepdims=True), axis=-1).max(1)
+    allowed = _allowed(paths, tolerance)
     sampled = rng.permutation(len(paths))[:MOST]
     parts = _parts(paths[sampled], weights[sampled], allowed[sampled], reference, fewest, rng)
     parts = _joined(paths[sampled], weights[sampled], allowed[sampled], reference, parts)
@@ -69,6 +70,23 @@ def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, 
         labels[sampled[rows]] = k
         motions.append(fit(paths[sampled[rows]], weights[sampled[rows]], reference))
     return _attached(paths, allowed, reference, labels, motions)
+
+
+def attach(paths: np.ndarray, weights: np.ndarray, tolerance: float, labels: np.ndarray) -> np.ndarray:
+    """The labels of `find`, with those of points that it was not asked about and that move about as a part near them.
+
+    Args:
+        paths: Places of the points over time. [R, S, 3]
+        weights: How much each counts. [R]
+        tolerance: Residual that is allowed to points that hardly travel, units of the paths.
+        labels: Part of each point, -1 for none; parts of fewer than four points take no others. [R]
+    """
+    reference = paths.shape[1] // 2
+    motions = []
+    for part in range(int(labels.max(initial=-1)) + 1):
+        rows = labels == part
+        motions.append(fit(paths[rows], weights[rows], reference) if rows.sum() > 3 else None)
+    return _attached(paths, _allowed(paths, tolerance), reference, labels, motions)
 
 
 def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
@@ -91,6 +109,11 @@ def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
     rotmats = u @ vt
     home = centers[..., reference, :]
     return RigidPath(rotmats, centers - np.einsum("...sij,...j->...si", rotmats, home))
+
+
+def _allowed(paths: np.ndarray, tolerance: float) -> np.ndarray:
+    """Residual that each point may have in its part's motion. [R]"""
+    return tolerance + SHARE * np.linalg.norm(paths - paths.mean(1, keepdims=True), axis=-1).max(1)
 
 
 def _parts(
@@ -182,7 +205,7 @@ def _joined(
 
 
 def _attached(
-    paths: np.ndarray, allowed: np.ndarray, reference: int, labels: np.ndarray, motions: list[RigidPath]
+    paths: np.ndarray, allowed: np.ndarray, reference: int, labels: np.ndarray, motions: Sequence[RigidPath | None]
 ) -> np.ndarray:
     """The labels, with those of points near a part that move about as it does. [R]"""
     labels = labels.copy()
@@ -191,11 +214,14 @@ def _attached(
         return labels
     best = np.full(len(open_rows), np.inf)
     for k, motion in enumerate(motions):
+        if motion is None:
+            continue
         members = np.flatnonzero(labels == k)
         tree = KDTree(features[members])
         spacing = np.median(tree.query(features[members], k=min(2, len(members)))[0][..., -1])
         off = motion.residuals(paths[open_rows], reference) / allowed[open_rows]
-        near = tree.query(features[open_rows])[0] < 2 * REACH * spacing
-        chosen = near & (off < LATE) & (off < best)
+        likely = np.flatnonzero((off < LATE) & (off < best))
+        reach = 2 * REACH * spacing
+        chosen = likely[tree.query(features[open_rows[likely]], distance_upper_bound=reach)[0] < reach]
         labels[open_rows[chosen]], best[chosen] = k, off[chosen]
     return labels

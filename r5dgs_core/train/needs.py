@@ -57,6 +57,14 @@ def discovery(dataset: Dataset, config: Config) -> bool:
     return tracks and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
 
 
+def sorting(dataset: Dataset, config: Config) -> bool:
+    """Whether a finished run sorts its Gaussians into what moves as one: it is a field, and no mask says it."""
+    field = config.train.representation == "field" and config.field.tracks_share == 0
+    unmasked = all(view.mask_path is None for view in dataset.train)
+    several = len({view.t for view in dataset.train}) > 1
+    return field and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
+
+
 def is_pinned(role: str, poses: np.ndarray, radius: float, wanted: NeedsSection) -> bool:
     """Whether a group of a role is baked at rest: it never moves, hardly does, or the user says so. poses [S, 7]"""
     if role == "pinned" or wanted.tracks == "off":

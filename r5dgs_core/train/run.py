@@ -18,7 +18,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, mask_stack, needs, probing, stopping
+from . import checkpoint, curves, identity, mask_stack, needs, probing, representation, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -280,6 +280,14 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
                 report,
             )
             extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
+    elif trainer.motion.name == representation.FIELD and needs.sorting(trainer.dataset, trainer.config):
+        from . import discovery
+
+        progress({"event": "prepare", "text": "no masks: sorting what moves into parts"})
+        labels = torch.from_numpy(discovery.sort(trainer) + 1)
+        count = int(labels.max())
+        progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
+        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), mask_stack.LABELS: labels}
     _save(trainer, run, began, finished=True, extra=extra)
 
 
@@ -293,6 +301,9 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
+    if mask_stack.LABELS in tensors:  # objects that nobody placed are taken to be there all the time
+        shape = len(tensors["object_ids"]) - 1, len(trainer.times)
+        state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
     values = {name: t for name, t in tensors.items() if t.is_floating_point() and name != checkpoint.RESIDUAL_GAINS}
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:

@@ -117,3 +117,58 @@ def test_objects_that_were_found_are_measured_against_the_true_ones_in_their_pla
     found = evaluate.object_errors(dataclasses.replace(tiny.truth, provenance={"discovered": True}), strange)
     assert min(row["position_error"] for row in named) > 0.1
     assert max(row["position_error"] for row in found) < 1e-3 and [row["id"] for row in found] == [1, 2]
+
+
+def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, monkeypatch):
+    """The parts become objects with groups of their own, and nobody takes their ids for those of the data."""
+    config = tiny_datasets.settings(
+        "train.representation='field'", "field.size='small'", "train.iterations=60", "densify.stop=0.6"
+    )
+    sorted_ones = []
+
+    def sort(trainer):
+        x = trainer.gaussians.means.detach().numpy()[:, 0]
+        labels = np.where(x > 0.5, 0, np.where(x < -0.5, 1, -1))
+        sorted_ones.append(labels)
+        return labels
+
+    monkeypatch.setattr(discovery, "sort", sort)
+    events = []
+    made = run.train(unmasked.root, tmp_path / "run", config, progress=events.append)
+    assert "2 parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]
+    tensors = checkpoint.load(made.folder).tensors
+    assert tensors["object_ids"].tolist() == [0, 1, 2] and mask_stack.LABELS in tensors
+    scene = bake.bake(made)
+    validation.check(scene, "scene")
+    assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]
+    assert scene.provenance["discovered"] and scene.classifier_weight is None
+    counts = {item.id: item.count for item in scene.objects}
+    (labels,) = sorted_ones
+    assert counts == {k: int((labels == k - 1).sum()) for k in range(3)}
+    assert {group.role for group in scene.groups if group.object_id > 0} >= {"body"}
+    again = run.train(unmasked.root, tmp_path / "run", config, resume=True)
+    assert len(sorted_ones) == 1 and checkpoint.load(again.folder).finished
+
+
+def test_a_field_is_sorted_only_where_nothing_else_says_what_belongs_together(unmasked, tiny):
+    data = datasets.read(unmasked.root)
+    field = "train.representation='field'"
+    assert needs.sorting(data, tiny_datasets.settings(field))
+    assert not needs.sorting(data, tiny_datasets.settings())
+    assert not needs.sorting(datasets.read(tiny.root), tiny_datasets.settings(field))
+    for off in ("discovery.iterations=0", "needs.tracks='off'", "field.tracks_share=0.2"):
+        assert not needs.sorting(data, tiny_datasets.settings(field, off))
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_field_are_the_objects(unmasked, tiny, tmp_path):
+    config = tiny_datasets.settings(
+        "train.representation='field'", "field.size='small'", "train.iterations=1000", "densify.stop=0.6"
+    )
+    scene = bake.bake(run.train(unmasked.root, tmp_path / "run", config))
+    shown = [evaluate.render(scene, v.camera, v.t).ids for v in datasets.read(unmasked.root).train]
+    truth = true_masks(tiny)
+    ids = range(1, len(scene.objects))
+    best = {b: max((overlap(shown, truth, a, b), a) for a in ids) for b in (tiny_datasets.BRICK, tiny_datasets.BALL)}
+    assert min(share for share, _ in best.values()) > 0.3
+    assert len({a for _, a in best.values()}) == 2

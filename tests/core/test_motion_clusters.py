@@ -83,3 +83,16 @@ def test_the_fit_is_the_motion_of_a_rigid_body(seed, count):
     assert motion.residuals(paths, 4).max() < 1e-9
     np.testing.assert_allclose(np.linalg.det(motion.rotmats), 1, atol=1e-9)
     np.testing.assert_allclose(motion.rotmats[4], np.eye(3), atol=1e-9)
+
+
+def test_points_that_were_not_asked_about_join_the_part_that_they_move_with():
+    rng = np.random.default_rng(5)
+    paths, truth = scene(rng, 0.01)
+    asked = rng.random(len(paths)) < 0.6
+    labels = np.full(len(paths), -1)
+    labels[asked] = motion_clusters.find(paths[asked], np.ones(asked.sum()), 0.03, 20, rng)
+    found = motion_clusters.attach(paths, np.ones(len(paths)), 0.03, labels)
+    np.testing.assert_array_equal(found[labels >= 0], labels[labels >= 0])
+    assert min(agreement(found, truth)) > 0.9
+    none = np.full(len(paths), -1)
+    np.testing.assert_array_equal(motion_clusters.attach(paths, np.ones(len(paths)), 0.03, none), none)
