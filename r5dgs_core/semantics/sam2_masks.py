@@ -29,7 +29,7 @@ class TrackSettings:
     key_frames: int = 3
     overlap: float = 0.5
     objects: int = 255
-    together: int = 16
+    together: int = 32
 
 
 class Sam2Masks:
