@@ -1,0 +1,88 @@
+"""What the other images say about a segment: leave-one-out overlap with each object.
+
+A Gaussian belongs to an object by the share of its weight that lies in segments of that object. When an image is
+judged its own segments have no vote, and Gaussians that no other image shows are no evidence for or against.
+
+Notation: S segments of all images, s of one image, N Gaussians, K objects, 0 = background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from . import bags
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Overlap of segments with objects as the other images see these.
+
+    Attributes:
+        common: Weight that segment and object have in common. [s, K + 1]
+        segments: Weight of each segment that other images know. [s]
+        objects: Weight of each object in the image. [K + 1]
+    """
+
+    common: np.ndarray
+    segments: np.ndarray
+    objects: np.ndarray
+
+    @property
+    def ious(self) -> np.ndarray:
+        """Intersection over union. [s, K + 1]"""
+        union = self.segments[:, None] + self.objects[None] - self.common
+        return self.common / np.maximum(union, 1e-9)
+
+    @property
+    def shares(self) -> np.ndarray:
+        """Share of each segment that lies in each object. [s, K + 1]"""
+        return self.common / np.maximum(self.segments[:, None], 1e-9)
+
+    @property
+    def recalls(self) -> np.ndarray:
+        """Share of each object in the image that lies in each segment. [s, K + 1]"""
+        return self.common / np.maximum(self.objects[None], 1e-9)
+
+
+def cast(stack: bags.Stack, labels: np.ndarray, count: int) -> sparse.csr_matrix:
+    """Sum the weights of segments by object.
+
+    Args:
+        stack: The segments.
+        labels: Object of each, 0 = background, -1 = none: it does not vote. [S]
+        count: Number of objects, K.
+
+    Returns:
+        Votes of all images. [N, K + 1]
+    """
+    rows = np.flatnonzero(labels >= 0)
+    member = sparse.csr_matrix((np.ones(len(rows), np.float32), (labels[rows], rows)), (count + 1, len(labels)))
+    return (member @ stack.weights).T.tocsr()
+
+
+def overlaps(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
+    """Leave-one-out overlaps image by image; arguments as of `cast`."""
+    votes = cast(stack, labels, count)
+    totals = np.asarray(votes.sum(axis=1)).ravel()
+    ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
+    for start, stop in zip(ends, ends[1:], strict=False):
+        own = stack.weights[start:stop]
+        seen = np.unique(own.indices)
+        own = own[:, seen]
+        said = labels[start:stop]
+        voting = np.flatnonzero(said >= 0)
+        mine = sparse.csr_matrix((np.ones(len(voting), np.float32), (voting, said[voting])), (stop - start, count + 1))
+        others = np.maximum((votes[seen] - own.T @ mine).toarray(), 0.0)
+        total = np.maximum(totals[seen] - np.asarray(own[voting].sum(axis=0)).ravel(), 0.0)
+        known = total > 1e-3
+        shares = np.where(known[:, None], others / np.maximum(total, 1e-3)[:, None], 0.0)
+        weight = np.asarray(own.sum(axis=0)).ravel()
+        yield Overlaps(
+            common=np.asarray(own @ shares, float),
+            segments=np.asarray(own @ known.astype(float)).ravel(),
+            objects=np.asarray(weight @ shares, float).ravel(),
+        )
