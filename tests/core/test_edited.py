@@ -8,6 +8,7 @@ import pytest
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import edited, playback, posing, scene_file, validation
 from r5dgs_core.scene.edited import Piece
+from r5dgs_core.scene.meanings import EncoderCard, Table, View
 from tests.scenes import make_scene
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
@@ -84,6 +85,9 @@ def rich_scene(**options):
     turns = rotations.rotvecs_to_quats(0.3 * random.normal(size=offsets.shape))
     turns[:, -1] = (1, 0, 0, 0)
     named = sum(item.id >= 0 for item in scene.objects)
+    units = rotations.normalize(random.normal(size=(len(scene.objects), 8))).astype(np.float32)
+    views = tuple((View("obs0", 0.1 * row, 0.5, (0, 0, 9, 9)),) for row in range(len(scene.objects)))
+    card, limits = EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}",)), tuple(map(float, range(len(views))))
     return dataclasses.replace(
         scene,
         residual_rows=rows.astype(np.int32), residual_offsets=offsets, residual_log_scales=growths,
@@ -91,7 +95,8 @@ def rich_scene(**options):
         dynamics=random.normal(size=(300, 12)).astype(np.float32), canonical_means=scene.means + np.float32(0.1),
         classifier_weight=random.normal(size=(named, 16)).astype(np.float32),
         classifier_bias=random.normal(size=named).astype(np.float32),
-        embeddings=rotations.normalize(random.normal(size=(len(scene.objects), 8))).astype(np.float32),
+        embeddings=units, vocabulary=("mug",), vocabulary_embeddings=units[:1], canonical_embeddings=units[:1],
+        view_embeddings=units[:, None], lookup=Table(card, ("object",), views, limits, 0.1, "mean"),
     )  # fmt: skip
 
 
@@ -115,6 +120,8 @@ def test_deleted_objects_are_gone_with_all_that_is_theirs():
     assert_same(result, dataclasses.replace(scene, **{n: getattr(scene, n)[keep] for n in MATCHING}), MATCHING[:6])
     np.testing.assert_array_equal(result.dynamics, scene.dynamics[keep])
     np.testing.assert_array_equal(result.embeddings, scene.embeddings[[0, 1, 2, 4]])
+    np.testing.assert_array_equal(result.view_embeddings, scene.view_embeddings[[0, 1, 2, 4]])
+    assert result.lookup.thresholds == (0, 1, 2, 4) and result.lookup.views[3] == scene.lookup.views[4]
     np.testing.assert_array_equal(result.classifier_weight, scene.classifier_weight[[0, 1, 3]])
     for t in (0.1, 0.6, 0.95):
         np.testing.assert_array_equal(playback.frame(result, t).means, playback.frame(scene, t).means[keep])
@@ -256,6 +263,7 @@ def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_f
     result, _ = edit(scene, [*pieces, copy], table)
     assert result.object(9).name == "mug two" and result.object(9).count == first.count
     np.testing.assert_array_equal(result.embeddings[-1], scene.embeddings[-1])
+    assert result.lookup.thresholds[-1] == scene.lookup.thresholds[-1]
     rows, old = result.object_ids == 9, scene.object_ids == 3
     straight = ~np.isin(np.flatnonzero(old), scene.residual_rows)
     for t in (0.2, 0.9):
