@@ -143,8 +143,9 @@ def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
     if in_place:
         lines.append("they can be read, and nothing was written")
     if made.numbering == "video" and made.videos > 1:
+        own = "" if made.folder == root / "object_mask" else f" --masks {made.folder}"
         lines.append(
             f"ids hold within each of {made.videos} videos only. Next: r5dgs train {root} --masks none --out RUN, "
-            "then r5dgs associate RUN"
+            f"then r5dgs associate RUN{own}"
         )
     return "\n".join(lines)
