@@ -19,12 +19,12 @@ import numpy as np
 Forward = Callable[[np.ndarray], np.ndarray]  # scene linear [N, 3] to display, in [0, 1] [N, 3]
 
 KNEE = 0.05  # scene-linear colour at which codes turn from linear to logarithmic
-BRIGHTEST = 16.3  # scene-linear colour that view transforms display as white: 6.5 stops over middle grey
+BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as white: 6.5 stops over middle grey
+MOST = 16.0  # times as bright is what the softest looks display as white
 SIZE = 33  # nodes of the grid along each channel
 STEP = 1 / 255  # of a display, in which errors are told
 SOLVED = 0.5 * STEP  # nodes that are displayed this near to what is wanted are within the view's reach
 
-_TOP = float(np.arcsinh(BRIGHTEST / KNEE))
 _CODES = 65536  # of the curves: display colours are rounded to so many, far finer than files keep them
 _CHUNK = 65536  # colours at a time, so that they stay in the processor's cache
 
@@ -74,7 +74,8 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
 
     Args:
         forward: Displays scene-linear colours; called a few dozen times with up to 110,000 of them.
-        scale: Of the colours: ``forward(scale * BRIGHTEST)`` should be about white; 2 ** -exposure.
+        scale: Of the colours: ``forward(scale * BRIGHTEST)`` should be about white, or that of colours up to `MOST`
+            times as bright; 2 ** -exposure.
 
     Returns:
         The inverse.
@@ -83,23 +84,31 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
     def shown(codes: np.ndarray) -> np.ndarray:
         return np.asarray(forward(scale * _decode(codes)), np.float64)
 
-    greys = np.linspace(0, _TOP, 2048)
+    top = _top(shown)
+    greys = np.linspace(0, top, 2048)
     # Where a curve is flat, the darkest of the colours that are displayed alike counts.
     rising = np.maximum.accumulate(shown(np.repeat(greys[:, None], 3, axis=1)), axis=0)
-    axis = np.linspace(0, _TOP, SIZE)
+    axis = np.linspace(0, top, SIZE)
     axes = [np.interp(axis, greys, rising[:, channel]) for channel in range(3)]
     wanted = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     start = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    codes, found = _solve(shown, wanted, start, rounds=5)
-    codes, found = _retry(shown, wanted, codes, found, rounds=3)
+    codes, found = _solve(shown, wanted, start, top, rounds=5)
+    codes, found = _retry(shown, wanted, codes, found, top, rounds=3)
     solved = _far(found, wanted) < SOLVED
-    grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), solved)
+    grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), solved, top)
     display = np.linspace(0, 1, _CODES)
     tiny = 1e-9 * np.arange(len(greys))  # np.interp asks for values that rise
     curves = [np.interp(display, rising[:, channel] + tiny, greys) for channel in range(3)]
-    curves = (np.stack(curves) / _TOP * (SIZE - 1)).astype(np.float32)
+    curves = (np.stack(curves) / top * (SIZE - 1)).astype(np.float32)
     made = Inverse(curves, grid.astype(np.float32), scale, 0.0, float(solved.mean()))
     return replace(made, error=_error(forward, made))
+
+
+def _top(shown: Forward) -> float:
+    """The least code of a grey, from that of `BRIGHTEST` on, that is displayed as the brightest one that is tried."""
+    tried = np.arcsinh(BRIGHTEST * np.geomspace(1.0, MOST, 17) / KNEE)
+    white = shown(np.repeat(tried[:, None], 3, axis=1))
+    return float(tried[np.argmax(_far(white, white[-1]) < SOLVED)])
 
 
 def _decode(codes: np.ndarray) -> np.ndarray:
@@ -117,13 +126,16 @@ def _squared(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.einsum("...k,...k->...", off, off)  # a sum over three is slow
 
 
-def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+def _solve(
+    shown: Forward, wanted: np.ndarray, codes: np.ndarray, top: float, rounds: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Codes that are displayed as wanted, by Levenberg-Marquardt steps with differences for derivatives.
 
     Args:
         shown: Displays codes.
         wanted: Display colours. [N, 3]
         codes: Where to start. [N, 3]
+        top: Largest code, and of light below nothing the least one with its sign turned.
         rounds: Number of steps; each shows four colours for each that is not solved yet.
 
     Returns:
@@ -136,13 +148,13 @@ def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -
         if not len(rows):
             break
         here, miss = codes[rows], found[rows] - wanted[rows]
-        ahead = np.where(here > _TOP - delta, -delta, delta)
+        ahead = np.where(here > top - delta, -delta, delta)
         moved = here + ahead.T[:, :, None] * np.eye(3)[:, None, :]
         shifted = shown(moved.reshape(-1, 3)).reshape(moved.shape) - found[rows]
         jacobian = np.moveaxis(shifted / ahead.T[:, :, None], 0, -1)
         normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping[rows, None, None] * np.eye(3)
         step = np.linalg.solve(normal, -np.einsum("nki,nk->ni", jacobian, miss)[..., None])[..., 0]
-        there = np.clip(here + np.clip(step, -1, 1), -_TOP, _TOP)
+        there = np.clip(here + np.clip(step, -1, 1), -top, top)
         then = shown(there)
         better = _squared(then, wanted[rows]) < _squared(found[rows], wanted[rows])
         codes[rows[better]], found[rows[better]] = there[better], then[better]
@@ -151,7 +163,7 @@ def _solve(shown: Forward, wanted: np.ndarray, codes: np.ndarray, rounds: int) -
 
 
 def _retry(
-    shown: Forward, wanted: np.ndarray, codes: np.ndarray, found: np.ndarray, rounds: int
+    shown: Forward, wanted: np.ndarray, codes: np.ndarray, found: np.ndarray, top: float, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve the nodes that are not again, each from the solved one that is displayed nearest to what it wants."""
     solved = _far(found, wanted) < SOLVED
@@ -173,7 +185,7 @@ def _retry(
     rows = np.flatnonzero(gap.ravel() < _squared(found, wanted))
     codes, found = codes.copy(), found.copy()
     if len(rows):
-        codes[rows], found[rows] = _solve(shown, wanted[rows], codes[nearest.ravel()[rows]], rounds)
+        codes[rows], found[rows] = _solve(shown, wanted[rows], codes[nearest.ravel()[rows]], top, rounds)
     return codes, found
 
 
@@ -186,12 +198,13 @@ def _neighbours() -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
         yield tuple(high), tuple(low)
 
 
-def _continue(grid: np.ndarray, solved: np.ndarray) -> np.ndarray:
+def _continue(grid: np.ndarray, solved: np.ndarray, top: float) -> np.ndarray:
     """Let the grid go on straight for a node past the view's reach, so that cells on its border are right inside.
 
     Args:
         grid: Codes. [SIZE, SIZE, SIZE, 3]
         solved: Whether they are displayed as wanted. [SIZE ** 3]
+        top: Largest code.
 
     Returns:
         Codes. [SIZE, SIZE, SIZE, 3]
@@ -208,7 +221,7 @@ def _continue(grid: np.ndarray, solved: np.ndarray) -> np.ndarray:
             number[2:] += both
     edge = ~solved & (count > 0)
     result = grid.copy()
-    result[edge] = np.clip(total[edge] / count[edge][:, None], -_TOP, _TOP)
+    result[edge] = np.clip(total[edge] / count[edge][:, None], -top, top)
     return result
 
 

@@ -12,6 +12,11 @@ def film(colors):
     return np.clip(0.5 - 0.5 * np.cos(np.pi * np.clip((stops + 10) / 16.6, 0, 1)), 0, 1)
 
 
+def soft(colors):
+    """Displays as white what is eight times brighter than others do."""
+    return film(colors / 8)
+
+
 MIX = np.array([[0.86, 0.09, 0.05], [0.06, 0.88, 0.06], [0.04, 0.12, 0.84]])
 
 
@@ -58,6 +63,12 @@ def test_views_of_single_channels_reach_every_colour(of, forward):
     wanted = np.random.default_rng(2).random((3000, 3))
     off = steps(forward(of(forward).scene_linear(wanted)), wanted)
     assert np.percentile(off, 95) < 0.5
+
+
+@pytest.mark.parametrize("forward", [film, mixed, gamma, soft])
+def test_white_is_reached_however_bright_a_view_asks_for_it(of, forward):
+    white = np.array([[1.0, 1.0, 1.0], [0.99, 0.99, 0.99]])
+    assert steps(forward(of(forward).scene_linear(white)), white).max() < 1
 
 
 def test_the_colour_itself_comes_back_where_it_is_displayed_alone(of):
