@@ -118,7 +118,7 @@ def _answer(context: bpy.types.Context, text: str) -> Answer:
 def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
     """The answer once the encoder has said its part, or with a note that it is being asked, or why it cannot be."""
     asked = " and ".join(repr(phrase) for phrase in answer.missing)
-    if not bpy.app.background and bpy.context.window_manager.windows:
+    if _has_window():
         phrases.begin(answer.missing, functools.partial(_join, text))
         return replace(answer, notes=[*answer.notes, f"Asking the text encoder for {asked}"])
     try:
@@ -126,6 +126,11 @@ def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answ
     except errors.R5dgsError as error:
         return replace(answer, notes=[*answer.notes, f"Text encoder: {error}"])
     return _answer(context, text)
+
+
+def _has_window() -> bool:
+    """Whether somebody looks at a window, which must not wait."""
+    return not bpy.app.background and bool(bpy.context.window_manager.windows)
 
 
 def _join(text: str, wrong: str) -> None:

@@ -101,6 +101,17 @@ def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
     assert "expected the folder of an encoder, found nothing" in told[1]
 
 
+def test_a_window_shows_at_once_what_is_known_and_then_the_rest(loaded, monkeypatch):
+    phrases, session = importlib.import_module("r5dgs.r5dgs_addon.phrases"), loaded.context.window_manager.r5dgs_words
+    monkeypatch.setattr(prompt(), "_has_window", lambda: True)
+    assert ask(loaded, "mug and zorb") == {"FINISHED"}
+    assert [match.object_id for match in session.matches] == [1]
+    assert notes(loaded) == ["Asking the text encoder for 'zorb'"]
+    while phrases.look() is not None:
+        time.sleep(0.02)
+    assert {1, 2} <= {match.object_id for match in session.matches} and notes(loaded) == []
+
+
 def test_an_answer_that_comes_later_is_shown_where_its_prompt_still_stands(loaded):
     session, phrases = loaded.context.window_manager.r5dgs_words, importlib.import_module("r5dgs.r5dgs_addon.phrases")
     phrases.fetch(["zorb"])
