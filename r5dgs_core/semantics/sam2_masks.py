@@ -24,12 +24,14 @@ class TrackSettings:
         overlap: What is found there and has this IoU with an object that was followed there is that object.
         objects: Most objects that a video may get.
         together: Objects that are followed at once; bounds memory.
+        gap: Images in a row in which an object may be lost; where it should be is unknown then, not background.
     """
 
     key_frames: int = 3
     overlap: float = 0.5
     objects: int = 255
     together: int = 32
+    gap: int = 8
 
 
 class Sam2Masks:
@@ -65,6 +67,7 @@ class Sam2Masks:
         canvas = tracking.Canvas(len(video.views), camera.height, camera.width, room)
         try:
             self._paint(video, canvas, report)
+            canvas.mark_gaps(self.track.gap)
             for index in range(len(video.views)):
                 yield canvas.ids[index].astype(np.int32)
         finally:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..data import masks
 from .sam2 import Sam2
 from .segments import full_size
 from .videos import Video
@@ -131,6 +132,27 @@ class Canvas:
         better = sure > self._sure[index]  # which begins at 0
         self.ids[index][better] = np.asarray(ids, np.uint16)[best[better]]
         self._sure[index][better] = sure[better]
+
+    def mark_gaps(self, longest: int) -> None:
+        """Call unknown where an object was before and after images that lack it, unless another one is there.
+
+        That it is hidden there by what is no object, or lost from sight, cannot be told from here.
+
+        Args:
+            longest: Longer gaps stay as they are: the object may have gone and come back. Images.
+        """
+        last: dict[int, int] = {}
+        for index in range(len(self.ids)):
+            for object_id in np.unique(self.ids[index]).tolist():
+                if object_id in (0, masks.UNKNOWN):
+                    continue
+                before = last.get(object_id, index - 1)
+                last[object_id] = index
+                if not 1 < index - before <= longest + 1:
+                    continue
+                place = (self.ids[before] == object_id) | (self.ids[index] == object_id)
+                for between in range(before + 1, index):
+                    self.ids[between][place & (self.ids[between] == 0)] = masks.UNKNOWN
 
     def close(self) -> None:
         """Give the room back."""

@@ -146,6 +146,24 @@ def test_a_pixel_goes_to_the_object_that_is_surest_of_it(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_where_an_object_is_lost_for_some_images_nothing_is_known(tmp_path):
+    def painted(rows, gap):
+        canvas = tracking.Canvas(len(rows), 1, 4, tmp_path)
+        for index, row in enumerate(rows):
+            for object_id in sorted(set(row) - {0}):
+                canvas.paint(index, [object_id], np.where(np.array(row) == object_id, 1.0, -1.0)[None, None])
+        canvas.mark_gaps(gap)
+        found = canvas.ids[:, 0].tolist()
+        canvas.close()
+        return found
+
+    u = masks.UNKNOWN
+    lost = [[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
+    known = [[0, 0, 0, 0], [1, 0, 0, 0], [u, u, 2, 0], [u, u, u, 0], [0, 1, 1, 0], [0, 0, 0, 0]]
+    assert painted(lost, 2) == known  # neither before it came nor after it went; what others hold stays theirs
+    assert painted(lost, 1) == lost
+
+
 def test_key_frames_are_spread_over_a_video():
     assert sam2_masks.key_frames(9, 1) == [4]
     assert sam2_masks.key_frames(9, 3) == [0, 4, 8]
@@ -170,10 +188,10 @@ def test_a_video_gets_masks_that_follow_what_was_marked(model, video, tmp_path):
     there = [logits.gt(0).numpy() for part in followed[5] for logits in part]
     later = segments.new_ones(segments.find(model, video.image(5), EVERYTHING), there, FEW.overlap)
     assert len(later) > 0
-    added = {int(i) for ids in images for i in np.unique(ids)} - set(range(len(first) + 1))
+    added = {int(i) for ids in images for i in np.unique(ids)} - set(range(len(first) + 1)) - {masks.UNKNOWN}
     assert added and added <= set(range(len(first) + 1, len(first) + 1 + len(later)))
     at_end = np.concatenate([segments.full_size(part, (36, 48)).numpy() for part in followed[5]])
-    old = images[5] <= len(first)
+    old = images[5] <= len(first)  # no gap ends after the last image, so nothing is unknown there
     expected = np.where(at_end.max(0) > 0, at_end.argmax(0) + 1, 0)
     assert (images[5] == expected)[old & (images[5] > 0)].mean() > 0.99  # half floats make ties of near equals
 
