@@ -48,7 +48,15 @@ def new_point_clouds(counts: Sequence[int]) -> list[bpy.types.PointCloud]:
         return [source.evaluated_get(layer.depsgraph).data.copy() for source in sources]
     finally:
         bpy.data.batch_remove(made)
-        bpy.data.scenes.remove(scene)
+        remove_scene(scene)
+
+
+def remove_scene(scene: bpy.types.Scene) -> None:
+    """Remove a scene that no window shows.
+
+    ``scenes.remove`` asks the window what it shows, and up to 4.4 crashes where there is none, as in `blender -b -a`.
+    """
+    bpy.data.batch_remove([scene])
 
 
 def make_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:

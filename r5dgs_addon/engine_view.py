@@ -239,7 +239,7 @@ class _Sampler:
 
     def close(self) -> None:
         """Remove what was made."""
-        bpy.data.scenes.remove(self._scene)
+        compat.remove_scene(self._scene)
         self._folder.cleanup()
 
 

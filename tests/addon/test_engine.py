@@ -360,6 +360,17 @@ def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
     assert view_module.want(blender.context.scene) is made
 
 
+def test_a_view_is_inverted_where_there_is_no_window(blender, loaded, monkeypatch):
+    """As in `blender -b FILE -a`, where removing a scene of one's own crashed Blender 4.2 and 4.3."""
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    monkeypatch.setattr(view_module, "_inverses", {})
+    blender.context.scene.view_settings.view_transform = "Filmic"
+    with blender.context.temp_override(window=None):
+        assert blender.context.window is None
+        assert view_module.prepare(blender.context.scene).error < 0.5
+    assert len(blender.data.scenes) == 1
+
+
 def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blender, loaded, tmp_path, monkeypatch):
     color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
     view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
