@@ -12,7 +12,8 @@ import numpy as np
 from association_scenes import Image
 from scipy import ndimage, optimize
 
-UNKNOWN = 65535
+from r5dgs_core.data.masks import UNKNOWN
+from r5dgs_core.semantics.association import Row
 
 
 @dataclass(frozen=True)
@@ -164,3 +165,22 @@ def majority(masks: Sequence[np.ndarray], images: Sequence[Image], count: int) -
                 out[mask == name] = names[np.argmax(np.bincount(winner[image.indices[where, 0]]))]
         repaired.append(out)
     return repaired
+
+
+def switches(masks: Sequence[np.ndarray], images: Sequence[Image], rows: Sequence[Row]) -> tuple[float, float]:
+    """Precision and recall of ``relabelled``: segments that show another object than their id mostly does in the view.
+
+    NaN where there are none.
+    """
+    shown: dict[tuple[int, int], list[int]] = {}
+    truths = []
+    for row in rows:
+        truth = int(np.argmax(np.bincount(images[row.image].truth[masks[row.image] == row.old_id])))
+        truths.append(truth)
+        counts = shown.setdefault((images[row.image].view, row.old_id), [])
+        counts.extend([truth] * row.pixels)
+    usual = {key: int(np.argmax(np.bincount(values))) for key, values in shown.items()}
+    wrong = np.array([truth != usual[images[r.image].view, r.old_id] for truth, r in zip(truths, rows, strict=True)])
+    named = np.array([row.done == "relabelled" for row in rows])
+    hits = float((wrong & named).sum())
+    return (hits / named.sum() if named.any() else np.nan, hits / wrong.sum() if wrong.any() else np.nan)

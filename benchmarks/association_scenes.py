@@ -8,6 +8,7 @@ Notation: N Gaussians, T times, V views, P pixels of an image, k Gaussians kept 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numba
@@ -173,14 +174,14 @@ def displaced(scene: Scene, error_px: float, model: str, rng: np.random.Generato
 
     Args:
         scene: The scene.
-        error_px: Standard deviation of the whole error along each axis, pixels in the middle of the scene.
-        model: ``drift``: half of the variance is a fixed offset of each Gaussian, half a smooth drift of each object
-            over time (the floor has none); ``jitter``: no error here, `observe` adds it anew for each image.
+        error_px: Standard deviation of each error along each axis, pixels in the middle of the scene.
+        model: ``drift``: a fixed offset of each Gaussian, and beside it a smooth drift of each object over time (the
+            floor has none); ``jitter``: no error here, `observe` adds it anew for each Gaussian and image.
         rng: Source of the draws.
     """
     if model == "jitter" or not error_px:
         return scene.paths
-    sigma = error_px * scene.pixel / np.sqrt(2.0)
+    sigma = error_px * scene.pixel
     fixed = rng.normal(size=(len(scene.paths), 1, 3)) * sigma
     times = scene.paths.shape[1]
     knots = rng.normal(size=(scene.objects.max() + 1, 5, 3))
@@ -193,21 +194,18 @@ def displaced(scene: Scene, error_px: float, model: str, rng: np.random.Generato
     return scene.paths + fixed + drift[scene.objects]
 
 
-def observe(scene: Scene, error_px: float, model: str, seed: int) -> list[Image]:
-    """All images in the order of views, then times."""
+def observe(scene: Scene, error_px: float, model: str, seed: int) -> Iterator[Image]:
+    """All images in the order of views, then times; arguments as of `displaced`."""
     rng = np.random.default_rng(seed)
-    exact = [_draw(scene, scene.paths[:, t], view, t) for view, t in _moments(scene.plan)]
-    if not error_px:
-        return exact
     paths = displaced(scene, error_px, model, rng)
-    seen = []
-    for image in exact:
-        places = paths[:, image.time]
-        if model == "jitter":
-            places = places + rng.normal(size=places.shape) * error_px * scene.pixel
-        found = _draw(scene, places, image.view, image.time)
-        seen.append(replace(found, truth=image.truth))
-    return seen
+    for view, t in _moments(scene.plan):
+        image = _draw(scene, scene.paths[:, t], view, t)
+        if error_px:
+            places = paths[:, t]
+            if model == "jitter":
+                places = places + rng.normal(size=places.shape) * error_px * scene.pixel
+            image = replace(_draw(scene, places, view, t), truth=image.truth)
+        yield image
 
 
 def _moments(plan: Plan) -> list[tuple[int, int]]:

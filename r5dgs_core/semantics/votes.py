@@ -16,6 +16,8 @@ from scipy import sparse
 
 from . import bags
 
+LEAST = 1e-3  # weight in other images, in pixels, below which a Gaussian is no evidence
+
 
 @dataclass(frozen=True)
 class Overlaps:
@@ -66,23 +68,37 @@ def cast(stack: bags.Stack, labels: np.ndarray, count: int) -> sparse.csr_matrix
 
 def overlaps(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
     """Leave-one-out overlaps image by image; arguments as of `cast`."""
+    ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
+    for start, stop, (seen, shares) in zip(ends, ends[1:], left_out(stack, labels, count), strict=False):
+        own = stack.weights[start:stop][:, seen]
+        known = shares.any(axis=1).astype(np.float32)
+        yield Overlaps(
+            common=np.asarray(own @ shares, float),
+            segments=np.asarray(own @ known, float).ravel(),
+            objects=np.asarray(np.asarray(own.sum(axis=0)).ravel() @ shares, float).ravel(),
+        )
+
+
+def left_out(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What the Gaussians of each image show by the votes of all other images; arguments as of `cast`.
+
+    Yields:
+        Gaussians that the image shows [n], and their shares of background and the objects, 0 where no other image
+        shows the Gaussian [n, K + 1].
+    """
     votes = cast(stack, labels, count)
-    totals = np.asarray(votes.sum(axis=1)).ravel()
     ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
     for start, stop in zip(ends, ends[1:], strict=False):
         own = stack.weights[start:stop]
         seen = np.unique(own.indices)
-        own = own[:, seen]
         said = labels[start:stop]
         voting = np.flatnonzero(said >= 0)
-        mine = sparse.csr_matrix((np.ones(len(voting), np.float32), (voting, said[voting])), (stop - start, count + 1))
-        others = np.maximum((votes[seen] - own.T @ mine).toarray(), 0.0)
-        total = np.maximum(totals[seen] - np.asarray(own[voting].sum(axis=0)).ravel(), 0.0)
-        known = total > 1e-3
-        shares = np.where(known[:, None], others / np.maximum(total, 1e-3)[:, None], 0.0)
-        weight = np.asarray(own.sum(axis=0)).ravel()
-        yield Overlaps(
-            common=np.asarray(own @ shares, float),
-            segments=np.asarray(own @ known.astype(float)).ravel(),
-            objects=np.asarray(weight @ shares, float).ravel(),
-        )
+        others = votes[seen].toarray()
+        mine = own[voting][:, seen].tocoo()
+        np.subtract.at(others, (mine.col, said[voting][mine.row]), mine.data)
+        total = others.sum(axis=1)
+        known = total > LEAST
+        shares = np.maximum(others, 0.0)
+        shares[~known] = 0.0
+        shares[known] /= shares[known].sum(axis=1, keepdims=True)
+        yield seen, shares

@@ -1,0 +1,82 @@
+"""Pixels that a relabelled segment cannot mend: objects that the tracker missed or ran together with others.
+
+The other images' votes are drawn into the image. Outlines stay as they came; only where an object that the votes show
+has no segment of its own may pixels change: inside the one segment, or the background, that most of it lies in.
+
+Notation: H, W pixels, K objects, N Gaussians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..data import masks
+from . import association, bags, votes
+
+TRUSTED = 0.3  # usual overlap of segments with the votes of other images below which outlines of votes are too far off
+WITHIN = 0.5  # share of what the votes show of an object that must lie in one segment for it to take pixels of that
+LEAST = 0.1  # share of the usual size of an object's segments that votes must show for it to take any pixel
+
+
+def shares(images: Sequence[bags.ImageBags], found: association.Association) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """What the Gaussians of each image show by the votes of all others, to be drawn like colours.
+
+    Yields:
+        Gaussians that the image shows [n], and their shares of background and the objects [n, K + 1] float32.
+    """
+    stack = bags.stack(images)
+    names = np.concatenate([[0], found.objects])
+    new = np.concatenate(found.ids)
+    labels = np.where(new == masks.UNKNOWN, -1, np.searchsorted(names, new))
+    for seen, part in votes.left_out(stack, labels, len(found.objects)):
+        yield seen, part.astype(np.float32)
+
+
+def mend(
+    mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: association.Association, image: int
+) -> np.ndarray:
+    """New ids of an image's pixels.
+
+    Args:
+        mask: Incoming ids. [H, W]
+        ids: Incoming id of each segment, `bags.ImageBags.ids`. [S]
+        drawn: Votes of the other images, `shares` blended like colours. [H, W, K + 1]
+        found: The association.
+        image: Index of the image.
+
+    Returns:
+        New ids, 0 = background, `masks.UNKNOWN` = unknown. [H, W] int32
+    """
+    out = relabel(mask, ids, found.ids[image])
+    if found.fallback or found.usual_iou < TRUSTED:
+        return out
+    names = np.concatenate([[0], found.objects])
+    shown = names[drawn.argmax(axis=-1)]
+    shown[drawn.sum(axis=-1) <= 0] = 0
+    sizes = _sizes(found)
+    result = out.copy()
+    for name in found.objects[~np.isin(found.objects, found.ids[image])]:
+        where = shown == name
+        if where.sum() < LEAST * sizes.get(int(name), np.inf):
+            continue
+        segments, counts = np.unique(mask[where], return_counts=True)
+        best = int(counts.argmax())
+        if counts[best] >= WITHIN * counts.sum() and segments[best] != masks.UNKNOWN:
+            result[where & (mask == segments[best])] = name
+    return result
+
+
+def relabel(mask: np.ndarray, ids: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Put the new ids of segments in place of those that they came with. [H, W] int32"""
+    at = np.minimum(np.searchsorted(ids, mask), len(ids) - 1)
+    return np.where(ids[at] == mask, new[at], masks.UNKNOWN).astype(np.int32)
+
+
+def _sizes(found: association.Association) -> dict[int, float]:
+    """Usual size of each object's segments in pixels."""
+    rows: dict[int, list[int]] = {}
+    for row in found.rows:
+        rows.setdefault(row.new_id, []).append(row.pixels)
+    return {name: float(np.median(pixels)) for name, pixels in rows.items()}
