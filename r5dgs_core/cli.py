@@ -72,6 +72,16 @@ def parser() -> argparse.ArgumentParser:
     masks.add_argument("--overwrite", action="store_true", help="begin anew where there are other masks")
     add_progress(masks)
 
+    associate = commands.add_parser("associate", help="give masks that a tracker numbered wrongly one numbering")
+    associate.add_argument(
+        "target", type=Path, metavar="RUN|SCENE", help="what shows the segments: a run, best without masks"
+    )
+    associate.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
+    incoming = "masks to renumber (default: the run's, or DATA/object_mask where it was trained without)"
+    associate.add_argument("--masks", type=Path, metavar="FOLDER", help=incoming)
+    associate.add_argument("--out", type=Path, metavar="FOLDER", help="where masks go (default: RUN/object_mask)")
+    add_progress(associate)
+
     bake = commands.add_parser("bake", help="turn a run into a scene file")
     bake.add_argument("run", type=Path, help="run folder")
     bake.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
@@ -194,7 +204,7 @@ def _dispatch(args: argparse.Namespace) -> int:
     """Do what the command line says; returns the exit status."""
     cap = getattr(args, "max_gaussians", None)
     overrides = [*getattr(args, "set", []), *([] if cap is None else [f"densify.max_gaussians={cap}"])]
-    if getattr(args, "masks", None) is not None:
+    if args.command == "train" and args.masks is not None:
         overrides.append(f"data.masks={args.masks if args.masks == 'none' else str(Path(args.masks).resolve())}")
     if args.command in ("demo", "train"):
         options = {
@@ -217,6 +227,11 @@ def _dispatch(args: argparse.Namespace) -> int:
         names = ("backend", "model", "source", "out", "key_frames", "points", "score", "stability", "max_area")
         options = {name: getattr(args, name) for name in (*names, "device", "unknown", "overwrite")}
         commands_masks.run_masks(args.data, **options, progress_kind=args.progress)
+    elif args.command == "associate":
+        from . import commands_association
+
+        options = {"masks": args.masks, "out": args.out}
+        commands_association.run_associate(args.target, args.data, **options, progress_kind=args.progress)
     elif args.command == "bake":
         commands.run_bake(args.run, args.out, args.data, overrides)
     elif args.command == "import":

@@ -37,10 +37,20 @@ ALLOWED = {
         *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
         "importing",
     },
+    "commands_association": {"scene", "data", "semantics", "commands", "progress"},
     "commands_masks": {"scene", "data", "semantics", "progress"},
     "commands_objects": {"scene", "data", "semantics", "report", "commands", "commands_words"},
     "commands_words": {"scene", "semantics", "progress"},
-    "cli": {"commands", "commands_masks", "commands_words", "commands_objects", "demo", "bench", "scene"},
+    "cli": {
+        "commands",
+        "commands_association",
+        "commands_masks",
+        "commands_words",
+        "commands_objects",
+        "demo",
+        "bench",
+        "scene",
+    },
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}

@@ -72,6 +72,8 @@ class Dataset:
         digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
         points: Points of the world that a reconstruction (COLMAP) gives. [P, 3] float64 or None
         point_colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
+        mask_folder: Folder of the training views' masks; None where they are passed over.
+        own_ids: Whether the ids in it are its own, not those of the data set.
     """
 
     root: Path
@@ -88,6 +90,8 @@ class Dataset:
     digest: str
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
+    mask_folder: Path | None = None
+    own_ids: bool = False
 
     def views(self, split: str) -> tuple[View, ...]:
         """The views of "train", "val" or "test"."""
@@ -192,17 +196,17 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         for file in (view.image_path, view.mask_path):
             if file is not None:
                 hasher.update(_fingerprint(root, file))
-    renamed = (
+    own_ids = (
         folders["train"] is not None and folders["train"] != root / MASKS and (folders["train"] / OBJECTS).exists()
     )
-    names, aliases = read_objects(folders["train"] if renamed else root)
+    names, aliases = read_objects(folders["train"] if own_ids else root)
     convention = header.get("world_convention", "blender")
     if convention not in cameras.WORLD_TO_BLENDER:
         raise errors.DatasetError(
             f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
             f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}"
         )
-    ground_truth = None if renamed else read_ground_truth(root)  # which goes by the ids of the data set's own masks
+    ground_truth = None if own_ids else read_ground_truth(root)  # which goes by the ids of the data set's own masks
     if ground_truth is not None:
         for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
             names.setdefault(object_id, name)
@@ -221,6 +225,8 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         digest=hasher.hexdigest(),
         points=None if reconstruction is None else reconstruction.points,
         point_colors=None if reconstruction is None else reconstruction.colors,
+        mask_folder=folders["train"],
+        own_ids=own_ids,
     )
 
 

@@ -1,0 +1,91 @@
+"""What ``r5dgs associate`` does: one numbering for masks that a tracker numbered wrongly, or video by video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import errors
+
+if TYPE_CHECKING:
+    from .semantics.mask_repair import Repair
+
+SHOWN = 12  # changes that are printed
+
+
+def run_associate(
+    target: Path,
+    data: Path | None = None,
+    *,
+    masks: Path | None = None,
+    out: Path | None = None,
+    progress_kind: str = "none",
+) -> Path:
+    """Write masks with the ids that geometry and motion give to the segments of the incoming ones.
+
+    Args:
+        target: A run folder, or a ``.r5dgs`` file with ``data`` and ``out``: what shows which segments are one object.
+        data: The data set; by default that of the run.
+        masks: Folder of the incoming masks; by default those that the run was trained with, or ``DATA/object_mask``
+            where it was trained without.
+        out: Folder to write; ``RUN/object_mask`` where None.
+        progress_kind: How progress is shown (`progress.make`).
+
+    Returns:
+        The folder.
+
+    Raises:
+        ConfigError, DatasetError, CheckpointError, SceneFileError: As their messages say.
+    """
+    from . import commands
+    from .data import dataset as datasets
+    from .progress import make
+    from .semantics import mask_repair
+
+    if not target.is_dir() and (data is None or out is None):
+        raise errors.ConfigError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
+    with make(progress_kind) as progress:
+        progress({"event": "prepare", "text": "the scene"})
+        scene, dataset = commands.open_target(target, data)
+        assert dataset is not None
+        folder = (Path(out) if out is not None else target / datasets.MASKS).resolve()
+        if masks is not None or dataset.mask_folder is None:
+            dataset = datasets.read(dataset.root, datasets.MASKS if masks is None else str(Path(masks).resolve()))
+        assert dataset.mask_folder is not None
+        if folder == dataset.mask_folder.resolve():
+            raise errors.ConfigError(f"--out {folder}: holds the incoming masks; name another folder")
+        done = mask_repair.repair(scene, dataset, progress=progress)
+        names = {} if done.own_ids else dataset.object_names if dataset.own_ids else None
+        made_with = {"scene": str(target.resolve()), "masks": str(dataset.mask_folder.resolve())}
+        mask_repair.write(done, folder, names, made_with)
+        summary = mask_repair.summary(done)
+        if progress_kind == "json":
+            progress({"event": "associated", "path": str(folder), **summary})
+    if progress_kind != "json":
+        _tell(done, summary, folder, dataset.root)
+    return folder
+
+
+def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
+    """What was done, in words, and what to do next."""
+    from .semantics import mask_repair
+
+    counted = ("segments", "images", "relabelled", "unknown", "kept")
+    segments, images, relabelled, unknown, kept = (summary[key] for key in counted)
+    print(
+        f"{segments} segments in {images} images: {relabelled} relabelled, {unknown} unknown, {kept} kept; "
+        f"{len(summary['objects'])} objects"
+    )
+    print(
+        f"segments agree with what other images show of their objects to {summary['agreement']:.2f} (IoU); "
+        f"with the incoming ids to {summary['agreement_before']:.2f}"
+    )
+    if summary["fallback"]:
+        print("the incoming ids stay: too little is certain, or nothing would be better")
+    changed = mask_repair.switches(done)
+    for row in changed[:SHOWN]:
+        new = "unknown" if row.done == "unknown" else f"{row.new_id}, where its track is {row.usual_id} mostly"
+        print(f"  {done.views[row.image].name}: {row.old_id} -> {new} ({row.pixels} pixels, score {row.score:.2f})")
+    if len(changed) > SHOWN:
+        print(f"  and {len(changed) - SHOWN} more in {folder / mask_repair.SEGMENTS}")
+    print(f"written: {folder}\nNext: r5dgs train {root} --masks {folder} --out RUN")

@@ -1,0 +1,69 @@
+"""The bags of a data set's masks: each image is drawn as the scene has it, and its Gaussians sorted by segments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from ..data import dataset as datasets
+from ..data import masks as id_masks
+from ..raster import RasterSettings, scene_render, segment_weights
+from ..scene import playback
+from ..scene.scene import Scene
+from . import bags, videos
+
+LEAST = 0.02  # of a pixel: what a Gaussian has to give a segment to be in its bag
+
+
+def draw(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    masks: Sequence[np.ndarray],
+    *,
+    backend: str = "auto",
+    progress: Callable[[int], None] | None = None,
+) -> list[bags.ImageBags]:
+    """Draw the scene as each view sees it and sum weights over the segments of its mask.
+
+    Args:
+        scene: The scene; in the observed time it moves as it was learned, residuals included.
+        views: Views of the scene's world.
+        masks: Incoming ids of each, 0 = background, `masks.UNKNOWN` = left out. Of [H, W]
+        backend: Rasterizer.
+        progress: Called with the number of views that are done.
+
+    Returns:
+        Bags of the views, in their order; images of one video belong together.
+    """
+    video_of = {view.name: k for k, video in enumerate(videos.of(views)) for view in video.views}
+    drawn = []
+    for done, (view, mask) in enumerate(zip(views, masks, strict=True)):
+        posed = scene_render.pose_frame(scene, playback.frame(scene, view.t))
+        gaussians = scene_render.PosedGaussians(posed)
+        ids, segments, pixels = np.unique(mask, return_inverse=True, return_counts=True)
+        known = ids != id_masks.UNKNOWN
+        weights = segment_weights.segment_weights(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            view.camera,
+            torch.from_numpy(segments.reshape(mask.shape)),
+            len(ids),
+            settings=RasterSettings(near_plane=scene.near_plane),
+            backend=backend,
+        ).numpy()
+        weights = np.where(weights >= LEAST, weights, 0)[:, known]
+        rows = sparse.csr_matrix(weights.T.astype(np.float32))
+        drawn.append(bags.ImageBags(ids[known].astype(np.int32), pixels[known], rows, video_of[view.name], view.t))
+        if progress is not None:
+            progress(done + 1)
+    return drawn
+
+
+def paths(scene: Scene, times: np.ndarray) -> np.ndarray:
+    """Where each Gaussian is at some times. [S] -> [N, S, 3] float32"""
+    return np.stack([playback.frame(scene, float(t)).means for t in times], axis=1)

@@ -1,0 +1,169 @@
+"""Masks with one numbering from masks with many: a data set's segments associated by a scene that shows them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .. import errors
+from ..data import dataset as datasets
+from ..data import mask_notes, masks
+from ..data.annotations import OBJECTS
+from ..scene import files
+from ..scene.scene import Scene
+from . import association, drawn_bags
+
+NEIGHBOURS = 8
+TIMES = 16  # at most, of which places of the Gaussians are compared
+SEGMENTS, SUMMARY = "segments.csv", "association.json"
+
+
+@dataclass(frozen=True)
+class Repair:
+    """What was done, and with what.
+
+    Attributes:
+        views: Views with masks, in the order of the association's images.
+        incoming: Their masks as they were. Of [H, W]
+        result: New ids.
+        own_ids: Whether the new ids are the folder's own: those of the data set held within single videos.
+    """
+
+    views: tuple[datasets.View, ...]
+    incoming: tuple[np.ndarray, ...]
+    result: association.Association
+    own_ids: bool
+
+    def mask(self, index: int) -> np.ndarray:
+        """New ids of a view; pixels that were unknown stay so. [H, W] int32"""
+        old = self.incoming[index]
+        ids = np.unique(old)
+        new = np.full(len(ids), masks.UNKNOWN, np.int32)
+        new[ids != masks.UNKNOWN] = self.result.ids[index]
+        return new[np.searchsorted(ids, old)]
+
+
+def repair(
+    scene: Scene,
+    dataset: datasets.Dataset,
+    *,
+    backend: str = "auto",
+    progress: Callable[[dict[str, Any]], None] | None = None,
+) -> Repair:
+    """Associate the segments of the training views' masks.
+
+    Args:
+        scene: A scene that was trained from the data set, in whatever way it came to its objects; with `none` masks
+            best, so that wrong ones have no part in it.
+        dataset: The data set, with the masks.
+        backend: Rasterizer.
+        progress: Called with events.
+
+    Raises:
+        DatasetError: No training view has a mask, or one cannot be read.
+    """
+    progress = progress or (lambda event: None)
+    views = tuple(view for view in dataset.train if view.mask_path is not None)
+    if not views:
+        raise errors.DatasetError(
+            f"{dataset.root}: expected masks of training views, found none. Remedy: r5dgs masks, or name their folder "
+            "with --masks"
+        )
+    incoming = tuple(mask for view in views if (mask := datasets.load_mask(view)) is not None)
+    progress({"event": "draw", "done": 0, "total": len(views)})
+    images = drawn_bags.draw(
+        scene,
+        views,
+        incoming,
+        backend=backend,
+        progress=lambda done: progress({"event": "draw", "done": done, "total": len(views)}),
+    )
+    progress({"event": "prepare", "text": "associating segments"})
+    _, neighbours = cKDTree(scene.means).query(scene.means, min(NEIGHBOURS + 1, len(scene.means)), workers=-1)
+    times = np.unique([view.t for view in views])
+    some = times[np.linspace(0, len(times) - 1, min(TIMES, len(times))).round().astype(int)]
+    result = association.associate(
+        images, neighbours.reshape(len(scene.means), -1)[:, 1:], paths=drawn_bags.paths(scene, some)
+    )
+    return Repair(views, incoming, result, own_ids=any(view.mask_video for view in views))
+
+
+def write(done: Repair, folder: Path, names: dict[int, str] | None, made_with: dict[str, Any]) -> None:
+    """Write the new masks, the list of segments and what was found of the whole; `train --masks` reads the folder.
+
+    Files: the masks by the names of their views; ``segments.csv``, one line for each segment with what became of it,
+    changes first; ``association.json``, the whole in numbers; ``masks.json``; and ``objects.json`` where the ids are
+    the folder's own.
+
+    Args:
+        done: What `repair` did.
+        folder: The folder; files of the same names are replaced, one by one and whole.
+        names: Names of ids where they are the folder's own, others are called "object 3"; None where they are those of
+            the data set.
+        made_with: For ``masks.json``: what the masks were made from.
+
+    Raises:
+        DatasetError: A file cannot be written.
+    """
+    notes = mask_notes.MaskNotes(backend="associate", finished=False, made_with=made_with)
+    folder.mkdir(parents=True, exist_ok=True)
+    mask_notes.write(notes, folder)
+    seen: set[int] = set()
+    for index, view in enumerate(done.views):
+        ids = done.mask(index)
+        seen.update(np.unique(ids).tolist())
+        masks.write(folder / f"{view.name}.png", ids)
+    present = sorted(seen - {0, masks.UNKNOWN})
+    try:
+        if names is not None:
+            called = {str(k): names.get(k, f"object {k}") for k in present}
+            files.write(folder / OBJECTS, (json.dumps(called, indent=1) + "\n").encode())
+        files.write(folder / SEGMENTS, _segments(done).encode())
+        files.write(folder / SUMMARY, (json.dumps(summary(done), indent=1) + "\n").encode())
+    except OSError as error:
+        raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
+    video = mask_notes.Video(tuple(view.name for view in done.views), tuple(present))
+    mask_notes.write(mask_notes.MaskNotes("associate", videos={"all": video}, made_with=made_with), folder)
+
+
+def summary(done: Repair) -> dict[str, Any]:
+    """The whole in numbers; what ``association.json`` holds."""
+    result = done.result
+    counts = {what: sum(row.done == what for row in result.rows) for what in ("kept", "relabelled", "unknown")}
+    return {
+        "images": len(done.views),
+        "segments": len(result.rows),
+        **counts,
+        "objects": [int(k) for k in result.objects],
+        "confident": round(result.confident, 4),
+        "agreement": round(result.agreement, 4),
+        "agreement_before": round(result.agreement_before, 4),
+        "usual_iou": round(result.usual_iou, 4),
+        "fallback": result.fallback,
+    }
+
+
+def switches(done: Repair) -> list[association.Row]:
+    """Segments whose id changed against what their track usually got, or is unknown; the largest first."""
+    changed = [row for row in done.result.rows if row.done != "kept"]
+    return sorted(changed, key=lambda row: -row.pixels)
+
+
+def _segments(done: Repair) -> str:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["image", "old_id", "new_id", "usual_id", "pixels", "score", "done"])
+    changed = switches(done)
+    for row in [*changed, *(row for row in done.result.rows if row.done == "kept")]:
+        new = "unknown" if row.new_id == masks.UNKNOWN else row.new_id
+        name = done.views[row.image].name
+        table.writerow([name, row.old_id, new, row.usual_id, row.pixels, f"{row.score:.3f}", row.done])
+    return text.getvalue()

@@ -1,0 +1,119 @@
+"""Associating the masks of a data set: one numbering from many, single switches named, nothing else touched."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from r5dgs_core import cli, commands_association, errors
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.data import mask_notes, masks
+from r5dgs_core.scene import scene_file
+from r5dgs_core.semantics import mask_repair
+
+
+def rewrite(root, folder, change):
+    """Write the training masks into a folder, each through ``change(view, ids)``."""
+    data = datasets.read(root)
+    for view in data.train:
+        masks.write(folder / f"{view.name}.png", change(view, datasets.load_mask(view)))
+    return data
+
+
+def exchanged(ids):
+    return np.select([ids == 1, ids == 2], [2, 1], ids)
+
+
+@pytest.fixture
+def switched(tiny, tmp_path):
+    """Right masks but for one image, whose two objects have each other's id, and a patch of nothing known."""
+
+    def change(view, ids):
+        if view.name != "train/r_008":
+            return ids
+        ids = exchanged(ids)
+        ids[:3, :3] = masks.UNKNOWN
+        return ids
+
+    rewrite(tiny.root, tmp_path / "switched", change)
+    return tmp_path / "switched"
+
+
+def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
+    folder, out = tmp_path / "videos", tmp_path / "out"
+    names = sorted({view.camera.name for view in datasets.read(tiny.root).train})
+    data = rewrite(
+        tiny.root,
+        folder,
+        lambda view, ids: exchanged(ids) if names.index(view.camera.name) % 2 else np.where(ids == 1, 9, ids),
+    )
+    videos = {
+        name: mask_notes.Video(tuple(v.name for v in data.train if v.camera.name == name), (1, 2, 9)) for name in names
+    }
+    mask_notes.write(mask_notes.MaskNotes("tracker", mask_notes.VIDEO, videos=videos), folder)
+    with pytest.raises(errors.DatasetError, match="r5dgs associate RUN"):
+        datasets.read(tiny.root, str(folder)).require_one_numbering()
+
+    commands_association.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+
+    repaired = datasets.read(tiny.root, str(out))
+    repaired.require_one_numbering()
+    pairs = set()
+    for view, true in zip(repaired.train, data.train, strict=True):
+        pairs |= set(
+            zip(datasets.load_mask(view).ravel().tolist(), datasets.load_mask(true).ravel().tolist(), strict=True)
+        )
+    assert len(pairs) == len({new for new, _ in pairs}) == len({old for _, old in pairs}) == 3  # a one-to-one map
+    assert (0, 0) in pairs
+    # The ids are the folder's own: nothing that goes by those of the data set is put on them.
+    assert set(repaired.object_names.values()).isdisjoint(data.object_names.values())
+    assert repaired.ground_truth is None
+
+
+def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert cli.main(["associate", str(trained.folder), "--masks", str(switched), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "2 relabelled, 0 unknown" in said and "train/r_008: 2 -> 1" in said and f"--masks {out}" in said
+    data, repaired = datasets.read(tiny.root), datasets.read(tiny.root, str(out))
+    for view, true in zip(repaired.train, data.train, strict=True):
+        new, ids = datasets.load_mask(view), datasets.load_mask(true)
+        known = new != masks.UNKNOWN
+        assert (new == ids)[known].all()
+        assert (~known).sum() == (9 if view.name == "train/r_008" else 0)  # what nobody knew, nobody knows
+    assert repaired.object_names == data.object_names and repaired.ground_truth is not None
+    with (out / mask_repair.SEGMENTS).open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["image"] for row in rows if row["done"] == "relabelled"] == ["train/r_008"] * 2
+    assert {row["done"] for row in rows[2:]} == {"kept"}
+    summary = json.loads((out / mask_repair.SUMMARY).read_text())
+    assert summary["relabelled"] == 2 and summary["segments"] == len(rows) and summary["objects"] == [1, 2]
+    assert summary["agreement"] > summary["agreement_before"]
+
+
+def test_a_scene_file_does_as_well_as_its_run(baked, trained, tiny, switched, tmp_path):
+    scene_file.write(baked, tmp_path / "scene.r5dgs")
+    one = commands_association.run_associate(
+        tmp_path / "scene.r5dgs", tiny.root, masks=switched, out=tmp_path / "one", progress_kind="json"
+    )
+    two = commands_association.run_associate(trained.folder, masks=switched, out=tmp_path / "two")
+    for path in one.rglob("*.png"):
+        assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
+
+
+def test_masks_that_are_read_are_not_written_over(trained, switched):
+    before = {path: path.read_bytes() for path in switched.rglob("*.png")}
+    with pytest.raises(errors.ConfigError, match="holds the incoming masks; name another folder"):
+        commands_association.run_associate(trained.folder, masks=switched, out=switched)
+    assert before == {path: path.read_bytes() for path in switched.rglob("*.png")}
+
+
+def test_a_scene_file_alone_is_not_enough(tmp_path):
+    with pytest.raises(errors.ConfigError, match="needs the data set and a folder, --data and --out"):
+        commands_association.run_associate(tmp_path / "scene.r5dgs")
+
+
+def test_no_masks_at_all_is_an_error(baked, tiny):
+    with pytest.raises(errors.DatasetError, match="expected masks of training views, found none. Remedy: r5dgs masks"):
+        mask_repair.repair(baked, datasets.read(tiny.root, datasets.NO_MASKS))
