@@ -26,7 +26,7 @@ BESIDE = ("pytest", "hypothesis", "OpenImageIO", "rich", "packaging", "scipy", "
 def python_of(version: str) -> str:
     """A Python of a version such as "3.13"."""
     found = shutil.which(f"python{version}")
-    if found is None:
+    if found is None or subprocess.run([found, "-c", ""], capture_output=True).returncode:  # a shim may lead nowhere
         raise SystemExit(f"python{version}: not found; the bpy module of this version is for it alone, so install it")
     return found
 
