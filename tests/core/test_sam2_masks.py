@@ -11,6 +11,7 @@ from r5dgs_core import commands_masks, errors
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
 from r5dgs_core.semantics import mask_making, sam2, sam2_masks, segments, tracking, videos
+from tests import datasets as tiny_datasets
 from tests import sam2 as tiny_sam2
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed")
@@ -194,6 +195,42 @@ def test_a_video_gets_masks_that_follow_what_was_marked(model, video, tmp_path):
     old = images[5] <= len(first)  # no gap ends after the last image, so nothing is unknown there
     expected = np.where(at_end.max(0) > 0, at_end.argmax(0) + 1, 0)
     assert (images[5] == expected)[old & (images[5] > 0)].mean() > 0.99  # half floats make ties of near equals
+
+
+def test_networks_that_see_the_truth_give_the_truth_and_late_objects_too(model, tmp_path, monkeypatch):
+    """With the answers of the networks replaced by true masks, every image gets these, under numbers of its video."""
+    late = tiny_datasets.make_dataset(tmp_path / "late", ball_from=0.4)
+    views = datasets.read(late.root).train
+    truth = {view.name: datasets.load_mask(view) for view in views}
+    by_image = {videos.Video("", (view,)).image(0).tobytes(): truth[view.name] for view in views}
+    now = []
+
+    def logits(ids, wanted):
+        return torch.from_numpy(np.where(ids == wanted, 9.0, -9.0).astype(np.float32))
+
+    def find(model, image, settings):
+        ids = by_image[image.tobytes()]
+        return [segments.Segment(logits(ids, k), 0.9) for k in np.unique(ids[ids > 0]).tolist()]
+
+    def follow(model, frames, key, marked):
+        names = [view.name for view in frames._video.views]
+        true = truth[names[key]]
+        wanted = [int(np.bincount(true[mask > 0]).argmax()) for mask in marked.numpy()]
+        now.append((key, wanted))
+        for index in [*range(key, len(names)), *reversed(range(key))]:
+            yield index, torch.stack([logits(truth[names[index]], k) for k in wanted])
+
+    monkeypatch.setattr(segments, "find", find)
+    monkeypatch.setattr(tracking, "follow", follow)
+    mask_making.make(views, sam2_masks.Sam2Masks(model), tmp_path / "m")
+    assert {key for key, wanted in now if tiny_datasets.BALL in wanted} == {5}  # of 0, 2 and 5; it comes at 3
+    for name, video in mask_notes.read(tmp_path / "m").videos.items():
+        pairs = set()
+        for image in video.images:
+            ids = masks.read(tmp_path / "m" / f"{image}.png")
+            pairs |= set(zip(ids.ravel().tolist(), truth[image].ravel().tolist(), strict=True))
+        assert {a for a, _ in pairs} == {0, *video.ids} and len(pairs) == len(video.ids) + 1, name
+    assert any(len(video.ids) == 2 for video in mask_notes.read(tmp_path / "m").videos.values())
 
 
 def test_a_video_of_one_image_gets_its_segments(model, video, tmp_path):
