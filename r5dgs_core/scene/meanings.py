@@ -10,6 +10,7 @@ its own, calibrated where the table is made (`semantics.calibration`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 POOLINGS = ("mean", "max")
 UNCALIBRATED = 0.25  # threshold of a file that says nothing about its encoder
 PASS = 0.5  # score at the threshold
-_BEST = 0.95  # score of relevancy 1: below a name's
+_BEST = 0.95  # score far above the threshold: below a name's
+_SPREAD = 0.25  # of cosines, in a file that says nothing about its encoder
 _BESIDE = 0.4  # most of an object that fits far worse than another
 
 
@@ -180,24 +182,21 @@ def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
     """The best that an object's embeddings say, None where it has none."""
     rows, thresholds = _rows(meanings, row)
     table, canonical = meanings.table, meanings.canonical_embeddings
+    spread = _SPREAD if table is None else table.margin
     answers = []
     for own, threshold in zip(rows, thresholds.tolist(), strict=True):
         cosine = float(np.clip(own @ np.asarray(query, np.float64), -1, 1))
-        if table is None or canonical is None or len(canonical) == 0:
-            found, score = None, _score(0.5 + 0.5 * cosine, 0.5 + 0.5 * threshold)
-        else:
-            beside = canonical.astype(np.float64) @ own
-            found = relevancy(cosine, beside, table.encoder.scale)
-            score = _score(found, relevancy(threshold, beside, table.encoder.scale))
-        answers.append(Meant(meanings.object_ids[row], score, cosine, found))
+        found = None
+        if table is not None and canonical is not None and len(canonical):
+            found = relevancy(cosine, canonical.astype(np.float64) @ own, table.encoder.scale)
+        answers.append(Meant(meanings.object_ids[row], _score(cosine - threshold, spread), cosine, found))
     return max(answers, key=lambda one: one.score, default=None)
 
 
-def _score(found: float, least: float) -> float:
-    """From what was found and what is least needed, both in [0, 1]: 0 for nothing, `PASS` at the least."""
-    if found >= least:
-        return PASS + (_BEST - PASS) * (found - least) / max(1 - least, 1e-9)
-    return PASS * found / least
+def _score(above: float, spread: float) -> float:
+    """Of a cosine that lies so far above the threshold: 0 far below it, `PASS` at it, `_BEST` far above."""
+    share = math.exp(-min(abs(above) / max(spread, 1e-9), 700.0))
+    return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 
 def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:

@@ -54,6 +54,15 @@ def test_a_score_passes_exactly_where_the_cosine_reaches_the_threshold(cosine, t
         assert (one.score >= meanings.PASS) == (cosine > threshold)
 
 
+@given(cosines, st.floats(0.01, 0.5))
+def test_scores_do_not_depend_on_how_near_all_cosines_of_an_encoder_lie(cosine, threshold):
+    """An encoder whose cosines are twice as close has thresholds and a margin that are so, too."""
+    wide = table_of([around(cosine)], [threshold], margin=0.4)
+    close = table_of([around(cosine / 2)], [threshold / 2], margin=0.2)
+    (one,), (other,) = (meanings.ask(each, np.eye(4)[0]) for each in (wide, close))
+    assert one.score == pytest.approx(other.score, abs=1e-9)
+
+
 @given(st.lists(st.floats(0, 0.99), min_size=2, max_size=6), st.floats(0.01, 0.9))
 def test_scores_of_one_threshold_are_in_the_order_of_cosines(found, threshold):
     answers = meanings.ask(table_of([around(c) for c in found], [threshold] * len(found)), np.eye(4)[0])
