@@ -124,15 +124,13 @@ class Dataset:
         Raises:
             DatasetError: Ids hold within a video only, and there are several.
         """
-        paths = [view.mask_path for view in self.train if view.mask_path is not None]
-        if not paths:
-            return
         videos = sorted({view.mask_video for view in self.train if view.mask_path is not None})
         if len(videos) > 1:
             raise errors.DatasetError(
-                f"{paths[0]} and others: their ids hold within a video only ({len(videos)} of them: "
+                f"{self.mask_folder}: the ids of these masks hold within a video only ({len(videos)} of them: "
                 f"{', '.join(videos[:3])}{', ...' if len(videos) > 3 else ''}), an object has another one in each. "
-                "Remedy: train with --masks none, then r5dgs associate RUN, which gives them one numbering"
+                f"Remedy: train with --masks none, then r5dgs associate RUN --masks {self.mask_folder}, which gives "
+                "them one numbering"
             )
 
 
