@@ -110,8 +110,10 @@ class Running:
     def cancel(self, context):
         """Blender ends the operator: the file browser is closed, or a window or the file while it runs."""
         if getattr(self, "_timer", None) is not None:
-            self._steps.close()
-            self._end(context)
+            try:
+                self._steps.close()
+            finally:  # where what the steps undo fails, too
+                self._end(context)
 
     def _step(self, context):
         """Do one step; the operator's result when that was the last, else None."""

@@ -103,6 +103,21 @@ def test_esc_closes_the_steps(running):
     assert tidy(window) and "stopped" in reports[0][1]
 
 
+def test_esc_leaves_the_window_as_it_was_even_where_undoing_the_steps_fails(running):
+    def steps():
+        try:
+            while True:
+                yield running.Step(0, 9, "frame", slow=True)
+        finally:
+            raise ZeroDivisionError
+
+    operator, window, _ = begin(running, steps())
+    blink(operator, window)
+    with pytest.raises(ZeroDivisionError):
+        blink(operator, window, "ESC")
+    assert tidy(window)
+
+
 @pytest.mark.parametrize("error", [errors.ConfigError("expected another"), ZeroDivisionError()])
 def test_an_error_leaves_the_window_as_it_was(running, error):
     def steps():
