@@ -16,6 +16,7 @@ from ..r5dgs_core.scene import lookup, scene_file
 from . import phrases, picture, selection, table
 
 HISTORY = 12  # prompts kept
+ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
 STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
 _meanings: dict[Path, tuple[tuple[int, int], lookup.Meanings | None]] = {}  # by file, with its time and size
 
@@ -120,7 +121,7 @@ def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answ
     asked = " and ".join(repr(phrase) for phrase in answer.missing)
     if _has_window():
         phrases.begin(answer.missing, functools.partial(_join, text))
-        return replace(answer, notes=[*answer.notes, f"Asking the text encoder for {asked}"])
+        return replace(answer, notes=[*answer.notes, f"{ASKING}{asked}"])
     try:
         phrases.fetch(answer.missing)
     except errors.R5dgsError as error:

@@ -45,7 +45,7 @@ def run_bake(run_folder: Path, out: Path, data: Path | None, overrides: Sequence
     from .report import table
     from .train import bake
 
-    _check_scene_name(out)
+    check_scene_name(out)
     scene = bake.run_bake(run_folder, out, data, overrides)
     _tell_scene(scene, out)
     Console().print(table.needs(scene.needs))
@@ -64,7 +64,7 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
     from .progress import make
     from .scene import scene_file
 
-    _check_scene_name(out)
+    check_scene_name(out)
     chosen = importer.Options(**{name: value for name, value in options.items() if value is not None})
     with make(progress_kind) as progress:
         scene = importer.import_run(
@@ -79,7 +79,8 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
         _tell_scene(scene, out)
 
 
-def _check_scene_name(out: Path) -> None:
+def check_scene_name(out: Path) -> None:
+    """Refuse a place for a scene file that Blender would not find. Raises `SceneFileError`."""
     if out.is_dir():
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
     if out.suffix.lower() != ".r5dgs":

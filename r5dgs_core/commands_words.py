@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import errors
+from . import commands, errors
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -45,6 +45,8 @@ def run_lookup(
     from .scene import scene_file
     from .semantics import encoders, lookup_table
 
+    if out is not None:
+        commands.check_scene_name(out)
     scene = scene_file.read(path)
     if captions is not None:
         scene = described(scene, _read_captions(captions), str(captions))

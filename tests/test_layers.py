@@ -40,7 +40,7 @@ ALLOWED = {
     "commands_association": {"scene", "data", "semantics", "commands", "progress"},
     "commands_masks": {"scene", "data", "semantics", "progress"},
     "commands_objects": {"scene", "data", "semantics", "report", "commands", "commands_words"},
-    "commands_words": {"scene", "semantics", "progress"},
+    "commands_words": {"scene", "semantics", "progress", "commands"},
     "cli": {
         "commands",
         "commands_association",
@@ -54,8 +54,11 @@ ALLOWED = {
 }
 LIGHT = {"errors", "motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
-HEAVY = {"torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"}
-TORCH_TIER = {"torch", "numba", "gsplat", "transformers", "torchvision"}
+HEAVY = {
+    *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
+    *("safetensors", "open_clip"),
+}
+TORCH_TIER = {"torch", "numba", "gsplat", "transformers", "torchvision", "safetensors", "open_clip"}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import isolation, objects, selection, table
+from .. import isolation, objects, prompt, selection, table
 from . import sidebar
 
 
@@ -49,7 +49,8 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 
 
 def _draw_answers(box, session, names):
-    if not session.matches:
+    asking = any(note.name.startswith(prompt.ASKING) for note in session.notes)
+    if not session.matches and not asking:
         box.label(text=f"Nothing matches '{session.asked}'", icon="INFO")
     for match in session.matches:
         line = box.split(factor=0.5)
@@ -66,7 +67,7 @@ def _draw_answers(box, session, names):
         for item in session.meant:
             row.operator("r5dgs.select_by_prompt", text=item.name).text = item.name
     for note in session.notes:
-        box.label(text=note.name, icon="ERROR")
+        box.label(text=note.name, icon="TIME" if note.name.startswith(prompt.ASKING) else "ERROR")
 
 
 def _current_names(session) -> dict[tuple[str, int], str]:

@@ -324,6 +324,7 @@ def test_naming_an_object_changes_that_alone(file, capsys):
         (["query", "FILE", " ,"], "expected words for the objects"),
         (["query", "FILE", "mug", "--threshold", "2"], "--threshold 2.0: expected a number from 0 to 1"),
         (["lookup", "FILE", "--encoder", "plain", "--captions", "no.json"], "--captions no.json: expected JSON"),
+        (["lookup", "FILE", "--encoder", "plain", "--out", "no.zip"], "expected a name that ends in .r5dgs"),
         (["lookup", "FILE", "--encoder", "plain", "--words", "no.txt"], "--words no.txt: expected text"),
     ],
 )
