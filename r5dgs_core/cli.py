@@ -1,5 +1,5 @@
-"""The ``r5dgs`` command: demo, train, masks, bake, import, evaluate, report, bench, info, objects, lookup, query, name,
-warm-up.
+"""The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, objects, lookup,
+query, name, warm-up.
 
 What each sub-command does is in `commands` and its neighbours.
 """
