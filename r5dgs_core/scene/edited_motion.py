@@ -152,16 +152,24 @@ def _turned(quats: np.ndarray, moves: np.ndarray, parent: np.ndarray) -> tuple[n
     """Poses X P0 X^-1 of a motion under a parent that is a similarity. [T, 4], [T, 3] and X [3, 3]"""
     if (parent == np.eye(3)).all():
         return quats, moves
-    turn = rotations.rotmats_to_quats(carried.nearest_rotation(parent))
+    turn = rotations.rotmats_to_quats(_turn_of(parent)[0])
     return rotations.multiply(rotations.multiply(turn, quats), rotations.conjugate(turn)), moves @ parent.T
+
+
+def _turn_of(parent: np.ndarray) -> tuple[np.ndarray, float]:
+    """What axes are turned and lengths are scaled by: below 0 for a mirror, which is a turn with all axes reversed.
+
+    Places go through the mirror, axes of rotations through the turn alone. [3, 3] -> [3, 3] and a factor
+    """
+    scale = float(np.cbrt(np.linalg.det(parent)))
+    return carried.nearest_rotation(np.sign(scale) * parent), scale
 
 
 def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
     """The model of `_turned`, its covariance included."""
     if (parent == np.eye(3)).all():
         return model
-    turn = carried.nearest_rotation(parent)
-    scale = float(abs(np.linalg.det(parent)) ** (1 / 3))
+    turn, scale = _turn_of(parent)
     maps = {name: scale * turn for name in _LENGTHS} | {name: turn for name in _ANGLES}
     values = {name: linear @ getattr(model, name) for name, linear in maps.items()}
     if model.inertia is not None:
@@ -170,7 +178,7 @@ def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
     if model.covariance is not None:
         change = _change(model.covariance_names, maps)
         values["covariance"] = change @ model.covariance @ change.T
-    return replace(model, radius=scale * model.radius, **values)
+    return replace(model, radius=abs(scale) * model.radius, **values)
 
 
 def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:

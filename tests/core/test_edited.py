@@ -170,14 +170,16 @@ def test_residuals_and_shading_turn_with_what_was_turned():
         np.testing.assert_allclose(np.abs((found.quats * turned).sum(-1)), 1, atol=1e-5)
 
 
-def test_a_parent_turns_the_learned_motion_and_its_model():
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
     scene = rich_scene(seed=2)
-    matrix = matrix_of(0.7 * TURN, (1.0, 0.5, 0.0))
+    linear = 0.7 * TURN @ np.diag([mirror, 1, 1])
+    matrix = matrix_of(linear, (1.0, 0.5, 0.0))
     result, _ = edit(scene, pieces_of(scene, before={1: matrix}))
     model, turned = scene.groups[1].model, result.groups[1].model
     assert turned.kind == model.kind
-    np.testing.assert_allclose(turned.velocity, 0.7 * TURN @ model.velocity)
-    np.testing.assert_allclose(turned.angular_velocity, TURN @ model.angular_velocity)
+    np.testing.assert_allclose(turned.velocity, linear @ model.velocity)
+    np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
     rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residual_rows)
     for t in (0.0, 0.31, 0.75, 0.99):
         wanted = playback.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
