@@ -46,6 +46,11 @@ def of(phrase: str, card: EncoderCard) -> np.ndarray | None:
     return found.vector if found is not None and found.digest == card.digest else None
 
 
+def is_there() -> bool:
+    """Whether the preferences name an encoder."""
+    return bool(preferences.text_encoder())
+
+
 def missing(asked: Sequence[str]) -> list[str]:
     """The phrases that the encoder of the preferences has not been asked for yet; none where there is no encoder."""
     where = preferences.text_encoder()

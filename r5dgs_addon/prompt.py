@@ -65,7 +65,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
     Returns:
         The answer; equal scores are in the order of ``loaded``.
     """
-    matches, deleted, notes, known, missing = [], [], [], [], []
+    matches, deleted, notes, known, missing, lost = [], [], [], [], [], []
     for collection in loaded:
         labels = table.labels(collection)
         there = table.present(collection)
@@ -77,6 +77,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
         if meanings is not None and meanings.table is not None:
             card, unknown = meanings.table.encoder, lookup.unknown(labels, text, meanings)
             missing += phrases.missing(unknown)
+            lost += [] if phrases.is_there() else unknown
             other = phrases.stranger(unknown, card)
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrases.of, card=card)
@@ -85,6 +86,9 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
             else:
                 deleted.append(names[found.object_id])
+    if lost and not matches:
+        asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
+        notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
     if deleted:
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     matches.sort(key=lambda match: -round(match.score, 6))

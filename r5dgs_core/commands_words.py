@@ -58,7 +58,9 @@ def run_lookup(
             scene,
             opened,
             extra,
-            progress=lambda done, total: progress({"event": "lookup", "done": done, "total": total, "unit": "objects"}),
+            progress=lambda what, done, total: progress(
+                {"event": f"look up {what}", "done": done, "total": total, "unit": what}
+            ),
         )
         target = scene_file.write(made.scene, out or path, exact=scene_file.is_exact(path))
         if progress_kind == "json":

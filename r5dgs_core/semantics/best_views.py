@@ -7,7 +7,7 @@ small pictures from the scene's own cameras at observed times.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -48,32 +48,42 @@ class Sighting:
     worth: float
 
 
-def find(scene: Scene, object_ids: Sequence[int], *, backend: str = "auto") -> dict[int, list[Sighting]]:
+def find(
+    scene: Scene,
+    object_ids: Sequence[int],
+    *,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[int, list[Sighting]]:
     """The best views of objects, spread over cameras and times.
 
     Args:
         scene: The scene.
         object_ids: The objects.
         backend: Rasterizer.
+        progress: Told of pictures looked at, and their number.
 
     Returns:
         At most `VIEWS` of each object, the best first; none for one that no camera sees.
     """
-    seen: dict[int, list[tuple[Sighting, int, np.ndarray]]] = {object_id: [] for object_id in object_ids}
-    for at in _standpoints(scene):
+    seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
+    places = _standpoints(scene)
+    for done, at in enumerate(places):
         small = standpoints.sized(at.camera, _LOOK)
         output = scene_render.render_frame(scene, playback.frame(scene, at.t), small, backend=backend)
         ids = scene_render.to_numpy(output.ids, np.int32)
         for object_id in object_ids:
             mask = ids == object_id
             if mask.sum() >= _LEAST_PIXELS:
-                seen[object_id].append((_sighting(at, small, mask), int(mask.sum()), mask))
+                seen[object_id].append((_sighting(at, small, mask), mask))
+        if progress:
+            progress(done + 1, len(places))
     result = {}
     for object_id, found in seen.items():
         found.sort(key=lambda entry: -entry[0].worth)
         tried = [
             dataclasses.replace(sighting, worth=sighting.worth * _unhidden(scene, object_id, sighting, mask, backend))
-            for sighting, _, mask in found[:_TRIED]
+            for sighting, mask in found[:_TRIED]
         ]
         result[object_id] = _spread(tried)
     return result

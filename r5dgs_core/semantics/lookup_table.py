@@ -1,12 +1,13 @@
 """Making the lookup table of a scene: what each object looks like or is called, as an encoder sees it.
 
-Objects that are not in the background get an embedding. One that sees gets it from pictures of the object
+Every object but the background gets an embedding. One that sees gets it from pictures of the object
 (`best_views`), a sentence model from its name, aliases and caption. Beside them go words with their embeddings, so that
 these are found without the encoder, and thresholds (`calibration`).
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from . import best_views, calibration, common_nouns, encoders
 
 _NUMBERED = re.compile(r"^(?:object|obj|id|segment|instance|mask)?[\s_#.-]*\d+$", re.IGNORECASE)
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[str, int, int], None]  # told what is done, how much of it, and of how much
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ def make(
         encoder: The encoder; queries have to come from the same one.
         words: Words to store beside the objects' names and the common nouns.
         backend: Rasterizer.
-        progress: Told of objects done and their number.
+        progress: Told of "views" and "objects" done, and their number.
 
     Returns:
         The scene with its table, and what there is to say.
@@ -68,8 +69,11 @@ def make(
     Raises:
         BackendError: No object has anything to embed.
     """
-    items = [item for item in scene.objects if item.id > 0]
+    items = [item for item in scene.objects if item.id > 0 and item.count]
+    empty = [item.name for item in scene.objects if item.id > 0 and not item.count]
     found, notes = (_from_pictures if encoder.card.sees else _from_words)(scene, items, encoder, backend, progress)
+    if empty:
+        notes.append(f"without Gaussians, and so without an embedding: {', '.join(empty)}")
     if not found:
         raise errors.BackendError(
             f"{scene.name}: no object has anything to embed; {'; '.join(notes) or 'the scene has no objects'}"
@@ -94,7 +98,7 @@ def _from_words(
         else:
             nameless.append(item.name)
         if progress:
-            progress(done + 1, len(items))
+            progress("objects", done + 1, len(items))
     notes = (
         [f"without a name, alias or caption, and so without an embedding: {', '.join(nameless)}"] if nameless else []
     )
@@ -105,7 +109,8 @@ def _from_pictures(
     scene: Scene, items: Sequence[SceneObject], encoder: encoders.Encoder, backend: str, progress: Progress | None
 ) -> tuple[dict[int, _Views], list[str]]:
     """How objects look, each view an embedding: the mean of the object alone and in its place."""
-    sightings = best_views.find(scene, [item.id for item in items if item.count], backend=backend)
+    looked = None if progress is None else functools.partial(progress, "views")
+    sightings = best_views.find(scene, [item.id for item in items], backend=backend, progress=looked)
     found, unseen = {}, []
     for done, item in enumerate(items):
         own = sightings.get(item.id, [])
@@ -119,7 +124,7 @@ def _from_pictures(
         else:
             unseen.append(item.name)
         if progress:
-            progress(done + 1, len(items))
+            progress("objects", done + 1, len(items))
     notes = [f"seen by no camera, and so without an embedding: {', '.join(unseen)}"] if unseen else []
     return found, notes
 

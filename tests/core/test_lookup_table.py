@@ -13,6 +13,20 @@ from tests import encoder_folders
 from tests.scenes import make_scene
 
 WORDS = common_nouns.words()
+PER_GAUSSIAN = (
+    *("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids"),
+    *("identities", "shading"),
+)
+    "means",
+    "quats",
+    "log_scales",
+    "opacity_logits",
+    "sh",
+    "object_ids",
+    "motion_ids",
+    "identities",
+    "shading",
+)
 
 
 class Plain:
@@ -131,6 +145,24 @@ def test_a_caption_answers_for_a_name_that_says_nothing():
         lookup_table.make(named("object 1", "2"), Plain())
     with pytest.raises(errors.BackendError, match="the scene has no objects"):
         lookup_table.make(make_scene(n=30, objects=0), Plain())
+
+
+@pytest.mark.parametrize("kind", ["text", "clip"])
+def test_an_object_without_gaussians_gets_no_embedding_and_that_is_said(kind):
+    scene = ring(named("lemon", "hammer"))
+    keep = scene.object_ids != 2
+    bare = dataclasses.replace(
+        scene,
+        **{name: getattr(scene, name)[keep] for name in PER_GAUSSIAN},
+        objects=tuple(dataclasses.replace(item, count=0 if item.id == 2 else item.count) for item in scene.objects),
+        groups=tuple(dataclasses.replace(g, anchor_index=-1) for g in scene.groups),
+    )
+    told = []
+    made = lookup_table.make(bare, Plain(kind), progress=lambda what, done, total: told.append((what, done == total)))
+    assert made.scene.lookup.thresholds[_row(bare, 2)] is None and not made.scene.embeddings[_row(bare, 2)].any()
+    assert made.scene.lookup.thresholds[_row(bare, 1)] is not None
+    assert "without Gaussians, and so without an embedding: hammer" in made.notes
+    assert told[-1] == ("objects", True) and (("views", True) in told) == (kind == "clip")
 
 
 def _row(scene, object_id):
