@@ -17,16 +17,6 @@ PER_GAUSSIAN = (
     *("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids"),
     *("identities", "shading"),
 )
-    "means",
-    "quats",
-    "log_scales",
-    "opacity_logits",
-    "sh",
-    "object_ids",
-    "motion_ids",
-    "identities",
-    "shading",
-)
 
 
 class Plain:
