@@ -78,7 +78,10 @@ def to_parent(anchor: bpy.types.Object, place: Vector) -> np.ndarray:
     """A place in the world along the axes of an anchor's parent, those of its location. [3]"""
     if anchor.parent is None:
         return np.array(place, np.float64)
-    frame = anchor.parent.matrix_world @ anchor.matrix_parent_inverse
+    if anchor.parent_type == "OBJECT":
+        frame = anchor.parent.matrix_world @ anchor.matrix_parent_inverse
+    else:  # bones and points of meshes
+        frame = anchor.matrix_world @ anchor.matrix_basis.inverted_safe()
     return np.array(frame.inverted_safe() @ place, np.float64)
 
 

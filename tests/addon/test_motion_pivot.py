@@ -163,6 +163,28 @@ def test_the_3d_cursor_becomes_the_pivot_and_can_be_undone(blender, loaded, mug)
     assert motions.keys(mug) == written
 
 
+def test_the_3d_cursor_is_the_pivot_of_what_hangs_on_a_bone_too(blender, loaded, mug):
+    rig = blender.data.objects.new("rig", blender.data.armatures.new("rig"))
+    blender.context.scene.collection.objects.link(rig)
+    rig.location, rig.rotation_euler = (0.5, 1.0, -0.5), (0.3, 0.2, 0.9)
+    motions.choose(blender, rig)
+    blender.ops.object.mode_set(mode="EDIT")
+    bone = rig.data.edit_bones.new("hand")
+    bone.head, bone.tail = (1, 0, 0), (1, 2, 1)
+    blender.ops.object.mode_set(mode="OBJECT")
+    mug.parent, mug.parent_type, mug.parent_bone = rig, "BONE", "hand"
+    motions.go_to(blender, loaded, T_MAX)
+    motions.choose(blender, mug)
+    set_up(mug.r5dgs_motion, *KINDS["hinge"][:1], **SPIN)
+    blender.context.scene.cursor.location = PIVOT
+    assert blender.ops.r5dgs.pivot_to_cursor() == {"FINISHED"}
+    blender.ops.r5dgs.re_extrapolate()
+    there = np.linalg.solve(motions.matrix(blender, mug), [*PIVOT, 1.0])
+    for t in TIMES:
+        motions.go_to(blender, loaded, t)
+        np.testing.assert_allclose((motions.matrix(blender, mug) @ there)[:3], PIVOT, atol=1e-4)
+
+
 def test_the_pivot_of_a_copy_is_where_the_copy_is(blender, loaded, mug):
     set_up(mug.r5dgs_motion, *KINDS["hinge"][:1], **SPIN)
     mug.r5dgs_pivot.point = PIVOT
