@@ -178,6 +178,12 @@ def test_each_slip_counts_one():
     assert lookup.edit_distance("elppa", "apple") == 4 and lookup.edit_distance("", "mug") == 3
 
 
+def test_two_of_a_kind_are_two_matches():
+    labels = [lookup.Label(1, "red chair"), lookup.Label(2, "table"), lookup.Label(3, "blue chair")]
+    assert [m.object_id for m in lookup.search_labels(labels, "the two chairs")] == [1, 3]
+    assert [m.object_id for m in lookup.search_labels(labels, "both of the chairs")] == [1, 3]
+
+
 def test_embeddings_answer_beside_labels_that_were_renamed():
     meanings = lookup.Meanings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
     labels = [lookup.Label(1, "planet"), lookup.Label(2, "desk")]
