@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import re
 
 import numpy as np
@@ -372,3 +373,12 @@ def test_captions_come_from_a_file(file, tmp_path, capsys):
         captions.write_text(wrong)
         assert cli.main(asked) == 1
         assert str(captions) in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
+def test_a_real_sentence_model_finds_by_meaning_and_says_nothing_matches():
+    encoder = encoders.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
+    made = lookup_table.make(named("mug", "lemon", "apple", "donut", "cutting board", "bowl"), encoder).scene
+    found = {text: {m.object_id for m in lookup.search(made, text)} for text in ("fruit", "pastry", "cup", "elephant")}
+    assert found == {"fruit": {2, 3}, "pastry": {4}, "cup": {1}, "elephant": set()}
+    assert [m.object_id for m in query.find(made, "something to drink from", encoder)] == [1]
