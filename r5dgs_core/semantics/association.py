@@ -22,7 +22,8 @@ from scipy import optimize, sparse
 from ..data import masks
 from . import assignment, bags, clustering, patches, tracklets, votes
 
-GAIN = 0.15  # by which share the images must agree better than on the incoming ids, where geometry says nothing at all
+GAIN = 0.5  # of the usual overlap that a pixel that changes must win on average for anything to change,
+FEW = 4  # and twice that with so few images: little evidence agrees with a wrong outcome by chance
 DOUBTFUL = 0.55  # share of the score of the two best objects below which the better one is in doubt
 
 
@@ -123,9 +124,12 @@ def associate(
     sure = (found.labels > 0) & (found.margins >= DOUBTFUL) & (found.scores >= assignment.LOWEST)
     shown = stack.ids > 0
     confident = float(stack.pixels[sure].sum() / max(stack.pixels[shown].sum(), 1))
-    if confident < settings.confident_share or found.agreement <= before.agreement * (1 + GAIN * (1 - found.usual_iou)):
-        return _untouched(stack, before, confident)
     ids, usual = _name(stack, found, sure)
+    changed = float(stack.pixels[shown & (ids != stack.ids)].sum() / max(stack.pixels[shown].sum(), 1))
+    gain = found.agreement - before.agreement
+    needed = GAIN * (1 + FEW / len(stack.views)) * found.usual_iou * changed
+    if changed and (confident < settings.confident_share or gain < needed):
+        return _untouched(stack, before, confident)
     return _result(stack, ids, usual, found, confident, before.agreement)
 
 
@@ -250,7 +254,8 @@ def _result(
 
 
 def _untouched(stack: bags.Stack, found: assignment.Assignment, confident: float) -> Association:
-    return _result(stack, stack.ids, stack.ids, found, confident, found.agreement, fallback=True)
+    ids, usual = _compact(stack.ids, stack.ids)
+    return _result(stack, ids, usual, found, confident, found.agreement, fallback=True)
 
 
 def _plain(stack: bags.Stack, agreement: float) -> assignment.Assignment:

@@ -21,7 +21,7 @@ SAME = 0.3  # share of the usual agreement at which two groups of runs are one o
 SIDE_BY_SIDE = 0.08  # share of the shorter group's images in which both may be seen apart
 PRIOR = 5.0  # pairs of runs that the usual agreement of all views counts for in that of two views
 PART = 0.6  # share of the usual agreement of an object with itself that lies in a larger one where it is a part of that
-HINT = 2.0  # most that a common id counts for, as a factor on agreement, and that different ids count against
+HINT = 4.0  # most that a common id counts for, as a factor on agreement, and that different ids count against
 THIN = 0.1  # share of the smaller run's pixels below which common evidence is weak
 
 
