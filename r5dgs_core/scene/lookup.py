@@ -27,6 +27,8 @@ _TYPO_RATIO = 0.75
 _LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
 _MOST_SLIPS = 3
 _FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
+# Said before what is counted, they are no part of its name; "mug two" keeps its number.
+_COUNTS = frozenset(("both", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "some", "few"))
 _HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
 _SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
 
@@ -176,6 +178,8 @@ def _parts(text: str) -> list[tuple[str, list[str]]]:
     for part in _SPLIT.split(text):
         words = words_of(part)
         kept = [word for word in words if word not in _FILLER] or words
+        while len(kept) > 1 and kept[0] in _COUNTS:
+            kept = kept[1:]
         if kept:
             result.append((part.strip(), kept))
     return result

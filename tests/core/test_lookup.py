@@ -184,6 +184,14 @@ def test_two_of_a_kind_are_two_matches():
     assert [m.object_id for m in lookup.search_labels(labels, "both of the chairs")] == [1, 3]
 
 
+def test_counts_are_no_part_of_what_is_counted_but_may_be_of_a_name():
+    labels = [lookup.Label(1, "mug one"), lookup.Label(2, "mug two"), lookup.Label(3, "two towers")]
+    assert lookup.wishes("the two fruits and some mugs") == [["fruit"], ["mug"]]
+    assert [m.object_id for m in lookup.search_labels(labels, "mug two")][0] == 2
+    assert [m.object_id for m in lookup.search_labels(labels, "two towers")] == [3]
+    assert [m.object_id for m in lookup.search_labels(labels, "two mugs")] == [1, 2]
+
+
 def test_embeddings_answer_beside_labels_that_were_renamed():
     meanings = lookup.Meanings((1, 2), np.eye(2), ("sphere",), np.array([[1.0, 0.0]]))
     labels = [lookup.Label(1, "planet"), lookup.Label(2, "desk")]
