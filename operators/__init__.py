@@ -2,6 +2,7 @@
 
 import bpy
 
+from ..r5dgs_addon import running
 from . import (
     add_alias,
     capture_dataset,
@@ -96,7 +97,8 @@ def register():
 
 
 def unregister():
-    """Undo `register` in reverse order."""
+    """Undo `register` in reverse order; what still runs is stopped first."""
+    running.stop_all(bpy.context)
     for menu, draw in MENUS:
         menu.remove(draw)
     for module in reversed(MODULES):

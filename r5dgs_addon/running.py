@@ -44,6 +44,8 @@ class Outcome:
 BLINK_S = 0.2  # between two looks at the window, which is drawn anew then
 Steps = Iterator[Step]  # a generator that returns an `Outcome`
 
+_beside: list[bpy.types.Operator] = []  # what goes on beside the window
+
 
 class Running:
     """Mixed into an operator that has ``steps``, and ``filepath`` or ``directory`` among its properties.
@@ -85,6 +87,7 @@ class Running:
         manager.progress_begin(0, 1)
         manager.modal_handler_add(self)
         self._timer = manager.event_timer_add(0.01, window=context.window)
+        begin(self)
         _say(context, f"{self.work}: begins; Esc stops")
         return {"RUNNING_MODAL"}
 
@@ -144,10 +147,27 @@ class Running:
             _say(context, f"{self.work}: {step.what}{stands}")
 
     def _end(self, context):
+        end(self)
         context.window_manager.event_timer_remove(self._timer)
         self._timer = None
         context.window_manager.progress_end()
         _say(context, None)
+
+
+def begin(operator: bpy.types.Operator) -> None:
+    """Note that an operator goes on beside the window, for `stop_all`."""
+    _beside.append(operator)
+
+
+def end(operator: bpy.types.Operator) -> None:
+    """Forget an operator that has ended."""
+    _beside[:] = [other for other in _beside if other is not operator]
+
+
+def stop_all(context: bpy.types.Context) -> None:
+    """Stop what goes on beside the window, as Esc does. Blender itself does not where an operator's class goes."""
+    for operator in list(_beside):
+        operator.cancel(context)
 
 
 @contextmanager

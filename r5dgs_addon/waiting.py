@@ -3,7 +3,7 @@
 import bpy
 
 from ..r5dgs_core import errors
-from . import worker
+from . import running, worker
 
 
 class Waiting:
@@ -26,6 +26,7 @@ class Waiting:
             return {"CANCELLED"}
         self._timer = context.window_manager.event_timer_add(0.1, window=context.window)
         context.window_manager.modal_handler_add(self)
+        running.begin(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
@@ -64,6 +65,7 @@ class Waiting:
             return {"CANCELLED"}
 
     def _leave(self, context):
+        running.end(self)
         context.window_manager.event_timer_remove(self._timer)
         _say(context, None)
         for window in context.window_manager.windows:

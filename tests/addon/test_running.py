@@ -118,6 +118,28 @@ def test_esc_leaves_the_window_as_it_was_even_where_undoing_the_steps_fails(runn
     assert tidy(window)
 
 
+def test_what_runs_beside_the_window_is_stopped_before_the_extension_goes(running, extension, monkeypatch):
+    closed = []
+
+    def steps():
+        try:
+            while True:
+                yield running.Step(0, 9, "frame", slow=True)
+        finally:
+            closed.append(True)
+
+    stop, window = running.stop_all, None
+    monkeypatch.setattr(running, "stop_all", lambda context: stop(window))  # the module bpy has no window
+    operator, window, _ = begin(running, steps())
+    blink(operator, window)
+    assert not closed
+    extension.unregister()
+    extension.register()
+    assert closed == [True] and tidy(window)
+    stop(window)
+    assert window.timers == 0, "it was stopped twice"
+
+
 @pytest.mark.parametrize("error", [errors.ConfigError("expected another"), ZeroDivisionError()])
 def test_an_error_leaves_the_window_as_it_was(running, error):
     def steps():
