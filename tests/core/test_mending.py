@@ -1,0 +1,72 @@
+"""Mending: objects without a segment of their own take pixels from the one they lie in, and outlines stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("scipy")
+
+from r5dgs_core.data.masks import UNKNOWN  # noqa: E402
+from r5dgs_core.semantics import association, bags, mending  # noqa: E402
+
+SIZE, TIMES = 24, 6
+PIXELS = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)  # of a scene in which every pixel shows a Gaussian of its own
+
+
+def truth() -> np.ndarray:
+    """Two squares that touch, and one by itself. [H, W]"""
+    mask = np.zeros((SIZE, SIZE), np.int32)
+    mask[2:10, 2:10], mask[2:10, 10:18], mask[14:20, 4:10] = 1, 2, 3
+    return mask
+
+
+def mended(masks: list[np.ndarray]) -> list[np.ndarray]:
+    """Associate and mend masks of one view over time."""
+    indices, weights = PIXELS.reshape(-1, 1), np.ones((SIZE * SIZE, 1))
+    given = [bags.from_pixels(mask, indices, weights, SIZE * SIZE, view=0, time=t) for t, mask in enumerate(masks)]
+    found = association.associate(given)
+    out = []
+    for k, (seen, shares) in enumerate(mending.shares(given, found)):
+        drawn = np.zeros((SIZE * SIZE, shares.shape[1]), np.float32)
+        drawn[seen] = shares
+        out.append(mending.mend(masks[k], given[k].ids, drawn.reshape(SIZE, SIZE, -1), found, k))
+    return out
+
+
+def test_right_masks_stay_as_they_are():
+    for mask in mended([truth() for _ in range(TIMES)]):
+        np.testing.assert_array_equal(mask, truth())
+
+
+def test_what_was_missed_is_filled():
+    masks = [truth() for _ in range(TIMES)]
+    masks[3][masks[3] == 3] = 0
+    np.testing.assert_array_equal(mended(masks)[3], truth())
+
+
+def test_what_was_run_together_is_parted():
+    masks = [truth() for _ in range(TIMES)]
+    masks[2][masks[2] == 2] = 1
+    np.testing.assert_array_equal(mended(masks)[2], truth())
+
+
+def test_outlines_of_segments_stay_even_where_votes_say_otherwise():
+    masks = [truth() for _ in range(TIMES)]
+    masks[4][2:10, 9] = 2  # a column of object 1
+    masks[4][14:20, 10] = 3  # a column of background
+    np.testing.assert_array_equal(mended(masks)[4], masks[4])
+
+
+def test_an_object_that_nothing_shows_takes_no_pixel():
+    masks = [truth() for _ in range(TIMES)]
+    masks[0][masks[0] == 3] = UNKNOWN
+    out = mended(masks)[0]
+    assert (out[truth() == 3] == UNKNOWN).all()
+    np.testing.assert_array_equal(out[truth() != 3], truth()[truth() != 3])
+
+
+def test_relabelling_follows_the_ids_and_knows_no_others():
+    mask = np.array([[0, 5], [9, UNKNOWN]])
+    new = mending.relabel(mask, np.array([0, 5, 9]), np.array([0, 2, 7]))
+    assert new.tolist() == [[0, 2], [7, UNKNOWN]]
