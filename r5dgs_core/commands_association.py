@@ -76,6 +76,8 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
         f"{segments} segments in {images} images: {relabelled} relabelled, {unknown} unknown, {kept} kept; "
         f"{len(summary['objects'])} objects"
     )
+    if summary["mended"]:
+        print(f"in {summary['mended']} images objects that had no segment got pixels, as the other images show them")
     print(
         f"segments agree with what other images show of their objects to {summary['agreement']:.2f} (IoU); "
         f"with the incoming ids to {summary['agreement_before']:.2f}"

@@ -24,7 +24,9 @@ class Assignment:
 
     Attributes:
         labels: Object of each, 0 = background, -1 = none. [S]
-        scores: Leave-one-out IoU with it, in shares of what is usual for it; 0 where none. [S]
+        scores: Leave-one-out IoU with it and that of its run, in shares of what is usual for it, with the bonus of
+            those that stay; 0 where none. [S]
+        plain: The same without run and bonus. [S]
         margins: Score over the sum of it and that of the next best object: 0.5 is a draw. [S]
         agreement: Mean leave-one-out IoU of the objects' pixels: what to compare assignments by.
         usual_iou: Median leave-one-out IoU of the segments that had an object before.
@@ -32,6 +34,7 @@ class Assignment:
 
     labels: np.ndarray
     scores: np.ndarray
+    plain: np.ndarray
     margins: np.ndarray
     agreement: float
     usual_iou: float
@@ -66,9 +69,9 @@ def assign(stack: bags.Stack, runs: np.ndarray, labels: np.ndarray, count: int) 
     for k in range(1, count + 1):
         mine = ious[own[labels[own] == k], k]
         usual[k] = (mine.sum() + 2 * usual[0]) / (len(mine) + 2)
-    scores = ious / np.maximum(usual, 1e-6)
+    plain = ious / np.maximum(usual, 1e-6)
     # The worse segments agree with what the other images say, the more the whole run is asked.
-    scores = usual[0] * scores + (1 - usual[0]) * _run_means(scores, runs, stack.pixels)
+    scores = usual[0] * plain + (1 - usual[0]) * _run_means(plain, runs, stack.pixels)
     scores[own, labels[own]] *= STAY
     scores[:, 0] = 0.0
     result = np.where(stack.ids > 0, -1, 0)
@@ -88,7 +91,8 @@ def assign(stack: bags.Stack, runs: np.ndarray, labels: np.ndarray, count: int) 
             reached[row] = scores[row, k]
             others = np.delete(scores[row], k).max(initial=0.0)
             margins[row] = reached[row] / max(reached[row] + others, 1e-9)
-    return Assignment(result, reached, margins, _agreement(stack, ious, labels), float(usual[0]))
+    own = np.where(result > 0, np.take_along_axis(plain, np.maximum(result, 0)[:, None], axis=1)[:, 0], 0.0)
+    return Assignment(result, reached, own, margins, _agreement(stack, ious, labels), float(usual[0]))
 
 
 def measure(stack: bags.Stack, labels: np.ndarray, count: int) -> Assignment:
@@ -98,9 +102,9 @@ def measure(stack: bags.Stack, labels: np.ndarray, count: int) -> Assignment:
     scores = np.zeros(len(labels))
     scores[own] = ious[own, labels[own]]
     usual = float(np.median(scores[own])) if len(own) else 0.0
-    return Assignment(
-        labels, scores / max(usual, 1e-6), np.full(len(labels), 0.5), _agreement(stack, ious, labels), usual
-    )
+    plain = scores / max(usual, 1e-6)
+    margins = np.full(len(labels), 0.5)
+    return Assignment(labels, plain, plain, margins, _agreement(stack, ious, labels), usual)
 
 
 def _agreement(stack: bags.Stack, ious: np.ndarray, labels: np.ndarray) -> float:

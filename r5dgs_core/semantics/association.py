@@ -236,7 +236,7 @@ def _result(
                 new_id=int(ids[row]),
                 usual_id=int(usual[row]),
                 pixels=int(stack.pixels[row]),
-                score=float(found.scores[row]),
+                score=float(found.plain[row]),
                 done=done,
             )
         )
@@ -260,4 +260,4 @@ def _untouched(stack: bags.Stack, found: assignment.Assignment, confident: float
 
 def _plain(stack: bags.Stack, agreement: float) -> assignment.Assignment:
     nothing = np.zeros(len(stack.ids))
-    return assignment.Assignment(np.zeros(len(stack.ids), int), nothing, nothing, agreement, 0.0)
+    return assignment.Assignment(np.zeros(len(stack.ids), int), nothing, nothing, nothing, agreement, 0.0)

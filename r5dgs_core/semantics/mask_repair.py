@@ -19,7 +19,7 @@ from ..data import mask_notes, masks
 from ..data.annotations import OBJECTS
 from ..scene import files
 from ..scene.scene import Scene
-from . import association, drawn_bags
+from . import association, drawn_bags, drawn_votes, mending
 
 NEIGHBOURS = 8
 TIMES = 16  # at most, of which places of the Gaussians are compared
@@ -33,22 +33,26 @@ class Repair:
     Attributes:
         views: Views with masks, in the order of the association's images.
         incoming: Their masks as they were. Of [H, W]
-        result: New ids.
+        result: New ids of segments.
+        mended: New masks, in which objects without a segment of their own may have taken pixels. Of [H, W] uint16
         own_ids: Whether the new ids are the folder's own: those of the data set held within single videos.
     """
 
     views: tuple[datasets.View, ...]
     incoming: tuple[np.ndarray, ...]
     result: association.Association
+    mended: tuple[np.ndarray, ...]
     own_ids: bool
 
     def mask(self, index: int) -> np.ndarray:
         """New ids of a view; pixels that were unknown stay so. [H, W] int32"""
+        return self.mended[index].astype(np.int32)
+
+    def filled(self, index: int) -> int:
+        """Pixels of a view that went to another object than the rest of their segment, or than the background."""
         old = self.incoming[index]
-        ids = np.unique(old)
-        new = np.full(len(ids), masks.UNKNOWN, np.int32)
-        new[ids != masks.UNKNOWN] = self.result.ids[index]
-        return new[np.searchsorted(ids, old)]
+        ids = np.unique(old[old != masks.UNKNOWN])
+        return int((mending.relabel(old, ids, self.result.ids[index]) != self.mended[index]).sum())
 
 
 def repair(
@@ -93,7 +97,9 @@ def repair(
     result = association.associate(
         images, neighbours.reshape(len(scene.means), -1)[:, 1:], paths=drawn_bags.paths(scene, some)
     )
-    return Repair(views, incoming, result, own_ids=any(view.mask_video for view in views))
+    made = drawn_votes.mend(scene, views, incoming, images, result, backend=backend)
+    mended = tuple(mask.astype(np.uint16) for mask in made)
+    return Repair(views, incoming, result, mended, own_ids=any(view.mask_video for view in views))
 
 
 def write(done: Repair, folder: Path, names: dict[int, str] | None, made_with: dict[str, Any]) -> None:
@@ -142,6 +148,7 @@ def summary(done: Repair) -> dict[str, Any]:
         "images": len(done.views),
         "segments": len(result.rows),
         **counts,
+        "mended": sum(done.filled(index) > 0 for index in range(len(done.views))),
         "objects": [int(k) for k in result.objects],
         "confident": round(result.confident, 4),
         "agreement": round(result.agreement, 4),

@@ -50,14 +50,14 @@ def mend(
         New ids, 0 = background, `masks.UNKNOWN` = unknown. [H, W] int32
     """
     out = relabel(mask, ids, found.ids[image])
-    if found.fallback or found.usual_iou < TRUSTED:
+    if not trusts(found):
         return out
     names = np.concatenate([[0], found.objects])
     shown = names[drawn.argmax(axis=-1)]
     shown[drawn.sum(axis=-1) <= 0] = 0
     sizes = _sizes(found)
     result = out.copy()
-    for name in found.objects[~np.isin(found.objects, found.ids[image])]:
+    for name in lacks(found, image):
         where = shown == name
         if where.sum() < LEAST * sizes.get(int(name), np.inf):
             continue
@@ -66,6 +66,16 @@ def mend(
         if counts[best] >= WITHIN * counts.sum() and segments[best] != masks.UNKNOWN:
             result[where & (mask == segments[best])] = name
     return result
+
+
+def trusts(found: association.Association) -> bool:
+    """Whether votes are near enough to outlines for pixels to be given away by them."""
+    return not found.fallback and found.usual_iou >= TRUSTED
+
+
+def lacks(found: association.Association, image: int) -> list[int]:
+    """Objects that have no segment in an image."""
+    return found.objects[~np.isin(found.objects, found.ids[image])].tolist()
 
 
 def relabel(mask: np.ndarray, ids: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -92,6 +92,23 @@ def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, c
     assert summary["agreement"] > summary["agreement_before"]
 
 
+def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path, capsys):
+    folder, out = tmp_path / "missed", tmp_path / "out"
+    data = rewrite(
+        tiny.root, folder, lambda view, ids: np.where(ids == 1, 0, ids) if view.name == "train/r_008" else ids
+    )
+    commands_association.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+    for view, true in zip(datasets.read(tiny.root, str(out)).train, data.train, strict=True):
+        new, ids = datasets.load_mask(view), datasets.load_mask(true)
+        if view.name == "train/r_008":
+            assert ((new == 1) & (ids == 1)).sum() > 0.7 * ((new == 1) | (ids == 1)).sum() > 0
+            assert (new[ids == 2] == 2).all()
+        else:
+            np.testing.assert_array_equal(new, ids)
+    assert "in 1 images objects that had no segment got pixels" in capsys.readouterr().out
+    assert json.loads((out / mask_repair.SUMMARY).read_text())["mended"] == 1
+
+
 def test_a_scene_file_does_as_well_as_its_run(baked, trained, tiny, switched, tmp_path):
     scene_file.write(baked, tmp_path / "scene.r5dgs")
     one = commands_association.run_associate(

@@ -1,0 +1,53 @@
+"""What the other images say of a view's pixels, drawn, and the view's mask mended by it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..raster import scene_render
+from ..scene import playback
+from ..scene.scene import Scene
+from . import association, bags, mending
+
+
+def mend(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    masks: Sequence[np.ndarray],
+    images: Sequence[bags.ImageBags],
+    found: association.Association,
+    *,
+    backend: str = "auto",
+) -> Iterator[np.ndarray]:
+    """Mend the masks of views one by one.
+
+    Args:
+        scene: The scene that the bags were drawn from.
+        views: Its views.
+        masks: Their incoming ids. Of [H, W]
+        images: Their bags.
+        found: What became of them.
+        backend: Rasterizer.
+
+    Yields:
+        New ids of the next view, see `mending.mend`. [H, W] int32
+    """
+    if not mending.trusts(found):
+        for image, (mask, bag) in enumerate(zip(masks, images, strict=True)):
+            yield mending.relabel(mask, bag.ids, found.ids[image])
+        return
+    shares = mending.shares(images, found)
+    for image, (view, mask, (seen, part)) in enumerate(zip(views, masks, shares, strict=True)):
+        if not mending.lacks(found, image):
+            yield mending.relabel(mask, images[image].ids, found.ids[image])
+            continue
+        channels = np.zeros((len(scene.means), part.shape[1]), np.float32)
+        channels[seen] = part
+        drawn = scene_render.render_frame(
+            scene, playback.frame(scene, view.t), view.camera, background=None, backend=backend, features=channels
+        ).features
+        assert drawn is not None
+        yield mending.mend(mask, images[image].ids, drawn.numpy(), found, image)
