@@ -39,7 +39,7 @@ class Job:
         self._started = time.monotonic()
         self._answer: Answer | None = None
         self._error: BaseException | None = None
-        self._begun = False
+        self._begun = self._ended = False
         self._ending = threading.Event()
         self._guard = threading.Lock()
         self._thread = threading.Thread(target=self._run, args=(choice, steps), name="r5dgs worker job", daemon=True)
@@ -53,7 +53,7 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether `answer` returns at once."""
-        return self.dropped or not self._thread.is_alive()
+        return self.dropped or self._ended
 
     @property
     def seconds(self) -> float:
@@ -115,6 +115,8 @@ class Job:
                     self._answer = running.request(command, choice.timeout_s, **arguments)
             except BaseException as error:  # raised again where the answer is asked for
                 self._error = error
+            finally:  # before the next one's turn: the thread itself may take a moment more
+                self._ended = True
 
 
 _turn = threading.Lock()  # held by who asks the worker
