@@ -87,8 +87,8 @@ def run_query(
     Args:
         path: The scene file.
         text: One or several things.
-        encoder: Folder of the encoder that made the scene's table, or "text"; opened only where names and stored
-            words leave something unanswered.
+        encoder: Folder of the encoder that made the scene's table, or "text", for what names and stored words leave
+            unanswered; another one is refused even where nothing is left.
         threshold: Least score of a match, the usual one where None.
         as_json: Print JSON instead of a table.
 
@@ -239,10 +239,10 @@ def _show(scene: Scene, found: Sequence[Match]) -> None:
 
 
 def _object(scene: Scene, which: str, place: str) -> SceneObject:
-    """The object with an id or a name."""
-    for item in scene.objects:
-        if which in (str(item.id), item.name):
-            return item
+    """The object with an id, or else with a name: a name may be the number of another object."""
+    for known in ({str(item.id): item for item in scene.objects}, {item.name: item for item in scene.objects}):
+        if which in known:
+            return known[which]
     there = ", ".join(f"{item.id} {item.name!r}" for item in scene.objects)
     raise errors.ConfigError(f"{place}: expected an object of the scene, found {which!r}; there are {there}")
 

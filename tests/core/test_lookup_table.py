@@ -337,6 +337,13 @@ def test_naming_an_object_changes_that_alone(file, capsys):
     assert scene_file.read(file).object(3).aliases == ("snack", "bun")
 
 
+def test_an_id_is_no_name_of_another_object(file):
+    assert cli.main(["name", str(file), "1", "3"]) == 0  # object 1 is called "3" now
+    assert cli.main(["name", str(file), "3", "donut"]) == 0
+    after = scene_file.read(file)
+    assert (after.object(1).name, after.object(3).name) == ("3", "donut")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
