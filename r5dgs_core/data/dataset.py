@@ -194,9 +194,7 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         for file in (view.image_path, view.mask_path):
             if file is not None:
                 hasher.update(_fingerprint(root, file))
-    own_ids = (
-        folders["train"] is not None and folders["train"] != root / MASKS and (folders["train"] / OBJECTS).exists()
-    )
+    own_ids = folders["train"] is not None and (folders["train"] / OBJECTS).exists()
     names, aliases = read_objects(folders["train"] if own_ids else root)
     convention = header.get("world_convention", "blender")
     if convention not in cameras.WORLD_TO_BLENDER:
@@ -294,10 +292,13 @@ class _CameraNames:
 
 
 def _mask_folder(root: Path, name: str) -> Path | None:
-    """Where the training views' masks are; None for none of them."""
+    """Where the training views' masks are; None for none of them. The data set's own folder has one name, however it
+    is called: masks that are coded by colour are numbered together there."""
     if name == NO_MASKS:
         return None
     folder = root / name  # an absolute path stays one
+    if folder.resolve() == (root / MASKS).resolve():
+        return root / MASKS
     if name != MASKS and not folder.is_dir():
         raise errors.DatasetError(f"{folder}: no such folder of masks; give another with --masks, or 'none'")
     return folder

@@ -253,6 +253,19 @@ def test_masks_coded_by_colour_agree_between_splits(flat):
     assert dataset.load_mask(data.test[0])[0, :2].tolist() == [2, 1]
 
 
+def test_the_data_sets_own_masks_are_those_by_whatever_path(flat, tmp_path):
+    """Colours are numbered over all splits then, too."""
+    for path in (flat / "object_mask").rglob("*.png"):
+        path.unlink()
+    for split, color in (("train", (0, 0, 9)), ("test", (0, 0, 5))):
+        images.write_png(flat / "object_mask" / split / "r_000.png", np.full((HEIGHT, WIDTH, 3), color, np.uint8))
+    (tmp_path / "link").symlink_to(flat)
+    for path in (flat / "object_mask", tmp_path / "link" / "object_mask", flat / "train" / ".." / "object_mask"):
+        data = dataset.read(flat, str(path))
+        assert (dataset.load_mask(data.train[0])[0, 0], dataset.load_mask(data.test[0])[0, 0]) == (2, 1)
+        assert data.digest == dataset.read(flat).digest
+
+
 def test_transparent_pixels_show_the_background(flat):
     pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     pixels[..., 0], pixels[..., 3] = 200, 51
