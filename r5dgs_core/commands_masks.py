@@ -57,6 +57,7 @@ def run_masks(
         Interrupted: Ctrl-C; what is done is kept.
     """
     from .data import dataset as datasets
+    from .data import mask_notes
     from .progress import make
     from .semantics import mask_making
 
@@ -84,6 +85,12 @@ def run_masks(
         else:
             maker = mask_folders.Precomputed(own if source is not None else own / datasets.MASKS, views, unknown)
         in_place = maker.folder.resolve() == folder.resolve()
+        if in_place and unknown is not None and unknown != mask_notes.read(folder).unknown:
+            raise errors.ConfigError(
+                f"--unknown {unknown}: nothing would be written here, and training would not know it. Remedy: name a "
+                f'folder with --out, or say it in {folder / mask_notes.FILE}: {{"format_version": 1, "unknown": '
+                f"{unknown}}}"
+            )
     with make(progress_kind) as progress:
         if in_place:
             made = mask_making.check(views, maker, folder, progress=progress)

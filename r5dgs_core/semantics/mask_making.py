@@ -104,8 +104,12 @@ def make(
     )
     count = _Count()
 
-    def keep(view: datasets.View, ids: np.ndarray) -> None:
-        masks.write(folder / f"{view.name}.png", ids)
+    def keep(view: datasets.View, ids: np.ndarray | None) -> None:
+        path = folder / f"{view.name}.png"
+        if ids is None:
+            _remove(path)  # one of other masks would be read with these
+        else:
+            masks.write(path, ids)
 
     for video, found in _labelled(todo, backend, folder, count, keep, progress):
         notes = dataclasses.replace(notes, videos={**notes.videos, video.name: found})
@@ -142,7 +146,7 @@ def _labelled(
     backend: MaskBackend,
     room: Path,
     count: _Count,
-    keep: Callable[[datasets.View, np.ndarray], None],
+    keep: Callable[[datasets.View, np.ndarray | None], None],
     progress: Progress | None,
 ) -> Iterator[tuple[videos.Video, mask_notes.Video]]:
     """Make the masks of videos one after the other; gives each video when it is done, with what was found."""
@@ -161,9 +165,9 @@ def _labelled(
         seen: set[int] = set()
         images = []
         for view, ids in zip(video.views, backend.label(video, room, report), strict=True):
+            keep(view, ids)
             if ids is None:
                 continue
-            keep(view, ids)
             images.append(view.name)
             seen.update(np.unique(ids).tolist())
             count.pixels += ids.size
@@ -227,7 +231,15 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be made: {error}") from error
     mask_notes.write(fresh, folder)
+    _remove(folder / OBJECTS)  # names of the ids that stood here
     return fresh
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: cannot be removed: {error}") from error
 
 
 def _is_done(video: videos.Video, notes: mask_notes.MaskNotes, folder: Path) -> bool:

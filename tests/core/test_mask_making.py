@@ -212,3 +212,37 @@ def test_a_folder_without_masks_is_named(tiny, tmp_path):
         mask_folders.Precomputed(tmp_path, views)
     with pytest.raises(errors.DatasetError, match="expected a folder of masks"):
         mask_folders.Precomputed(tmp_path / "gone", views)
+
+
+def test_masks_that_a_backend_does_not_make_leave_nothing_of_others_behind(copied, tmp_path):
+    """A mask of another numbering that stays among new ones would be read with them, and so would names of its ids."""
+    views = datasets.read(copied).train
+    source, out = tmp_path / "theirs", tmp_path / "out"
+    shutil.copytree(copied / "object_mask", source)
+    (source / f"{views[4].name}.png").unlink()
+    alone = [view for view in views if view.camera.name == views[4].camera.name]
+    mask_making.make(alone, Numbered(), out)
+    assert (out / "objects.json").exists()
+    commands_masks.run_masks(copied, source=source, out=out, overwrite=True)
+    made = datasets.read(copied, str(out))
+    assert [view.name for view in made.train if view.mask_path is None] == [views[4].name]
+    assert made.object_names == datasets.read(copied).object_names
+
+
+def test_255_is_not_called_unknown_where_nothing_is_written(copied):
+    """Training would read it as an object all the same."""
+    with pytest.raises(
+        errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or say it in .*masks"
+    ):
+        commands_masks.run_masks(copied, unknown=255)
+    (copied / "object_mask" / "masks.json").write_text('{"format_version": 1, "unknown": 255}')
+    assert commands_masks.run_masks(copied, unknown=255).images == 36
+
+
+def test_names_of_the_ids_of_one_video_hold_in_the_data_sets_own_folder_too(copied):
+    shutil.rmtree(copied / "object_mask")
+    views = datasets.read(copied).train
+    alone = [view for view in views if view.camera.name == views[0].camera.name]
+    mask_making.make(alone, Numbered(), copied / "object_mask")
+    data = datasets.read(copied)
+    assert data.object_names == {k: f"object {k}" for k in range(1, 7)} and data.ground_truth is None
