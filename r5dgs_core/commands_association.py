@@ -54,10 +54,12 @@ def run_associate(
         assert dataset.mask_folder is not None
         if folder == dataset.mask_folder.resolve():
             raise errors.ConfigError(f"--out {folder}: holds the incoming masks; name another folder")
+        mask_repair.check_place(folder, dataset.train)
         done = mask_repair.repair(scene, dataset, progress=progress)
         names = {} if done.own_ids else dataset.object_names if dataset.own_ids else None
         made_with = {"scene": str(target.resolve()), "masks": str(dataset.mask_folder.resolve())}
-        mask_repair.write(done, folder, names, made_with)
+        unmasked = [view for view in dataset.train if view.mask_path is None]
+        mask_repair.write(done, folder, names, made_with, unmasked)
         summary = mask_repair.summary(done)
         if progress_kind == "json":
             progress({"event": "associated", "path": str(folder), **summary})
@@ -90,4 +92,8 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
         print(f"  {done.views[row.image].name}: {row.old_id} -> {new} ({row.pixels} pixels, score {row.score:.2f})")
     if len(changed) > SHOWN:
         print(f"  and {len(changed) - SHOWN} more in {folder / mask_repair.SEGMENTS}")
-    print(f"written: {folder}\nNext: r5dgs train {root} --masks {folder} --out RUN")
+    print(f"written: {folder}")
+    if done.numbering == "scene":
+        print(f"Next: r5dgs train {root} --masks {folder} --out RUN")
+    else:
+        print("ids still hold within single videos, which is nothing to train with: try a run of more steps or images")

@@ -36,9 +36,11 @@ def draw(
         progress: Called with the number of views that are done.
 
     Returns:
-        Bags of the views, in their order; images of one video belong together.
+        Bags of the views, in their order; images of one video belong together, as far as their masks were numbered
+        together.
     """
-    video_of = {view.name: k for k, video in enumerate(videos.of(views)) for view in video.views}
+    video_of = {view.name: (video.name, view.mask_video) for video in videos.of(views) for view in video.views}
+    number = {which: k for k, which in enumerate(dict.fromkeys(video_of.values()))}
     drawn = []
     for done, (view, mask) in enumerate(zip(views, masks, strict=True)):
         posed = scene_render.pose_frame(scene, playback.frame(scene, view.t))
@@ -58,7 +60,9 @@ def draw(
         ).numpy()
         weights = np.where(weights >= LEAST, weights, 0)[:, known]
         rows = sparse.csr_matrix(weights.T.astype(np.float32))
-        drawn.append(bags.ImageBags(ids[known].astype(np.int32), pixels[known], rows, video_of[view.name], view.t))
+        drawn.append(
+            bags.ImageBags(ids[known].astype(np.int32), pixels[known], rows, number[video_of[view.name]], view.t)
+        )
         if progress is not None:
             progress(done + 1)
     return drawn

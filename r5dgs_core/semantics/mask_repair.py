@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from . import association, drawn_bags, drawn_votes, mending
 
 NEIGHBOURS = 8
 TIMES = 16  # at most, of which places of the Gaussians are compared
+BACKEND = "associate"  # in masks.json
 SEGMENTS, SUMMARY = "segments.csv", "association.json"
 
 
@@ -43,6 +45,12 @@ class Repair:
     result: association.Association
     mended: tuple[np.ndarray, ...]
     own_ids: bool
+
+    @property
+    def numbering(self) -> str:
+        """Where the new ids hold, as in `mask_notes`: those that stay hold within their videos, as before."""
+        apart = self.result.fallback and len({view.mask_video for view in self.views}) > 1
+        return mask_notes.VIDEO if apart else mask_notes.SCENE
 
     def mask(self, index: int) -> np.ndarray:
         """New ids of a view; pixels that were unknown stay so. [H, W] int32"""
@@ -102,7 +110,25 @@ def repair(
     return Repair(views, incoming, result, mended, own_ids=any(view.mask_video for view in views))
 
 
-def write(done: Repair, folder: Path, names: dict[int, str] | None, made_with: dict[str, Any]) -> None:
+def check_place(folder: Path, views: Sequence[datasets.View]) -> None:
+    """Refuse a folder with masks of these views that somebody else made. Raises DatasetError."""
+    if mask_notes.read(folder).backend == BACKEND:
+        return
+    lost = [view.name for view in views if (folder / f"{view.name}.png").exists()]
+    if lost:
+        raise errors.DatasetError(
+            f"{folder}: holds {len(lost)} masks that r5dgs associate did not write, such as {lost[0]}.png; name "
+            "another folder with --out"
+        )
+
+
+def write(
+    done: Repair,
+    folder: Path,
+    names: dict[int, str] | None,
+    made_with: dict[str, Any],
+    unmasked: Sequence[datasets.View] = (),
+) -> None:
     """Write the new masks, the list of segments and what was found of the whole; `train --masks` reads the folder.
 
     Files: the masks by the names of their views; ``segments.csv``, one line for each segment with what became of it,
@@ -115,13 +141,20 @@ def write(done: Repair, folder: Path, names: dict[int, str] | None, made_with: d
         names: Names of ids where they are the folder's own, others are called "object 3"; None where they are those of
             the data set.
         made_with: For ``masks.json``: what the masks were made from.
+        unmasked: Views of the data set without a mask; those that an earlier call wrote of them are removed.
 
     Raises:
         DatasetError: A file cannot be written.
     """
-    notes = mask_notes.MaskNotes(backend="associate", finished=False, made_with=made_with)
-    folder.mkdir(parents=True, exist_ok=True)
-    mask_notes.write(notes, folder)
+    notes = mask_notes.MaskNotes(backend=BACKEND, finished=False, made_with=made_with)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        mask_notes.write(notes, folder)
+        stale = [folder / f"{view.name}.png" for view in unmasked] + ([folder / OBJECTS] if names is None else [])
+        for path in stale:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
     seen: set[int] = set()
     for index, view in enumerate(done.views):
         ids = done.mask(index)
@@ -136,8 +169,23 @@ def write(done: Repair, folder: Path, names: dict[int, str] | None, made_with: d
         files.write(folder / SUMMARY, (json.dumps(summary(done), indent=1) + "\n").encode())
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
-    video = mask_notes.Video(tuple(view.name for view in done.views), tuple(present))
-    mask_notes.write(mask_notes.MaskNotes("associate", videos={"all": video}, made_with=made_with), folder)
+    videos = {"all": mask_notes.Video(tuple(view.name for view in done.views), tuple(present))}
+    if done.numbering == mask_notes.VIDEO:
+        videos = _videos(done)
+    mask_notes.write(dataclasses.replace(notes, numbering=done.numbering, finished=True, videos=videos), folder)
+
+
+def _videos(done: Repair) -> dict[str, mask_notes.Video]:
+    """The videos within which ids that stay hold."""
+    images: dict[str, list[str]] = {}
+    found: dict[str, set[int]] = {}
+    for index, view in enumerate(done.views):
+        images.setdefault(view.mask_video, []).append(view.name)
+        found.setdefault(view.mask_video, set()).update(np.unique(done.mask(index)).tolist())
+    return {
+        name: mask_notes.Video(tuple(some), tuple(sorted(found[name] - {0, masks.UNKNOWN})))
+        for name, some in images.items()
+    }
 
 
 def summary(done: Repair) -> dict[str, Any]:
@@ -155,6 +203,7 @@ def summary(done: Repair) -> dict[str, Any]:
         "agreement_before": round(result.agreement_before, 4),
         "usual_iou": round(result.usual_iou, 4),
         "fallback": result.fallback,
+        "numbering": done.numbering,
     }
 
 

@@ -1,7 +1,9 @@
 """Associating the masks of a data set: one numbering from many, single switches named, nothing else touched."""
 
 import csv
+import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from r5dgs_core import cli, commands_association, errors
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
 from r5dgs_core.scene import scene_file
-from r5dgs_core.semantics import mask_repair
+from r5dgs_core.semantics import association, drawn_bags, mask_repair
 
 
 def rewrite(root, folder, change):
@@ -134,3 +136,52 @@ def test_a_scene_file_alone_is_not_enough(tmp_path):
 def test_no_masks_at_all_is_an_error(baked, tiny):
     with pytest.raises(errors.DatasetError, match="expected masks of training views, found none. Remedy: r5dgs masks"):
         mask_repair.repair(baked, datasets.read(tiny.root, datasets.NO_MASKS))
+
+
+def split_into_videos(root, folder):
+    """Masks that say that each camera's have a numbering of its own."""
+    data = rewrite(root, folder, lambda view, ids: exchanged(ids) if view.camera.name.endswith("1") else ids)
+    names = sorted({view.camera.name for view in data.train})
+    videos = {
+        name: mask_notes.Video(tuple(v.name for v in data.train if v.camera.name == name), (1, 2)) for name in names
+    }
+    mask_notes.write(mask_notes.MaskNotes("tracker", mask_notes.VIDEO, videos=videos), folder)
+    return data, videos
+
+
+def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny, tmp_path, capsys, monkeypatch):
+    """They would be trained with, an object of one video as that of another."""
+    data, videos = split_into_videos(tiny.root, tmp_path / "videos")
+    monkeypatch.setattr(association, "GAIN", 1e9)
+    out = commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=tmp_path / "out")
+    said = capsys.readouterr().out
+    assert "the incoming ids stay" in said and "within single videos" in said and "r5dgs train" not in said
+    assert mask_notes.read(out).videos == videos
+    with pytest.raises(errors.DatasetError, match="hold within a video only"):
+        datasets.read(tiny.root, str(out)).require_one_numbering()
+    assert json.loads((out / mask_repair.SUMMARY).read_text())["numbering"] == "video"
+
+
+def test_images_that_were_numbered_apart_are_so_in_bags(baked, tiny, tmp_path):
+    data, _ = split_into_videos(tiny.root, tmp_path / "videos")
+    first = [view for view in datasets.read(tiny.root).train if view.camera.name == data.train[0].camera.name]
+    parts = [dataclasses.replace(view, mask_video=f"part {k // 3}") for k, view in enumerate(first)]
+    bags = drawn_bags.draw(baked, parts, [datasets.load_mask(view) for view in parts])
+    assert [bag.view for bag in bags] == [0, 0, 0, 1, 1, 1]
+
+
+def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(trained, tiny, switched, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(tiny.root / "object_mask", out)
+    before = {path: path.read_bytes() for path in out.rglob("*.png")}
+    with pytest.raises(errors.DatasetError, match="holds 36 masks that r5dgs associate did not write.*--out"):
+        commands_association.run_associate(trained.folder, masks=switched, out=out)
+    assert before == {path: path.read_bytes() for path in out.rglob("*.png")}
+    shutil.rmtree(out)
+    split_into_videos(tiny.root, tmp_path / "videos")
+    commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    (switched / "train" / "r_004.png").unlink()
+    commands_association.run_associate(trained.folder, masks=switched, out=out)
+    made = datasets.read(tiny.root, str(out))
+    assert [view.name for view in made.train if view.mask_path is None] == ["train/r_004"]
+    assert made.object_names == datasets.read(tiny.root).object_names and made.ground_truth is not None
