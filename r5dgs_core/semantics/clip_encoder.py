@@ -35,10 +35,10 @@ class ClipEncoder:
         encoders.read_json(folder / "preprocessor_config.json")
         paths = encoders.weights_of(folder)
         try:
-            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
-            self._processor = AutoImageProcessor.from_pretrained(str(folder), local_files_only=True, backend="pil")
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), **encoders.LOADING)
+            self._processor = AutoImageProcessor.from_pretrained(str(folder), **encoders.LOADING, backend="pil")
             self._model, info = AutoModel.from_pretrained(
-                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+                str(folder), **encoders.LOADING, use_safetensors=True, output_loading_info=True
             )
         except Exception as error:  # whatever a damaged folder makes of it
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error

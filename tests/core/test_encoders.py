@@ -1,3 +1,4 @@
+import contextlib
 import json
 import os
 import shutil
@@ -266,3 +267,27 @@ def test_a_real_sentence_model_knows_what_things_are():
     encoder = encoders.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
     lemon, fruit, axe = encoders.embed_phrases(encoder, ["lemon", "fruit", "axe"])
     assert lemon @ fruit > lemon @ axe
+
+
+@pytest.mark.parametrize("make", [encoder_folders.clip, encoder_folders.sentences])
+def test_python_in_a_folder_is_neither_run_nor_asked_about(tmp_path, make, monkeypatch):
+    folder, ran = make(tmp_path / "encoder"), tmp_path / "ran"
+    (folder / "custom.py").write_text(f"open({str(ran)!r}, 'w')\n")
+    for name, classes in (
+        ("tokenizer_config.json", {"AutoTokenizer": ["custom.Own", None]}),
+        ("preprocessor_config.json", {"AutoImageProcessor": "custom.Own"}),
+        ("config.json", {"AutoModel": "custom.Own"}),
+    ):
+        if not (folder / name).exists():
+            continue
+        tree = json.loads((folder / name).read_text()) | {"auto_map": classes}
+        tree.pop("image_processor_type", None)  # so that the folder's own class is all that there is
+        (folder / name).write_text(json.dumps(tree))
+
+    def asked(*_):
+        raise AssertionError("asked whether to run code")
+
+    monkeypatch.setattr("builtins.input", asked)
+    with contextlib.suppress(errors.BackendError):
+        encoders.open_encoder(folder)
+    assert not ran.exists()
