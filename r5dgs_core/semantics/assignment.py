@@ -49,11 +49,12 @@ def refine(stack: bags.Stack, runs: np.ndarray, labels: np.ndarray, count: int) 
         labels: Objects to begin with. [S]
         count: Number of objects.
     """
-    for _ in range(PASSES):
-        found = assign(stack, runs, labels, count)
+    found = assign(stack, runs, labels, count)
+    for _ in range(PASSES - 1):
         if (found.labels == labels).all():
             break
         labels = found.labels
+        found = assign(stack, runs, labels, count)
     return found
 
 

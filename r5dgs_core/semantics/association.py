@@ -110,7 +110,7 @@ def associate(
     """
     if not images:
         raise ValueError("expected at least one image")
-    count = images[0].weights.shape[1]
+    count = images[0].weights.get_shape()[1]
     if count > settings.gaussians:
         groups = patches.group(count, neighbours, paths, settings.gaussians)
         images = [replace(image, weights=patches.pool(image.weights, groups)) for image in images]
@@ -138,11 +138,13 @@ def _objects(stack: bags.Stack, runs: np.ndarray, settings: Settings) -> tuple[n
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
     # Once more, with Gaussians that show several objects counting less: those that geometry has beside their object.
-    cast = votes.cast(stack, labels, labels.max()).tocsc()
+    cast = sparse.csc_matrix(votes.cast(stack, labels, int(labels.max())))
     total = np.asarray(cast.sum(axis=1)).ravel()
-    best = cast[:, 1:].max(axis=1).toarray().ravel()
+    best = sparse.csr_matrix(cast[:, 1:].max(axis=1)).toarray().ravel()
     purity = sparse.diags(np.sqrt(best / np.maximum(total, 1e-9)).astype(np.float32))
-    weighed = replace(stack, shared=(stack.shared @ purity).tocsr(), seen=(stack.seen @ purity).tocsr())
+    weighed = replace(
+        stack, shared=sparse.csr_matrix(stack.shared @ purity), seen=sparse.csr_matrix(stack.seen @ purity)
+    )
     of_runs = clustering.cluster(clustering.gather(weighed, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
     fewest = int(np.clip(round(settings.fewest_share * len(stack.views)), 2, 4))

@@ -96,19 +96,19 @@ def stack(bags: Sequence[ImageBags]) -> Stack:
     sqrt(v_i), the weight that segments s and t have in common is the product x_s . x_t, and that of s which t's image
     sees at all is x_s . sqrt(v_j).
     """
-    count = bags[0].weights.shape[1]
+    count = bags[0].weights.get_shape()[1]
     for k, image in enumerate(bags):
         if image.weights.shape != (len(image.ids), count) or np.any(np.diff(image.ids) <= 0):
             raise ValueError(f"image {k}: expected ascending ids and a bag over {count} Gaussians for each of them")
     images = np.repeat(np.arange(len(bags)), [len(image.ids) for image in bags])
-    weights = sparse.vstack([image.weights for image in bags], "csr", np.float32)
+    weights = sparse.csr_matrix(sparse.vstack([image.weights for image in bags], "csr", np.float32))
     members = sparse.csr_matrix((np.ones(len(images), np.float32), (images, np.arange(len(images)))))
     members.resize(len(bags), len(images))
     seen, shared = [], []
     for image in bags:
         total = np.asarray(image.weights.sum(axis=0), np.float32).ravel()
         root = np.sqrt(total)
-        rows = image.weights.astype(np.float32)
+        rows = sparse.csr_matrix(image.weights, dtype=np.float32, copy=True)
         rows.data = rows.data / np.maximum(root[rows.indices], 1e-12)
         shared.append(rows)
         at = np.flatnonzero(total).astype(np.int32)
@@ -120,6 +120,6 @@ def stack(bags: Sequence[ImageBags]) -> Stack:
         times=np.array([image.time for image in bags], float),
         pixels=np.concatenate([image.pixels for image in bags]),
         weights=weights,
-        shared=sparse.vstack(shared, "csr"),
-        seen=sparse.vstack(seen, "csr"),
+        shared=sparse.csr_matrix(sparse.vstack(shared, "csr")),
+        seen=sparse.csr_matrix(sparse.vstack(seen, "csr")),
     )

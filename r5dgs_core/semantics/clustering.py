@@ -65,8 +65,8 @@ def gather(stack: bags.Stack, runs: np.ndarray) -> Evidence:
     lengths = np.bincount(runs[rows], minlength=count)
     first = rows[np.unique(runs[rows], return_index=True)[1]]
     return Evidence(
-        common=(shared @ shared.T).toarray().astype(float),
-        seen=((shared @ stack.seen.T).tocsr() @ images.T).toarray().astype(float),
+        common=sparse.csr_matrix(shared @ shared.T).toarray().astype(float),
+        seen=sparse.csr_matrix(shared @ stack.seen.T @ images.T).toarray().astype(float),
         together=(images @ images.T).toarray(),
         lengths=lengths,
         pixels=np.bincount(runs[rows], stack.pixels[rows], minlength=count) / np.maximum(lengths, 1),

@@ -50,12 +50,12 @@ def pool(weights: sparse.csr_matrix, groups: np.ndarray) -> sparse.csr_matrix:
     """Sum the weights of segments over the Gaussians of each patch. [S, N] -> [S, G]"""
     count = int(groups.max()) + 1
     kept = groups[weights.indices]
-    rows = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    rows = np.repeat(np.arange(len(weights.indptr) - 1), np.diff(weights.indptr))
     keep = kept >= 0
     flat = rows[keep] * np.int64(count) + kept[keep]
     cells, at = np.unique(flat, return_inverse=True)
     sums = np.bincount(at, weights.data[keep], minlength=len(cells)).astype(np.float32)
-    return sparse.csr_matrix((sums, (cells // count, cells % count)), (weights.shape[0], count))
+    return sparse.csr_matrix((sums, (cells // count, cells % count)), (len(weights.indptr) - 1, count))
 
 
 def _together(neighbours: np.ndarray, paths: np.ndarray | None) -> np.ndarray:

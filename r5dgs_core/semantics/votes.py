@@ -63,7 +63,7 @@ def cast(stack: bags.Stack, labels: np.ndarray, count: int) -> sparse.csr_matrix
     """
     rows = np.flatnonzero(labels >= 0)
     member = sparse.csr_matrix((np.ones(len(rows), np.float32), (labels[rows], rows)), (count + 1, len(labels)))
-    return (member @ stack.weights).T.tocsr()
+    return sparse.csr_matrix((member @ stack.weights).T)
 
 
 def overlaps(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
