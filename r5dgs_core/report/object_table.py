@@ -206,9 +206,10 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
 
 
 def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
-    """The same in JSON types: ``{"scene", "views", "hygiene", "objects": [ObjectRow, ...]}``."""
+    """The same in JSON types: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
     objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
-    return {"scene": scene.name, "views": views, "hygiene": hygiene(scene), "objects": objects}
+    cleaned = {"hygiene": hygiene(scene), "label_hygiene": label_hygiene(scene)}
+    return {"scene": scene.name, "views": views, **cleaned, "objects": objects}
 
 
 def hygiene(scene: Scene) -> dict[str, Any] | None:
@@ -219,6 +220,13 @@ def hygiene(scene: Scene) -> dict[str, Any] | None:
         ``to_rest`` (`train.groups.Moves`).
     """
     found = scene.provenance.get("regrouping")
+    return dict(found) if isinstance(found, dict) else None
+
+
+def label_hygiene(scene: Scene) -> dict[str, Any] | None:
+    """What the cleaning of the objects' labels changed in training (`train.label_hygiene.Changes`); None where it did
+    not run."""
+    found = scene.provenance.get("label_hygiene")
     return dict(found) if isinstance(found, dict) else None
 
 
@@ -238,7 +246,12 @@ def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
     found = hygiene(scene)
     if found is not None:
         moved = sum(int(found.get(key, 0)) for key in ("to_bodies", "to_shadows", "to_rest"))
-        parts.append(f"label hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
+        parts.append(f"hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
+    cleaned = label_hygiene(scene)
+    if cleaned is not None:
+        rules = {rule: int(cleaned.get(rule, 0)) for rule in ("neighbours", "motion", "outliers")}
+        by = ", ".join(f"{rule} {count}" for rule, count in rules.items())
+        parts.append(f"hygiene: {sum(rules.values())} of {cleaned.get('gaussians', 0)} labels changed ({by})")
     return "; ".join(parts)
 
 

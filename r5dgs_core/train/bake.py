@@ -24,7 +24,18 @@ from ..motion import fitting, gravity, rotations, top
 from ..motion.models import MotionModel
 from ..scene import residuals, visibility
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
-from . import checkpoint, falling, groups, mask_stack, needs, plain_motion, point_baking, representation, track_checks
+from . import (
+    checkpoint,
+    falling,
+    groups,
+    label_hygiene,
+    mask_stack,
+    needs,
+    plain_motion,
+    point_baking,
+    representation,
+    track_checks,
+)
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -135,6 +146,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         near_plane=NEAR_PLANE * norm.scale,
         **single,
     )
+    cleaned = label_hygiene.changes_of(tensors)
+    if cleaned is not None:
+        scene = dataclasses.replace(scene, provenance=scene.provenance | {"label_hygiene": cleaned})
     if motion.moves is None:
         return scene
     counts = dataclasses.asdict(motion.moves) | {"unexplained": len(residuals.unexplained(scene))}

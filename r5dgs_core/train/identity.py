@@ -44,16 +44,25 @@ def vote(
     Returns:
         The classes. [N] int64
     """
-    masked = spread([v for v in views if v.mask is not None], VOTE_VIEWS)
-    count = max(classes.values(), default=0) + 1
-    weights = torch.zeros(len(fallback), count)
-    for view in masked:
+    return elect(votes(views, pose, classes, len(fallback)), fallback)
+
+
+def elect(weights: Tensor, fallback: Tensor) -> Tensor:
+    """Class with most of some `votes`, and the ``fallback`` [N] where there are none. [N] int64"""
+    return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
+
+
+def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
+    """What each of ``count`` Gaussians contributes to the mask pixels of each class, pixels; see `vote`. [N, C]"""
+    kinds = max(classes.values(), default=0) + 1
+    weights = torch.zeros(count, kinds)
+    for view in spread([v for v in views if v.mask is not None], VOTE_VIEWS):
         target = class_map(view, classes)
         with torch.no_grad():
             splats = pose(view)
         given = (splats.means, splats.quats, splats.scales, splats.opacities)
-        weights += segment_weights(*given, view.camera, target, count)
-    return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
+        weights += segment_weights(*given, view.camera, target, kinds)
+    return weights
 
 
 def train_encodings(

@@ -18,7 +18,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, mask_stack, needs, probing, representation, stopping
+from . import checkpoint, curves, identity, label_hygiene, mask_stack, needs, probing, representation, stopping
 from . import config as configs
 from .config import Config
 from .posing import Splats
@@ -255,7 +255,8 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
             return trainer.splats(view.camera, view.t)
 
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})
-        extra["labels"] = identity.vote(trainer.views, pose, classes, fallback)
+        votes = identity.votes(trainer.views, pose, classes, len(fallback))
+        extra["labels"] = identity.elect(votes, fallback)
         steps, started = _identity_steps(trainer), time.monotonic()
         if trainer.identity is not None:
             extra |= trainer.identity.outcome(trainer.gaussians)
@@ -280,6 +281,9 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
                 report,
             )
             extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
+        if trainer.config.identity.hygiene and len(classes) > 1:
+            # After the encodings, which follow the masks' edges by themselves: the labels say what goes with what.
+            extra |= _cleaned(trainer, votes, extra["labels"])
     elif trainer.motion.name == representation.FIELD and needs.sorting(trainer.dataset, trainer.config):
         from . import discovery
 
@@ -289,6 +293,30 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
         progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), mask_stack.LABELS: labels}
     _save(trainer, run, began, finished=True, extra=extra)
+
+
+def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Labels after hygiene, and what it changed, by the names of the checkpoint."""
+    given, ids = labels.numpy(), trainer.gaussians.motion_ids
+    params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
+    tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
+    motion = representation.observed_motion(
+        trainer.motion.name,
+        tensors | {"gaussians.motion_ids": ids},
+        trainer.object_ids,
+        trainer.places.measured,
+        given,
+        trainer.config,
+    )
+    gaussians = {name: tensor.numpy() for name, tensor in params.items()} | (motion.gaussians or {})
+    group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
+    points = label_hygiene.bound(motion.groups, group_ids, gaussians["means"])
+    going, moving = label_hygiene.companions(motion.groups, group_ids, points, trainer.object_ids)
+    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].astype(np.float64)))
+    found, changes = label_hygiene.clean(votes.numpy(), given, points, opacities, going, moving)
+    counts = dataclasses.astuple(changes)
+    log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)
+    return {"labels": torch.from_numpy(found), label_hygiene.CHANGES: torch.tensor(counts)}
 
 
 def _save(

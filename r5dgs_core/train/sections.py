@@ -376,6 +376,7 @@ class IdentitySection:
         include_self: Whether L_3d counts a Gaussian among its own neighbours, as Gaussian Grouping does; "auto" does
             in a ``field``.
         samples: Gaussians that are compared with theirs each time.
+        hygiene: Whether labels that the masks leave undecided follow neighbours and motion (`label_hygiene.py`).
     """
 
     training: str = "after"
@@ -390,6 +391,7 @@ class IdentitySection:
     neighbours: int = 5
     include_self: str = "auto"
     samples: int = 1000
+    hygiene: bool = True
 
 
 @dataclass(frozen=True)
