@@ -243,8 +243,8 @@ def _remove(path: Path) -> None:
 
 
 def _is_done(video: videos.Video, notes: mask_notes.MaskNotes, folder: Path) -> bool:
-    """Whether the folder holds all masks of a video that the notes know."""
+    """Whether the folder holds masks of all images of a video, none of which joined it or left it since."""
     known = notes.videos.get(video.name)
-    if known is None or not set(known.images) <= {view.name for view in video.views}:
+    if known is None or set(known.images) != {view.name for view in video.views}:
         return False
     return all((folder / f"{name}.png").is_file() for name in known.images)

@@ -246,3 +246,11 @@ def test_names_of_the_ids_of_one_video_hold_in_the_data_sets_own_folder_too(copi
     mask_making.make(alone, Numbered(), copied / "object_mask")
     data = datasets.read(copied)
     assert data.object_names == {k: f"object {k}" for k in range(1, 7)} and data.ground_truth is None
+
+
+def test_a_video_that_got_more_images_is_made_again(views, tmp_path):
+    some = [view for view in views if view.name != views[4].name]
+    mask_making.make(some, Numbered(), tmp_path)
+    again = Numbered()
+    assert mask_making.make(views, again, tmp_path).images == 36
+    assert again.asked == [views[4].camera.name]
