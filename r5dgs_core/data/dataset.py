@@ -194,8 +194,9 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         for file in (view.image_path, view.mask_path):
             if file is not None:
                 hasher.update(_fingerprint(root, file))
-    own_ids = folders["train"] is not None and (folders["train"] / OBJECTS).exists()
-    names, aliases = read_objects(folders["train"] if own_ids else root)
+    mask_folder = folders["train"]
+    own_ids = mask_folder is not None and (mask_folder / OBJECTS).exists()
+    names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
     convention = header.get("world_convention", "blender")
     if convention not in cameras.WORLD_TO_BLENDER:
         raise errors.DatasetError(
@@ -221,7 +222,7 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         digest=hasher.hexdigest(),
         points=None if reconstruction is None else reconstruction.points,
         point_colors=None if reconstruction is None else reconstruction.colors,
-        mask_folder=folders["train"],
+        mask_folder=mask_folder,
         own_ids=own_ids,
     )
 
@@ -351,7 +352,7 @@ def _attach_notes(views: tuple[View, ...], folder: Path | None, hasher: Any) -> 
     notes = mask_notes.read(folder)
     hasher.update(f"{notes.numbering} {notes.unknown}".encode())
     if not notes.finished:
-        _log.warning("%s: masks are missing; give the command of r5dgs masks again, it goes on", folder)
+        _log.warning("%s: masks are missing; give the command that makes them again", folder)
     videos = notes.video_of()
     lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
     return tuple(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .. import errors
 from ..data import dataset as datasets
@@ -99,7 +99,7 @@ def repair(
         progress=lambda done: progress({"event": "draw", "done": done, "total": len(views)}),
     )
     progress({"event": "prepare", "text": "associating segments"})
-    _, neighbours = cKDTree(scene.means).query(scene.means, min(NEIGHBOURS + 1, len(scene.means)), workers=-1)
+    _, neighbours = KDTree(scene.means).query(scene.means, min(NEIGHBOURS + 1, len(scene.means)), workers=-1)
     times = np.unique([view.t for view in views])
     some = times[np.linspace(0, len(times) - 1, min(TIMES, len(times))).round().astype(int)]
     result = association.associate(
@@ -137,11 +137,11 @@ def write(
 
     Args:
         done: What `repair` did.
-        folder: The folder; files of the same names are replaced, one by one and whole.
+        folder: The folder; what an earlier call wrote there is replaced.
         names: Names of ids where they are the folder's own, others are called "object 3"; None where they are those of
             the data set.
         made_with: For ``masks.json``: what the masks were made from.
-        unmasked: Views of the data set without a mask; those that an earlier call wrote of them are removed.
+        unmasked: Views of the data set without a mask, which get none.
 
     Raises:
         DatasetError: A file cannot be written.
@@ -150,8 +150,8 @@ def write(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         mask_notes.write(notes, folder)
-        stale = [folder / f"{view.name}.png" for view in unmasked] + ([folder / OBJECTS] if names is None else [])
-        for path in stale:
+        # First of all, so that a stop leaves masks missing, and none of two numberings.
+        for path in (folder / OBJECTS, *(folder / f"{view.name}.png" for view in (*done.views, *unmasked))):
             path.unlink(missing_ok=True)
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error

@@ -185,3 +185,22 @@ def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(
     made = datasets.read(tiny.root, str(out))
     assert [view.name for view in made.train if view.mask_path is None] == ["train/r_004"]
     assert made.object_names == datasets.read(tiny.root).object_names and made.ground_truth is not None
+
+
+def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    split_into_videos(tiny.root, tmp_path / "videos")
+    commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    written = []
+
+    def stopped(path, ids):
+        if len(written) == 5:
+            raise KeyboardInterrupt
+        written.append(path)
+        write(path, ids)
+
+    write = masks.write
+    monkeypatch.setattr(masks, "write", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        commands_association.run_associate(trained.folder, masks=switched, out=out)
+    assert sorted(out.rglob("*.png")) == sorted(written) and not mask_notes.read(out).finished
