@@ -80,7 +80,7 @@ def repair(
         progress: Called with events.
 
     Raises:
-        DatasetError: No training view has a mask, or one cannot be read.
+        DatasetError: No training view has a mask, one cannot be read, or none shows an object.
     """
     progress = progress or (lambda event: None)
     views = tuple(view for view in dataset.train if view.mask_path is not None)
@@ -90,6 +90,11 @@ def repair(
             "with --masks"
         )
     incoming = tuple(mask for view in views if (mask := datasets.load_mask(view)) is not None)
+    if not any(((mask > 0) & (mask != masks.UNKNOWN)).any() for mask in incoming):
+        raise errors.DatasetError(
+            f"{dataset.mask_folder}: expected objects in the masks, found background and unknown pixels alone; are "
+            "they the right ones? Name others with --masks"
+        )
     progress({"event": "draw", "done": 0, "total": len(views)})
     images = drawn_bags.draw(
         scene,

@@ -204,3 +204,10 @@ def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_p
     with pytest.raises(KeyboardInterrupt):
         commands_association.run_associate(trained.folder, masks=switched, out=out)
     assert sorted(out.rglob("*.png")) == sorted(written) and not mask_notes.read(out).finished
+
+
+@pytest.mark.parametrize("value", [0, masks.UNKNOWN])
+def test_masks_without_any_object_are_an_error(baked, tiny, tmp_path, value):
+    rewrite(tiny.root, tmp_path / "masks", lambda view, ids: np.full_like(ids, value))
+    with pytest.raises(errors.DatasetError, match="expected objects in the masks, found background and unknown"):
+        mask_repair.repair(baked, datasets.read(tiny.root, str(tmp_path / "masks")))
