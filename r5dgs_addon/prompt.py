@@ -66,6 +66,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
         The answer; equal scores are in the order of ``loaded``.
     """
     matches, deleted, notes, known, missing, lost = [], [], [], [], [], []
+    left: list[list[str]] = []
     for collection in loaded:
         labels = table.labels(collection)
         there = table.present(collection)
@@ -81,6 +82,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
             other = phrases.stranger(unknown, card)
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrases.of, card=card)
+        left.append(lookup.unanswered(labels, text, threshold, meanings, embed))
         for found in lookup.search_labels(labels, text, threshold, meanings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
@@ -89,6 +91,9 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
     if lost and not matches:
         asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
         notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
+    if matches:  # of several wishes some may have found nothing
+        void = [phrase for phrase in left[0] if phrase not in missing and all(phrase in each for each in left)]
+        notes += [f"Nothing matches {' and '.join(map(repr, void))}"] if void else []
     if deleted:
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     matches.sort(key=lambda match: -round(match.score, 6))

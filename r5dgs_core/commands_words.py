@@ -123,6 +123,10 @@ def run_query(
         print(json.dumps({"query": text, "threshold": least, "matches": rows, "note": said}, indent=1))
     elif found:
         _show(scene, found)
+        labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
+        for phrase in lookup.unanswered(labels, text, least, lookup.Meanings.of(scene)):
+            if encoder is None or phrase not in unknown:
+                print(f"nothing matches {phrase!r}")
     else:
         print(said)
     return found

@@ -93,6 +93,21 @@ def search_labels(
     return _ranked(best.values())
 
 
+def unanswered(
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
+) -> list[str]:
+    """Phrases of a text that nothing matches; arguments as of `search_labels`."""
+    return [
+        said
+        for said, wish in _parts(text)
+        if all(match.score < threshold for match in _fulfil(labels, said, wish, meanings, embed))
+    ]
+
+
 def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
     """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
     return [

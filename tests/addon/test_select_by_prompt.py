@@ -61,6 +61,13 @@ def test_several_wishes_select_several_objects_ranked_in_the_panel(blender, load
     assert scores == sorted(scores, reverse=True) and all(match.why for match in matches)
 
 
+def test_a_wish_that_finds_nothing_beside_others_is_named(blender, loaded, capfd):
+    assert ask(blender, "mug and elephant") == {"FINISHED"}
+    assert "Nothing matches 'elephant'" in capfd.readouterr().out
+    assert ask(blender, "mug and lemon") == {"FINISHED"}
+    assert "Nothing matches" not in capfd.readouterr().out
+
+
 def test_modes_set_add_and_subtract(blender, loaded):
     ask(blender, "mug")
     ask(blender, "globe", "ADD")

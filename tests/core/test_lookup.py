@@ -184,6 +184,13 @@ def test_two_of_a_kind_are_two_matches():
     assert [m.object_id for m in lookup.search_labels(labels, "both of the chairs")] == [1, 3]
 
 
+def test_what_finds_nothing_among_several_wishes_is_named():
+    labels = [lookup.Label(1, "mug"), lookup.Label(2, "lemon")]
+    assert lookup.unanswered(labels, "two spoons, lemon and elephant") == ["two spoons", "elephant"]
+    assert lookup.unanswered(labels, "mugs and lemons") == []
+    assert lookup.unanswered(labels, "mugs", threshold=1.0) == []
+
+
 def test_counts_are_no_part_of_what_is_counted_but_may_be_of_a_name():
     labels = [lookup.Label(1, "mug one"), lookup.Label(2, "mug two"), lookup.Label(3, "two towers")]
     assert lookup.wishes("the two fruits and some mugs") == [["fruit"], ["mug"]]
