@@ -31,7 +31,7 @@ def shares(images: Sequence[bags.ImageBags], found: association.Association) -> 
     new = np.concatenate(found.ids)
     labels = np.where(new == masks.UNKNOWN, -1, np.searchsorted(names, new))
     for seen, part in votes.left_out(stack, labels, len(found.objects)):
-        yield seen, part.astype(np.float32)
+        yield seen, part.toarray().astype(np.float32)
 
 
 def mend(

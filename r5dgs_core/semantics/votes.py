@@ -71,15 +71,15 @@ def overlaps(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[Over
     ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
     for start, stop, (seen, shares) in zip(ends, ends[1:], left_out(stack, labels, count), strict=False):
         own = stack.weights[start:stop][:, seen]
-        known = shares.any(axis=1).astype(np.float32)
+        known = np.diff(shares.indptr) > 0
         yield Overlaps(
-            common=np.asarray(own @ shares, float),
-            segments=np.asarray(own @ known, float).ravel(),
-            objects=np.asarray(np.asarray(own.sum(axis=0)).ravel() @ shares, float).ravel(),
+            common=sparse.csr_matrix(own @ shares).toarray().astype(float),
+            segments=np.asarray(own @ known.astype(np.float32), float).ravel(),
+            objects=np.asarray(shares.T @ np.asarray(own.sum(axis=0)).ravel(), float).ravel(),
         )
 
 
-def left_out(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def left_out(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, sparse.csr_matrix]]:
     """What the Gaussians of each image show by the votes of all other images; arguments as of `cast`.
 
     Yields:
@@ -93,12 +93,13 @@ def left_out(stack: bags.Stack, labels: np.ndarray, count: int) -> Iterator[tupl
         seen = np.unique(own.indices)
         said = labels[start:stop]
         voting = np.flatnonzero(said >= 0)
-        others = votes[seen].toarray()
-        mine = own[voting][:, seen].tocoo()
-        np.subtract.at(others, (mine.col, said[voting][mine.row]), mine.data)
-        total = others.sum(axis=1)
-        known = total > LEAST
-        shares = np.maximum(others, 0.0)
-        shares[~known] = 0.0
-        shares[known] /= shares[known].sum(axis=1, keepdims=True)
-        yield seen, shares
+        member = sparse.csr_matrix(
+            (np.ones(len(voting), np.float32), (np.arange(len(voting)), said[voting])), (len(voting), count + 1)
+        )
+        others = sparse.csr_matrix(votes[seen] - own[voting][:, seen].T @ member)
+        others.data = np.maximum(others.data, 0.0)
+        total = np.asarray(others.sum(axis=1)).ravel()
+        others.data[np.repeat(total <= LEAST, np.diff(others.indptr))] = 0.0
+        others.eliminate_zeros()
+        others.data /= np.repeat(total, np.diff(others.indptr))
+        yield seen, others
