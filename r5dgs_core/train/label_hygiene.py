@@ -34,7 +34,7 @@ OWN = 4.0  # a Gaussian's own votes count as much as so many neighbourhoods,
 MOTION = 0.5  # the group that it moves with as half of one
 DOUBT = 1.0  # pixels of votes that are trusted by half
 UNDECIDED = 0.55  # of the votes for its label and another one: a Gaussian with more for its label keeps it,
-UNDECIDED_TO_OBJECT = 0.505  # and one that would come to an object with more than this
+UNDECIDED_BACKGROUND = 0.45  # and so does what would come from the background to an object, with more than this
 APART = 5.0  # of the spacing of an object's members: parts that lie further off are not joined to it
 SMALL = 0.05  # of an object's opacity: larger parts are its own
 SUPPORTED = 0.65  # share of the votes of a part with which it stays
@@ -239,7 +239,7 @@ def _decide(
     said, other = shares[rows, own], shares[rows, new]
     sure = trust[rows] * said / np.maximum(said + other, 1e-9)
     take = (new != own) & (whole > 1e-6)
-    take &= sure < np.where(new == 0, UNDECIDED, UNDECIDED_TO_OBJECT)
+    take &= sure < np.where(own == 0, UNDECIDED_BACKGROUND, UNDECIDED)
     take &= (new == 0) | (opacities[rows] > visibility.SEEN_OPACITY)
     return np.where(take, new, own), take & (new != alone)
 
