@@ -11,7 +11,7 @@ import numpy as np
 from .. import errors
 from ..data import dataset as datasets
 from ..data import mask_notes, masks
-from ..data.annotations import read_objects
+from ..data.annotations import OBJECTS, read_objects
 from .videos import Video
 
 
@@ -53,6 +53,8 @@ class Precomputed:
                 "their images"
             )
         self._colors = masks.color_table(found)
+        own_names = self.folder / OBJECTS
+        self.own_names = own_names if own_names.is_file() else None
         self.made_with: dict[str, Any] = {"folder": str(self.folder.resolve()), "unknown": self.unknown}
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:

@@ -29,11 +29,13 @@ class MaskBackend(Protocol):
         name: Of the backend.
         numbering: Where its ids hold, `mask_notes.SCENE` or `mask_notes.VIDEO`.
         made_with: What the masks depend on; JSON types.
+        own_names: The ``objects.json`` of ids that are not those of the data set, None where there is none.
     """
 
     name: str
     numbering: str
     made_with: dict[str, Any]
+    own_names: Path | None
 
     def label(self, video: videos.Video, room: Path, report: Report) -> Iterator[np.ndarray | None]:
         """Object ids of each image of a video, in order; None where there is no mask.
@@ -114,8 +116,8 @@ def make(
     for video, found in _labelled(todo, backend, folder, count, keep, progress):
         notes = dataclasses.replace(notes, videos={**notes.videos, video.name: found})
         mask_notes.write(notes, folder)
-    if notes.numbering == mask_notes.VIDEO and len(every) == 1:
-        _write_names(notes, folder)
+    if backend.own_names is not None or (notes.numbering == mask_notes.VIDEO and len(every) == 1):
+        _write_names(notes, backend.own_names, folder)
     notes = dataclasses.replace(notes, finished=True)
     mask_notes.write(notes, folder)
     return _made(notes, folder, len(every) - len(todo), count)
@@ -189,13 +191,13 @@ def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -
     )
 
 
-def _write_names(notes: mask_notes.MaskNotes, folder: Path) -> None:
+def _write_names(notes: mask_notes.MaskNotes, own_names: Path | None, folder: Path) -> None:
     """Say that the ids are the folder's own, so that names of the data set's ids are not put on them."""
-    (video,) = notes.videos.values()
     path = folder / OBJECTS
-    names = {str(object_id): f"object {object_id}" for object_id in video.ids}
+    ids = sorted({object_id for video in notes.videos.values() for object_id in video.ids})
+    made = json.dumps({str(object_id): f"object {object_id}" for object_id in ids}, indent=1) + "\n"
     try:
-        files.write(path, (json.dumps(names, indent=1) + "\n").encode())
+        files.write(path, made.encode() if own_names is None else own_names.read_bytes())
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot be written: {error}") from error
 

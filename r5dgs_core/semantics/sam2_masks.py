@@ -44,6 +44,7 @@ class Sam2Masks:
     """
 
     name, numbering = "sam2", mask_notes.VIDEO
+    own_names: Path | None = None
 
     def __init__(
         self,

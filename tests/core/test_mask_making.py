@@ -16,7 +16,7 @@ from r5dgs_core.semantics import mask_folders, mask_making, videos
 class Numbered:
     """A backend that gives every video ids of its own; breaks off where it is told to."""
 
-    name, numbering = "numbered", mask_notes.VIDEO
+    name, numbering, own_names = "numbered", mask_notes.VIDEO, None
 
     def __init__(self, stop_at=None, kind=1):
         self.made_with = {"kind": kind}
@@ -254,3 +254,14 @@ def test_a_video_that_got_more_images_is_made_again(views, tmp_path):
     again = Numbered()
     assert mask_making.make(views, again, tmp_path).images == 36
     assert again.asked == [views[4].camera.name]
+
+
+def test_names_of_a_folders_own_ids_are_taken_over_with_its_masks(copied, tmp_path):
+    """Else those of the data set's ids, and its true poses, would be put on them."""
+    source, out = tmp_path / "theirs", tmp_path / "out"
+    shutil.copytree(copied / "object_mask", source)
+    (source / "objects.json").write_text('{"1": {"name": "zebra", "aliases": ["horse"]}, "2": "yak"}')
+    commands_masks.run_masks(copied, source=source, out=out)
+    made = datasets.read(copied, str(out))
+    assert made.object_names == {1: "zebra", 2: "yak"} and made.object_aliases[1] == ("horse",)
+    assert made.ground_truth is None
