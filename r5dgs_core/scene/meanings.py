@@ -25,6 +25,7 @@ UNCALIBRATED = 0.25  # threshold of a file that says nothing about its encoder
 PASS = 0.5  # score at the threshold
 _BEST = 0.95  # score far above the threshold: below a name's
 _SPREAD = 0.25  # of cosines, in a file that says nothing about its encoder
+_MOST_EXPONENT = 700.0  # whose exponential is a number
 _BESIDE = 0.4  # most of an object that fits far worse than another
 
 
@@ -175,7 +176,7 @@ def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
 
 def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
     """LERF's, of a cosine with a phrase beside those with the canonical ones. canonical: [C]"""
-    return float(1.0 / (1.0 + np.exp(-scale * (cosine - float(np.max(canonical))))))
+    return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MOST_EXPONENT))))
 
 
 def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
@@ -195,7 +196,7 @@ def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
 
 def _score(above: float, spread: float) -> float:
     """Of a cosine that lies so far above the threshold: 0 far below it, `PASS` at it, `_BEST` far above."""
-    share = math.exp(-min(abs(above) / max(spread, 1e-9), 700.0))
+    share = math.exp(-min(abs(above) / max(spread, 1e-9), _MOST_EXPONENT))
     return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 

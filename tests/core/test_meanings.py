@@ -43,6 +43,12 @@ def test_relevancy_is_the_least_of_the_pairs(cosine, canonical, scale):
     assert meanings.relevancy(cosine, np.array(canonical), scale) == pytest.approx(min(pairs), abs=1e-9)
 
 
+@pytest.mark.filterwarnings("error")
+def test_relevancy_is_a_number_at_any_scale():
+    assert meanings.relevancy(-1.0, np.array([1.0]), 1000.0) < 1e-300
+    assert meanings.relevancy(1.0, np.array([-1.0]), 1000.0) == 1.0
+
+
 @given(cosines, st.floats(-0.9, 0.9), st.booleans())
 def test_a_score_passes_exactly_where_the_cosine_reaches_the_threshold(cosine, threshold, canonical):
     known = table_of([around(cosine)], [threshold])
