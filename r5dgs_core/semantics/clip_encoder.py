@@ -43,6 +43,7 @@ class ClipEncoder:
         except Exception as error:  # whatever a damaged folder makes of it
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         encoders.check_loaded(folder, info)
+        encoders.check_words(folder, self._tokenizer)
         self._model.eval()
         self._longest = int(self._model.config.text_config.max_position_embeddings)
         # SigLIP was trained on texts of one length, and looks at their padding.

@@ -195,6 +195,16 @@ def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ())
             )
 
 
+def check_words(folder: Path, tokenizer: Any) -> None:
+    """Raise `BackendError` where all words are one: without its files transformers makes a tokenizer of no words."""
+    one, other = tokenizer(["lemon", "apple"])["input_ids"]  # as long as each other: each letter may be unknown
+    if list(one) == list(other):
+        raise errors.BackendError(
+            f"{folder}: the tokenizer knows no words, its vocabulary is missing; copy the model again, tokenizer.json "
+            "and all other files"
+        )
+
+
 def _text_package() -> Path:
     """Folder of the model in the optional package, which is looked up without importing it."""
     found = importlib.util.find_spec(TEXT_PACKAGE)

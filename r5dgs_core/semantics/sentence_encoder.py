@@ -44,6 +44,7 @@ class SentenceEncoder:
         except Exception as error:  # whatever a damaged folder makes of it
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         encoders.check_loaded(folder, info, unused=("pooler.",))
+        encoders.check_words(folder, self._tokenizer)
         self._model.eval()
         self._longest = min(int(config.get("max_position_embeddings", 512)), 512) - 2
         dimension = int(self._model.config.hidden_size)

@@ -160,6 +160,15 @@ def test_a_lost_file_is_named(copied, kind, file, message):
 
 
 @pytest.mark.parametrize("kind", MAKERS)
+def test_a_lost_vocabulary_is_an_error_and_never_makes_all_words_one(copied, kind):
+    folder = copied(kind)
+    for path in [*folder.glob("tokenizer*"), *folder.glob("vocab*"), *folder.glob("merges*")]:
+        path.unlink()
+    with pytest.raises(errors.BackendError, match="copy the model again"):
+        encoders.open_encoder(folder)
+
+
+@pytest.mark.parametrize("kind", MAKERS)
 def test_weights_that_are_missing_are_never_made_up(copied, kind):
     safetensors = pytest.importorskip("safetensors.numpy")
     folder = copied(kind)
