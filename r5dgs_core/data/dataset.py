@@ -181,6 +181,12 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
     image_root = root if reconstruction is None else root / colmap.IMAGES
     folders = {"train": _mask_folder(root, train_masks), "val": root / MASKS, "test": root / MASKS}
     views = {split: _make_views(folders[split], image_root, split, entries[split], camera_names) for split in SPLITS}
+    named = folders["train"] if folders["train"] != folders["val"] else None
+    if named is not None and all(view.mask_path is None for view in views["train"]):
+        raise errors.DatasetError(
+            f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: 'r5dgs masks' with "
+            "--from takes masks over that lie flat, --masks none goes without"
+        )
     if folders["train"] == folders["val"]:
         views = _attach_mask_colors(views)
     else:

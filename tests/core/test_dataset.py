@@ -449,6 +449,9 @@ def test_a_folder_of_masks_with_names_of_its_own_has_ids_of_its_own(flat, tmp_pa
     write_json(flat / "ground_truth.json", {"times": [0.0], "t_max": 0.5, "objects": []})
     folder = tmp_path_factory.mktemp("masks")
     write_json(folder / "objects.json", {"3": "cup"})
+    with pytest.raises(errors.DatasetError, match=r"expected masks such as .*\.png, found none"):
+        dataset.read(flat, str(folder))
+    shutil.copytree(flat / "object_mask" / "train", folder / "train")
     other = dataset.read(flat, str(folder))
     assert other.object_names == {3: "cup"}
     assert other.ground_truth is None and dataset.read(flat).ground_truth is not None
