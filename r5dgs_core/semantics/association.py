@@ -26,6 +26,8 @@ GAIN = 0.5  # of the usual overlap that a pixel that changes must win on average
 FEW = 4  # and twice that with so few images: little evidence agrees with a wrong outcome by chance
 DOUBTFUL = 0.55  # share of the score of the two best objects below which the better one is in doubt
 
+_NOBODY = -2  # id of what nobody can name, until all have one
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -200,20 +202,19 @@ def _name(stack: bags.Stack, found: assignment.Assignment, sure: np.ndarray) -> 
                 taken.add((int(stack.images[row]), name))
                 break
         else:
-            ids[row] = masks.UNKNOWN
+            ids[row] = _NOBODY
     return _compact(ids, usual[track])
 
 
 def _compact(ids: np.ndarray, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number anew where ids would not fit 16 bits."""
+    """Number anew where ids would not fit 16 bits, and give what is nobody's the value that says so."""
     used = np.unique(np.concatenate([ids, usual]))
-    used = used[(used > 0) & (used != masks.UNKNOWN)]
-    if not len(used) or used[-1] < masks.UNKNOWN:
-        return ids, usual
-    table = np.zeros(used[-1] + 1, int)
-    table[used] = np.arange(1, len(used) + 1)
-    kept = [np.where((a > 0) & (a != masks.UNKNOWN), table[np.minimum(a, used[-1])], a) for a in (ids, usual)]
-    return kept[0], kept[1]
+    used = used[used > 0]
+    if len(used) and used[-1] >= masks.UNKNOWN:
+        table = np.zeros(used[-1] + 1, int)
+        table[used] = np.arange(1, len(used) + 1)
+        ids, usual = (np.where(a > 0, table[np.maximum(a, 0)], a) for a in (ids, usual))
+    return np.where(ids == _NOBODY, masks.UNKNOWN, ids), usual
 
 
 def _result(

@@ -224,6 +224,18 @@ def test_ids_beyond_what_masks_hold_are_numbered_anew():
     assert association.associate(seen.bags(masks)).objects.tolist() == [1, 2, 3]
 
 
+@pytest.mark.parametrize("high", [60_000, 65_534])
+def test_new_objects_get_ids_that_name_them_however_high_the_incoming_ones_are(high):
+    seen = look(3, 3, 4)
+    given_masks = []
+    for truth, (view, _) in zip(seen.truths, seen.moments, strict=True):  # each view names two of the three objects
+        names = np.array([0, *(int(k) for k in np.insert([1, high], view, UNKNOWN))])
+        given_masks.append(names[truth])
+    found = association.associate(seen.bags(given_masks))
+    assert len(found.objects) == 3 and all(0 < k < UNKNOWN for k in found.objects)
+    assert not any(row.done == "unknown" for row in found.rows)
+
+
 def test_what_does_not_fit_is_refused():
     seen = look(2, 2, 2)
     with pytest.raises(ValueError, match="at least one image"):
