@@ -13,6 +13,7 @@ Notation: I images, S segments of an image, N Gaussians, k neighbours, K objects
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -176,9 +177,11 @@ def _name(stack: bags.Stack, found: assignment.Assignment, sure: np.ndarray) -> 
     rows, columns = optimize.linear_sum_assignment(overlap[1:], maximize=True)
     names = np.zeros(number + 1, int)
     names[rows + 1] = np.where(overlap[rows + 1, columns] > 0, old[columns], 0)
-    fresh = int(max(names.max(), 0)) + 1
+    top, used = int(names.max()), set(names.tolist())
+    above, below = range(top + 1, masks.UNKNOWN), range(1, top)
+    fresh = (k for k in itertools.chain(above, below) if k not in used)
     for k in np.flatnonzero(names[1:] == 0) + 1:
-        names[k], fresh = fresh, fresh + 1
+        names[k] = next(fresh)
     tracks, track = np.unique(
         np.stack([stack.views[stack.images], np.where(stack.ids > 0, stack.ids, 0)]), axis=1, return_inverse=True
     )
@@ -189,7 +192,7 @@ def _name(stack: bags.Stack, found: assignment.Assignment, sure: np.ndarray) -> 
     tally[:, 0] = 0.0
     usual = np.where(tally.max(axis=1) > 0, names[tally.argmax(axis=1)], -1)
     for t in np.flatnonzero((usual < 0) & (tracks[1] > 0)):  # of which nothing is certain: a name of its own
-        usual[t], fresh = fresh, fresh + 1
+        usual[t] = next(fresh)
     ids = np.where(stack.ids > 0, -1, 0)
     ids[sure] = names[found.labels[sure]]
     taken = set(zip(stack.images[sure].tolist(), ids[sure].tolist(), strict=True))
