@@ -42,8 +42,10 @@ def run_associate(
     from .progress import make
     from .semantics import mask_repair
 
-    if not target.is_dir() and (data is None or out is None):
+    if target.is_file() and (data is None or out is None):
         raise errors.ConfigError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
+    if not target.exists():
+        raise errors.ConfigError(f"associate {target}: expected a run folder or a .r5dgs file, found nothing")
     with make(progress_kind) as progress:
         progress({"event": "prepare", "text": "the scene"})
         scene, dataset = commands.open_target(target, data)
