@@ -279,7 +279,8 @@ def _parts(points: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, int]:
     """Part of each point, where what lies within `APART` of the usual spacing hangs together, and their number."""
     width = min(NEIGHBOURS + 1, len(points))
     distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
-    spacing = np.median(distances[visibility.seen(opacities), width // 2])
+    shown = visibility.seen(opacities)
+    spacing = np.median(distances[shown if shown.any() else slice(None), width // 2])
     near = distances <= APART * spacing
     rows = np.repeat(np.arange(len(points)), width)[near.ravel()]
     links = sparse.coo_matrix((np.ones(len(rows)), (rows, nearest.ravel()[near.ravel()])), (len(points),) * 2)
