@@ -191,7 +191,7 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
         dataset = None if data is None else datasets.read(data)
         trained_on = scene.provenance.get("dataset_digest")
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
-        log.warning("%s: %s was trained on other data; measured all the same", dataset.root, target)
+        log.warning("%s: %s was trained on other data than this; it is used all the same", dataset.root, target)
     return scene, dataset
 
 

@@ -90,8 +90,10 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
         print("the incoming ids stay: too little is certain, or nothing would be better")
     changed = mask_repair.switches(done)
     for row in changed[:SHOWN]:
-        new = "unknown" if row.done == "unknown" else f"{row.new_id}, where its track is {row.usual_id} mostly"
-        print(f"  {done.views[row.image].name}: {row.old_id} -> {new} ({row.pixels} pixels, score {row.score:.2f})")
+        said = "unknown here" if row.done == "unknown" else f"object {row.new_id} here"
+        usual = f", mostly object {row.usual_id} in its video" if row.usual_id > 0 else ""
+        figures = f"{row.pixels} pixels, score {row.score:.2f}"
+        print(f"  {done.views[row.image].name}: id {row.old_id} is {said}{usual} ({figures})")
     if len(changed) > SHOWN:
         print(f"  and {len(changed) - SHOWN} more in {folder / mask_repair.SEGMENTS}")
     print(f"written: {folder}")

@@ -72,7 +72,7 @@ def test_without_an_encoder_other_words_find_nothing(loaded, monkeypatch):
     monkeypatch.delenv("R5DGS_TEXT_ENCODER")
     assert ask(loaded, "zorb") == {"CANCELLED"}
     assert notes(loaded) == ["'zorb': no stored word; name the scene's encoder under Text Encoder in the preferences"]
-    assert ask(loaded, "mug and zorb") == {"FINISHED"} and notes(loaded) == []
+    assert ask(loaded, "mug and zorb") == {"FINISHED"} and notes(loaded) == ["Nothing matches 'zorb'"]
 
 
 def test_another_encoder_is_named_with_the_remedy(loaded, folders, monkeypatch):

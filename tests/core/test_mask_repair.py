@@ -77,7 +77,11 @@ def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, c
     out = tmp_path / "out"
     assert cli.main(["associate", str(trained.folder), "--masks", str(switched), "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "2 relabelled, 0 unknown" in said and "train/r_008: 2 -> 1" in said and f"--masks {out}" in said
+    assert (
+        "2 relabelled, 0 unknown" in said
+        and "train/r_008: id 2 is object 1 here, mostly object 2 in its video" in said
+        and f"--masks {out}" in said
+    )
     data, repaired = datasets.read(tiny.root), datasets.read(tiny.root, str(out))
     for view, true in zip(repaired.train, data.train, strict=True):
         new, ids = datasets.load_mask(view), datasets.load_mask(true)
