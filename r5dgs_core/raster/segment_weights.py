@@ -49,7 +49,7 @@ def segment_weights(
         ValueError, BackendError: As `rasterize_splats`.
     """
     weights = means.new_zeros(len(means), count)
-    fixed = [value.detach() for value in (means, quats, scales, opacities)]
+    fixed = (means.detach(), quats.detach(), scales.detach(), opacities.detach())
     for first in range(0, count, TOGETHER):
         some = torch.arange(first, min(first + TOGETHER, count), device=segments.device)
         members = (segments[..., None] == some).to(means)
