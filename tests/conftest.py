@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import os
 import sys
 
 import hypothesis
 import pytest
 
 BPY_PYTHON = (3, 11)
+STATUS = pytest.StashKey[int]()
 
 hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
@@ -28,3 +30,24 @@ def pytest_report_header(config: pytest.Config) -> str:
         return f"blender: ABSENT, its tests are skipped: the bpy module exists for Python {wanted}, this is {here}"
     remedy = "pip install -c constraints.txt -e '.[test]'"
     return f"blender: ABSENT, its tests are skipped: bpy is not installed, {remedy}"
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Keep the status for the end."""
+    session.config.stash[STATUS] = int(exitstatus)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End at once where the bpy module is loaded and pytest is the program.
+
+    The module lets go of its types when the last reference to it goes. Where one is left, 4.2 does so after Python has
+    ended, and crashes; what pytest found would then not be its exit status.
+    """
+    bpy = sys.modules.get("bpy")
+    if bpy is None or bpy.app.binary_path or config.invocation_params.plugins or STATUS not in config.stash:
+        return
+    config.get_terminal_writer().flush()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(config.stash[STATUS])
