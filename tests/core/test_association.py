@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-pytest.importorskip("scipy")
-
-from r5dgs_core.data.masks import UNKNOWN  # noqa: E402
-from r5dgs_core.semantics import association, bags, patches  # noqa: E402
+from r5dgs_core.data.masks import UNKNOWN
+from r5dgs_core.semantics import association, bags, patches
 
 PER_BODY, FLOOR = 40, 200
 

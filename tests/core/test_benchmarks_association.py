@@ -8,10 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from tests import benchmark_modules  # noqa: E402
+from tests import benchmark_modules
 
 
 @pytest.fixture

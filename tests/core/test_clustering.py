@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("scipy")
-
-from r5dgs_core.semantics import clustering  # noqa: E402
+from r5dgs_core.semantics import clustering
 
 
 def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int] | None = None, noise: float = 0.0):

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-pytest.importorskip("scipy")
-
-from r5dgs_core.data.masks import UNKNOWN  # noqa: E402
-from r5dgs_core.semantics import association, bags, mending  # noqa: E402
+from r5dgs_core.data.masks import UNKNOWN
+from r5dgs_core.semantics import association, bags, mending
 
 SIZE, TIMES = 24, 6
 PIXELS = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)  # of a scene in which every pixel shows a Gaussian of its own
