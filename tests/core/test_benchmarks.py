@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("numba")
-
-from r5dgs_core.raster import rasterize_splats  # noqa: E402
-from r5dgs_core.scene import scene_file  # noqa: E402
-from r5dgs_core.scene.cameras import Camera  # noqa: E402
-from tests import benchmark_modules, scenes  # noqa: E402
+from r5dgs_core.raster import rasterize_splats
+from r5dgs_core.scene import scene_file
+from r5dgs_core.scene.cameras import Camera
+from tests import benchmark_modules, scenes
 
 ROOT = Path(__file__).parents[2]
 COLUMNS = ["workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb"]

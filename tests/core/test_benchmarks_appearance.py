@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.scene import playback  # noqa: E402
-from tests import benchmark_modules, scenes  # noqa: E402
+from r5dgs_core.scene import playback
+from tests import benchmark_modules, scenes
 
 
 @pytest.fixture

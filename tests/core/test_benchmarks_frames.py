@@ -6,12 +6,9 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.raster import scene_render  # noqa: E402
-from r5dgs_core.scene import playback, validation  # noqa: E402
-from tests import benchmark_modules  # noqa: E402
+from r5dgs_core.raster import scene_render
+from r5dgs_core.scene import playback, validation
+from tests import benchmark_modules
 
 
 @pytest.fixture

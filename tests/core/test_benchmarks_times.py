@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.data import dataset as datasets  # noqa: E402
-from tests import benchmark_modules  # noqa: E402
-from tests import datasets as tiny_datasets  # noqa: E402
+from r5dgs_core.data import dataset as datasets
+from tests import benchmark_modules
+from tests import datasets as tiny_datasets
 
 
 @pytest.fixture

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba")
-
-from r5dgs_core.raster import compile as compilation  # noqa: E402
+from r5dgs_core.raster import compile as compilation
 
 CORE = Path(__file__).resolve().parents[2] / "r5dgs_core"
 TOY = """

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy as safetensors
+import torch
+import transformers
 
 from r5dgs_core import errors
 from r5dgs_core.semantics import encoders, sentence_encoder
 from tests import encoder_folders
 
-pytest.importorskip("transformers")
 MAKERS = {"clip": encoder_folders.clip, "siglip": encoder_folders.siglip, "text": encoder_folders.sentences}
 SEEING = ("clip", "siglip")
 
@@ -78,7 +80,6 @@ def test_pictures_and_texts_lie_in_one_space(opened, kind):
 
 @pytest.mark.parametrize("kind", SEEING)
 def test_embeddings_are_those_of_the_model_itself(opened, folders, kind):
-    torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
     model = transformers.AutoModel.from_pretrained(folders[kind]).eval()
     encoder = opened[kind]
     pixels = np.rint(255 * picture(3, encoder_folders.IMAGE, encoder_folders.IMAGE)) / 255
@@ -104,7 +105,6 @@ def test_preprocessing_of_older_folders_is_the_same(copied, opened):
 
 
 def test_a_sentence_is_the_mean_of_its_tokens_or_the_first_one_as_the_folder_says(opened, tmp_path):
-    torch = pytest.importorskip("torch")
     first = encoders.open_encoder(encoder_folders.sentences(tmp_path / "first", pooling="cls_token"))
     mean = encoders.open_encoder(encoder_folders.sentences(tmp_path / "mean", pooling="mean_tokens"))
     assert first.card.digest == mean.card.digest == opened["text"].card.digest
@@ -170,7 +170,6 @@ def test_a_lost_vocabulary_is_an_error_and_never_makes_all_words_one(copied, kin
 
 @pytest.mark.parametrize("kind", MAKERS)
 def test_weights_that_are_missing_are_never_made_up(copied, kind):
-    safetensors = pytest.importorskip("safetensors.numpy")
     folder = copied(kind)
     tensors = safetensors.load_file(folder / "model.safetensors")
     lost = next(name for name in sorted(tensors) if "encoder.layer" in name and name.endswith("weight"))
@@ -226,7 +225,7 @@ def test_a_missing_package_is_named_with_the_extra(monkeypatch, folders, kind):
 @pytest.fixture
 def perception(tmp_path):
     """A folder of open_clip: nothing in it but what our own code reads."""
-    safetensors, folder = pytest.importorskip("safetensors.numpy"), tmp_path / "PE"
+    folder = tmp_path / "PE"
     folder.mkdir()
     (folder / "open_clip_config.json").write_text(json.dumps({"model_cfg": {"embed_dim": 3}, "preprocess_cfg": {}}))
     safetensors.save_file({"w": np.ones(3, np.float32)}, folder / "open_clip_model.safetensors")
@@ -254,7 +253,7 @@ class StandIn:
 
 
 def test_folders_of_open_clip_are_opened_by_their_place(monkeypatch, perception):
-    torch, asked = pytest.importorskip("torch"), []
+    asked = []
 
     def create(where):
         asked.append(where)

@@ -6,12 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.raster import compile as compilation  # noqa: E402
+from r5dgs_core.raster import compile as compilation
 
 ROOT = Path(__file__).parents[2]
 

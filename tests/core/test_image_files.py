@@ -1,12 +1,11 @@
 """What the standard library writes, OpenImageIO reads."""
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from r5dgs_core.data import images
 from r5dgs_core.scene import image_files
-
-oiio = pytest.importorskip("OpenImageIO")
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -248,7 +248,6 @@ def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
 
 @pytest.mark.parametrize("kind", ["clip", "siglip", "sentences"])
 def test_tiny_encoders_go_all_the_way(kind, seen, tmp_path):
-    pytest.importorskip("transformers")
     folder = getattr(encoder_folders, kind)(tmp_path / kind)
     path = scene_file.write(seen, tmp_path / "seen.r5dgs")
     commands_words.run_lookup(path, str(folder))

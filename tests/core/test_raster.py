@@ -12,13 +12,22 @@ import torch
 
 from r5dgs_core import errors
 from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import RasterSettings, RasterStats, rasterize, rasterize_splats, splatting, warm_up
+from r5dgs_core.raster import (
+    RasterSettings,
+    RasterStats,
+    cpu,
+    cpu_blending,
+    cpu_blending_backward,
+    cpu_projection,
+    cpu_tiles,
+    rasterize,
+    rasterize_splats,
+    splatting,
+    warm_up,
+)
+from r5dgs_core.raster import compile as compilation
 from r5dgs_core.scene import cameras
 from tests.splats import camera, draw, relative, splats
-
-pytest.importorskip("numba", reason="the cpu backend needs numba")
-from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import cpu, cpu_blending, cpu_blending_backward, cpu_projection, cpu_tiles  # noqa: E402
 
 # float32 against float64: rounding grows with the number of layers; the largest seen on these scenes is about 3e-6
 TOLERANCE = 2e-5

@@ -15,8 +15,6 @@ from r5dgs_core.scene.cameras import Camera
 from tests.agreement import FORWARD, assert_within_bars
 from tests.splats import NAMES, camera, draw, relative, splats
 
-pytest.importorskip("numba", reason="the cpu backend needs numba")
-
 THRESHOLDS = RasterSettings()
 
 

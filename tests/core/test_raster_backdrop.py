@@ -7,10 +7,8 @@ import pytest
 import torch
 
 from r5dgs_core.raster import RasterSettings, rasterize_splats
+from r5dgs_core.raster.backdrop import Backdrop
 from tests.splats import camera, splats
-
-pytest.importorskip("numba", reason="a backdrop is drawn by the cpu backend")
-from r5dgs_core.raster.backdrop import Backdrop  # noqa: E402
 
 
 def single(scene):

@@ -12,8 +12,6 @@ from r5dgs_core.raster import RasterSettings, RasterStats, rasterize_splats
 from tests.agreement import FORWARD, assert_within_bars
 from tests.splats import camera, draw, splats
 
-pytest.importorskip("numba", reason="the cpu backend needs numba")
-
 BACKENDS = ("cpu", "reference")
 NEAR = RasterSettings().near_plane
 ALPHA_MIN, ALPHA_MAX = RasterSettings().alpha_min, RasterSettings().alpha_max

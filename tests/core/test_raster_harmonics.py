@@ -4,15 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.model import spherical_harmonics  # noqa: E402
-from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import harmonics, rasterize, splatting  # noqa: E402
-from r5dgs_core.scene.cameras import Camera  # noqa: E402
-from tests import scenes, splats  # noqa: E402
+from r5dgs_core.model import spherical_harmonics
+from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster import harmonics, rasterize, splatting
+from r5dgs_core.scene.cameras import Camera
+from tests import scenes, splats
 
 EYE = np.array([0.4, -3.0, 1.5])
 COUNTS = [4, 9, 16]

@@ -1,11 +1,10 @@
 """Vector operations inside numba kernels do what their scalar namesakes do."""
 
+import numba
 import numpy as np
 import pytest
 
-numba = pytest.importorskip("numba", reason="lanes live in numba kernels")
-
-from r5dgs_core.raster import doubles, lanes, vectors  # noqa: E402
+from r5dgs_core.raster import doubles, lanes, vectors
 
 
 @numba.njit

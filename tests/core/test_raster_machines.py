@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba", reason="the cpu backend needs numba")
-
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = """
 import torch

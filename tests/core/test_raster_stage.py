@@ -4,16 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba", reason="a stage keeps what stands still where the cpu backend draws")
-
-from r5dgs_core.motion import rotations  # noqa: E402
-from r5dgs_core.raster import RasterSettings, backdrop, rasterize_splats, scene_render, stage  # noqa: E402
-from r5dgs_core.raster.scene_render import Instance  # noqa: E402
-from r5dgs_core.scene import playback  # noqa: E402
-from tests import scenes  # noqa: E402
-from tests.core.test_scene_render import group_instances, matrix  # noqa: E402
+from r5dgs_core.motion import rotations
+from r5dgs_core.raster import RasterSettings, backdrop, rasterize_splats, scene_render, stage
+from r5dgs_core.raster.scene_render import Instance
+from r5dgs_core.scene import playback
+from tests import scenes
+from tests.core.test_scene_render import group_instances, matrix
 
 CAMERA, OTHER = scenes.orbit_camera(0.7, 80, 72), scenes.orbit_camera(1.1, 80, 72)
 

@@ -14,8 +14,6 @@ from r5dgs_core.semantics import mask_making, sam2, sam2_masks, segments, tracki
 from tests import datasets as tiny_datasets
 from tests import sam2 as tiny_sam2
 
-transformers = pytest.importorskip("transformers", reason="transformers is not installed")
-
 # The network is random: it foretells a quality of about a half, and its masks are noise.
 EVERYTHING = segments.SegmentSettings(points=3, score=0.0, stability=0.0, max_area=1.0)
 FEW = sam2_masks.TrackSettings(objects=5, together=2)

@@ -4,15 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from r5dgs_core.motion import rotations  # noqa: E402
-from r5dgs_core.raster import RasterSettings, scene_render  # noqa: E402
-from r5dgs_core.raster.scene_render import Instance  # noqa: E402
-from r5dgs_core.scene import playback  # noqa: E402
-from r5dgs_core.train import background  # noqa: E402
-from tests import scenes  # noqa: E402
+from r5dgs_core.motion import rotations
+from r5dgs_core.raster import RasterSettings, scene_render
+from r5dgs_core.raster.scene_render import Instance
+from r5dgs_core.scene import playback
+from r5dgs_core.train import background
+from tests import scenes
 
 CAMERA = scenes.orbit_camera(0.7, 48, 40)
 # Two float32 orders of the same operations: a cut-off (alpha < 1/255) may fall differently in a pixel or two.

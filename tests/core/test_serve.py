@@ -9,15 +9,13 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
-from r5dgs_core import serve  # noqa: E402
-from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import scene_render, stage, warming  # noqa: E402
-from r5dgs_core.scene import playback, scene_file  # noqa: E402
-from r5dgs_core.semantics import encoders, lookup_table  # noqa: E402
-from tests import encoder_folders, scenes  # noqa: E402
-from tests.core.test_scene_render import matrix  # noqa: E402
+from r5dgs_core import serve
+from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster import scene_render, stage, warming
+from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.semantics import encoders, lookup_table
+from tests import encoder_folders, scenes
+from tests.core.test_scene_render import matrix
 
 CAMERA = scenes.orbit_camera(0.2, 32, 24)
 CAMERA_JSON = {
@@ -267,7 +265,6 @@ def test_words_find_objects(path):
 
 
 def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
-    pytest.importorskip("transformers")
     folder = encoder_folders.sentences(tmp_path / "tiny")
     encoder = encoders.open_encoder(folder)
     made = lookup_table.make(scenes.make_scene(n=120, objects=2), encoder).scene

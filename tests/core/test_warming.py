@@ -9,15 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from r5dgs_core.raster import compile as compilation  # noqa: E402
-from r5dgs_core.raster import warming  # noqa: E402
-from r5dgs_core.scene import scene_file  # noqa: E402
-from tests import datasets as tiny_datasets  # noqa: E402
-from tests import scenes  # noqa: E402
+from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster import warming
+from r5dgs_core.scene import scene_file
+from tests import datasets as tiny_datasets
+from tests import scenes
 
 ROOT = Path(__file__).resolve().parents[2]
 
