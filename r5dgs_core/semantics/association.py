@@ -123,7 +123,7 @@ def associate(
         return _untouched(stack, _plain(stack, 0.0), 0.0)
     labels, objects = _objects(stack, runs, settings)
     found = assignment.refine(stack, runs, labels, objects)
-    before = _incoming(stack, runs)
+    before = _incoming(stack)
     sure = (found.labels > 0) & (found.margins >= DOUBTFUL) & (found.scores >= assignment.LOWEST)
     shown = stack.ids > 0
     confident = float(stack.pixels[sure].sum() / max(stack.pixels[shown].sum(), 1))
@@ -159,7 +159,7 @@ def _objects(stack: bags.Stack, runs: np.ndarray, settings: Settings) -> tuple[n
     return number[labels], int(enough.sum())
 
 
-def _incoming(stack: bags.Stack, runs: np.ndarray) -> assignment.Assignment:
+def _incoming(stack: bags.Stack) -> assignment.Assignment:
     """How well the incoming ids explain the images."""
     ids, labels = np.unique(np.where(stack.ids > 0, stack.ids, 0), return_inverse=True)
     labels = labels if ids[0] == 0 else labels + 1
@@ -169,7 +169,7 @@ def _incoming(stack: bags.Stack, runs: np.ndarray) -> assignment.Assignment:
 def _name(stack: bags.Stack, found: assignment.Assignment, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """New id of each segment, and the new id that its incoming id usually has in its view. [S], [S]"""
     shown = np.flatnonzero(stack.ids > 0)
-    number = int(found.labels.max())
+    number = int(found.labels.max(initial=0))  # -1 where nothing is an object's and no image shows background
     old, at = np.unique(stack.ids[shown], return_inverse=True)
     overlap = np.zeros((number + 1, len(old)))
     good = found.labels[shown] > 0

@@ -102,8 +102,6 @@ def stack(bags: Sequence[ImageBags]) -> Stack:
             raise ValueError(f"image {k}: expected ascending ids and a bag over {count} Gaussians for each of them")
     images = np.repeat(np.arange(len(bags)), [len(image.ids) for image in bags])
     weights = sparse.csr_matrix(sparse.vstack([image.weights for image in bags], "csr", np.float32))
-    members = sparse.csr_matrix((np.ones(len(images), np.float32), (images, np.arange(len(images)))))
-    members.resize(len(bags), len(images))
     seen, shared = [], []
     for image in bags:
         total = np.asarray(image.weights.sum(axis=0), np.float32).ravel()

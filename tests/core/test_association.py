@@ -186,6 +186,22 @@ def test_empty_masks_and_segments_without_gaussians_pass():
     assert not len(nothing.objects) and nothing.rows == []
 
 
+@pytest.mark.parametrize("rows", [[[1, 2]], [[1, 2], [3, 4]]])
+def test_images_of_objects_alone_that_share_nothing_keep_their_ids(rows):
+    given = [
+        bags.from_pixels(np.ones(2, int), np.array(own)[:, None], np.ones((2, 1)), 5, view=view, time=0)
+        for view, own in enumerate(rows)
+    ]
+    found = association.associate(given)
+    assert [ids.tolist() for ids in found.ids] == [[1]] * len(rows)
+
+
+def test_images_without_any_segment_have_no_objects():
+    unknown = bags.from_pixels(np.full(2, UNKNOWN), np.zeros((2, 1), int), np.ones((2, 1)), 3, view=0, time=0)
+    found = association.associate([unknown])
+    assert found.rows == [] and not len(found.objects) and found.ids[0].tolist() == []
+
+
 def test_many_gaussians_in_patches_part_the_segments_alike():
     seen = look(6, 3, 5)
     masks = renumbered(seen, 3)
