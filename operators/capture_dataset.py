@@ -1,13 +1,11 @@
 """Render the scene into a training data set: images, exact masks, cameras, times and poses."""
 
 import dataclasses
-from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..r5dgs_addon import amounts, capture, capture_objects, capture_views, running
-from ..r5dgs_core import errors
 
 
 def _items(identifiers, descriptions):
@@ -97,7 +95,7 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
     def settings(self) -> capture.CaptureSettings:
         """The properties as settings; a frame range that was not set is the scene's."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(capture.CaptureSettings)}
-        values["directory"] = Path(bpy.path.abspath(self.directory))
+        values["directory"] = self.target_folder()
         for name in ("frame_start", "frame_end"):
             if not self.properties.is_property_set(name):
                 values[name] = None
@@ -107,8 +105,6 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
         return bool(self.directory)
 
     def steps(self, context):
-        if not self.directory:
-            raise errors.ConfigError("capture.directory: expected a folder for the data set, got nothing; choose one")
         result = yield from capture.steps(context, self.settings())
         counts = ", ".join(f"{number} {split}" for split, number in result.images.items())
         unseen = [f"No image shows: {', '.join(result.unseen)}"] if result.unseen else []

@@ -1,12 +1,9 @@
 """Export Cameras: Blender's cameras as transforms.json or COLMAP text."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..r5dgs_addon import export_cameras, export_frames, export_gaussians, running
-from ..r5dgs_core import errors
 
 
 class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
@@ -34,11 +31,9 @@ class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
         return True
 
     def steps(self, context):
-        if not self.directory:
-            raise errors.ConfigError("export: expected a folder for the cameras, got nothing; choose one")
         return export_cameras.steps(
             context,
-            Path(bpy.path.abspath(self.directory)),
+            self.target_folder(),
             self.which,
             format=self.format,
             axes=self.axes,

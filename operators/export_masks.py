@@ -1,12 +1,9 @@
 """Export Masks: which object each pixel shows, as PNG masks and index EXR."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..r5dgs_addon import actions, export_frames, export_masks, running
-from ..r5dgs_core import errors
 
 
 class R5DGS_OT_export_masks(running.Running, actions.NeedsScene, bpy.types.Operator):
@@ -34,11 +31,8 @@ class R5DGS_OT_export_masks(running.Running, actions.NeedsScene, bpy.types.Opera
         return True
 
     def steps(self, context):
-        if not self.directory:
-            raise errors.ConfigError("export: expected a folder for the masks, got nothing; choose one")
-        folder = Path(bpy.path.abspath(self.directory))
         return export_masks.steps(
-            context, folder, format=self.format, every=self.frames == "RANGE", step=self.frame_step
+            context, self.target_folder(), format=self.format, every=self.frames == "RANGE", step=self.frame_step
         )
 
     def draw(self, context):

@@ -42,10 +42,9 @@ class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
         return False
 
     def steps(self, context):
-        path = Path(bpy.path.abspath(self.filepath))
         return export_gaussians.ply_steps(
             context,
-            path if path.suffix.lower() == ".ply" else path.with_name(path.name + ".ply"),
+            self.target_file(".ply"),
             self.which,
             axes=self.axes,
             plain=self.plain,

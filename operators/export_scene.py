@@ -1,7 +1,5 @@
 """Save Edited Scene: a loaded scene with its edits as a new .r5dgs file."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
@@ -35,13 +33,8 @@ class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Opera
         return False
 
     def steps(self, context):
-        path = Path(bpy.path.abspath(self.filepath))
-        return export_scene.steps(
-            context,
-            objects.active_collection(context),
-            path if path.suffix.lower() == ".r5dgs" else path.with_name(path.name + ".r5dgs"),
-            exact=self.exact,
-        )
+        target = self.target_file(".r5dgs")
+        return export_scene.steps(context, objects.active_collection(context), target, exact=self.exact)
 
 
 CLASSES = (R5DGS_OT_export_scene,)

@@ -1,10 +1,12 @@
 """Operators that run step by step: beside the window with progress and Esc, at once for scripts and in `blender -b`."""
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import bpy
 
@@ -63,6 +65,19 @@ class Running:
     def suggest(self, context: bpy.types.Context) -> bool:
         """Fill in a path where none is given. Returns whether to go on without asking for one."""
         return False
+
+    def target_file(self, suffix: str) -> Path:
+        """The file that ``filepath`` names, its suffix added where it is absent. ConfigError where it names none."""
+        path = bpy.path.abspath(self.filepath)
+        if not os.path.basename(path):
+            raise errors.ConfigError(f"{self.work.lower()}: expected a {suffix} file, got '{path}'; give it a name")
+        return Path(path if path.lower().endswith(suffix) else path + suffix)
+
+    def target_folder(self) -> Path:
+        """The folder that ``directory`` names. ConfigError where it names none."""
+        if not self.directory:
+            raise errors.ConfigError(f"{self.work.lower()}: expected a folder, got nothing; choose one")
+        return Path(bpy.path.abspath(self.directory))
 
     def invoke(self, context, event):
         self._interactive = True

@@ -283,3 +283,13 @@ def test_a_folder_that_is_not_there_is_an_error_and_no_file(blender, loaded, tmp
 
 def test_without_a_scene_the_operator_says_what_to_do(blender):
     assert not blender.ops.r5dgs.export_ply.poll()
+
+
+@pytest.mark.parametrize("operator", ["export_ply", "export_scene"])
+def test_a_path_that_names_no_file_is_refused_and_none_is_written_beside_it(blender, loaded, operator, tmp_path):
+    (tmp_path / "folder").mkdir()
+    before = sorted(tmp_path.iterdir())
+    for path in ("", "//", f"{tmp_path / 'folder'}/"):
+        with pytest.raises(RuntimeError, match="export: expected a .* file, got .*; give it a name"):
+            getattr(blender.ops.r5dgs, operator)(filepath=path)
+    assert sorted(tmp_path.iterdir()) == before
