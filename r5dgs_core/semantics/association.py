@@ -13,6 +13,7 @@ Notation: I images, S segments of an image, N Gaussians, k neighbours, K objects
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,24 +26,12 @@ from . import assignment, bags, clustering, patches, tracklets, votes
 
 GAIN = 0.5  # of the usual overlap that a pixel that changes must win on average for anything to change,
 FEW = 4  # and twice that with so few images: little evidence agrees with a wrong outcome by chance
+SHOWN = 0.03  # share of the images that must show an object; 2 to 4 of them whatever the share is
+MOST = 60_000  # Gaussians; more than this are put together to patches of neighbours first
+CERTAIN = 0.25  # share of the objects' pixels: where less of them is certain, nothing is changed
 DOUBTFUL = 0.55  # share of the score of the two best objects below which the better one is in doubt
 
 _NOBODY = -2  # id of what nobody can name, until all have one
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What the user of `associate` may choose.
-
-    Attributes:
-        fewest_share: Share of the images that must show an object; 2 to 4 of them whatever the share is.
-        gaussians: More Gaussians than this are put together to patches of neighbours first.
-        confident_share: Where less than this share of the objects' pixels is certain, nothing is changed.
-    """
-
-    fewest_share: float = 0.03
-    gaussians: int = 60_000
-    confident_share: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -95,13 +84,21 @@ class Association:
     usual_iou: float
     fallback: bool
 
+    @functools.cached_property
+    def sizes(self) -> dict[int, float]:
+        """Usual size of the segments of each outgoing id, pixels."""
+        pixels: dict[int, list[int]] = {}
+        for row in self.rows:
+            pixels.setdefault(row.new_id, []).append(row.pixels)
+        return {name: float(np.median(some)) for name, some in pixels.items()}
+
 
 def associate(
     images: Sequence[bags.ImageBags],
     neighbours: np.ndarray | None = None,
     *,
     paths: np.ndarray | None = None,
-    settings: Settings = Settings(),  # noqa: B008 - frozen
+    most: int = MOST,
 ) -> Association:
     """Find the objects that segments of many images show, and give the segments their ids.
 
@@ -109,19 +106,19 @@ def associate(
         images: Bags of each image, `bags.from_pixels`.
         neighbours: Nearest Gaussians of each; without them many Gaussians are thinned rather than put together. [N, k]
         paths: Places of the Gaussians at some times: those that do not move together are kept apart. [N, T, 3]
-        settings: See there.
+        most: More Gaussians than this are put together to patches first.
     """
     if not images:
         raise ValueError("expected at least one image")
     count = images[0].weights.get_shape()[1]
-    if count > settings.gaussians:
-        groups = patches.group(count, neighbours, paths, settings.gaussians)
+    if count > most:
+        groups = patches.group(count, neighbours, paths, most)
         images = [replace(image, weights=patches.pool(image.weights, groups)) for image in images]
     stack = bags.stack(images)
     runs = tracklets.link(stack)
     if not (runs >= 0).any():
         return _untouched(stack, _plain(stack, 0.0), 0.0)
-    labels, objects = _objects(stack, runs, settings)
+    labels, objects = _objects(stack, runs)
     found = assignment.refine(stack, runs, labels, objects)
     before = _incoming(stack)
     sure = (found.labels > 0) & (found.margins >= DOUBTFUL) & (found.scores >= assignment.LOWEST)
@@ -131,12 +128,12 @@ def associate(
     changed = float(stack.pixels[shown & (ids != stack.ids)].sum() / max(stack.pixels[shown].sum(), 1))
     gain = found.agreement - before.agreement
     needed = GAIN * (1 + FEW / len(stack.views)) * found.usual_iou * changed
-    if changed and (confident < settings.confident_share or gain < needed):
+    if changed and (confident < CERTAIN or gain < needed):
         return _untouched(stack, before, confident)
     return _result(stack, ids, usual, found, confident, before.agreement)
 
 
-def _objects(stack: bags.Stack, runs: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
+def _objects(stack: bags.Stack, runs: np.ndarray) -> tuple[np.ndarray, int]:
     """Objects to begin with and their number K. [S], 0 = background, -1 = none"""
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
@@ -150,7 +147,7 @@ def _objects(stack: bags.Stack, runs: np.ndarray, settings: Settings) -> tuple[n
     )
     of_runs = clustering.cluster(clustering.gather(weighed, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
-    fewest = int(np.clip(round(settings.fewest_share * len(stack.views)), 2, 4))
+    fewest = int(np.clip(round(SHOWN * len(stack.views)), 2, 4))
     pairs = np.unique(np.stack([labels, stack.images]), axis=1)
     enough = np.bincount(pairs[0], minlength=labels.max() + 1) >= min(fewest, len(stack.views))
     enough[0] = False

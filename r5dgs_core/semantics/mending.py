@@ -55,11 +55,10 @@ def mend(
     names = np.concatenate([[0], found.objects])
     shown = names[drawn.argmax(axis=-1)]
     shown[drawn.sum(axis=-1) <= 0] = 0
-    sizes = _sizes(found)
     result = out.copy()
     for name in lacks(found, image):
         where = shown == name
-        if where.sum() < LEAST * sizes.get(int(name), np.inf):
+        if where.sum() < LEAST * found.sizes.get(int(name), np.inf):
             continue
         segments, counts = np.unique(mask[where], return_counts=True)
         best = int(counts.argmax())
@@ -82,11 +81,3 @@ def relabel(mask: np.ndarray, ids: np.ndarray, new: np.ndarray) -> np.ndarray:
     """Put the new ids of segments in place of those that they came with. [H, W] int32"""
     at = np.minimum(np.searchsorted(ids, mask), len(ids) - 1)
     return np.where(ids[at] == mask, new[at], masks.UNKNOWN).astype(np.int32)
-
-
-def _sizes(found: association.Association) -> dict[int, float]:
-    """Usual size of each object's segments in pixels."""
-    rows: dict[int, list[int]] = {}
-    for row in found.rows:
-        rows.setdefault(row.new_id, []).append(row.pixels)
-    return {name: float(np.median(pixels)) for name, pixels in rows.items()}

@@ -209,11 +209,10 @@ def test_many_gaussians_in_patches_part_the_segments_alike():
     objects = np.concatenate([np.zeros(FLOOR, int), np.repeat(np.arange(1, 7), PER_BODY)])
     rng = np.random.default_rng(0)
     neighbours = np.stack([rng.choice(np.flatnonzero(objects == body), 4) for body in objects])
-    settings = association.Settings(gaussians=100)
     whole, patched, thinned = (
         association.associate(given),
-        association.associate(given, neighbours, settings=settings),
-        association.associate(given, settings=association.Settings(gaussians=300)),
+        association.associate(given, neighbours, most=100),
+        association.associate(given, most=300),
     )
     assert partition(whole.ids) == partition(patched.ids) == partition(thinned.ids)
 
