@@ -11,9 +11,24 @@ import math
 import numpy as np
 
 from .compile import helper, kernel, run_parts, threads
-from .cpu_projection import BOX_DIGIT, BOX_MARGIN, EXTENT_X, EXTENT_Y, L11, L12, L22, MEAN_X, MEAN_Y, MOST_TILES, TILE
+from .cpu_projection import (
+    BOX_DIGIT,
+    BOX_MARGIN,
+    EXTENT_X,
+    EXTENT_Y,
+    GEOMETRY,
+    L11,
+    L12,
+    L22,
+    MEAN_X,
+    MEAN_Y,
+    MOST_TILES,
+    TILE,
+)
+from .vectors import prefetch
 
 _BOX_BITS = np.uint64(BOX_DIGIT.bit_length() - 1)
+AHEAD = 16  # Gaussians
 _DIGIT = 11  # bits per pass of the radix sort
 _WORTH_A_THREAD = 4000  # Gaussians
 _MOST_PAIRS = (1 << 31) - 1  # slots are numbered in int32
@@ -157,9 +172,14 @@ def count_pairs(worker, workers, order, boxes, geometry, columns, tile_counts, s
         tile_counts: Takes the number of pairs per tile, one row per worker. [workers, tiles] int64
         slot_counts: Takes the number of pairs of each Gaussian, from its second entry on. [N + 1] int64, or empty
     """
-    counts = tile_counts[worker]
+    counts, flat_geometry = tile_counts[worker], geometry.reshape(-1)
     counts[:] = 0
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
+        if rank + AHEAD < len(order):  # depth order leads anywhere in memory
+            coming = np.int64(order[rank + AHEAD])
+            prefetch(boxes, coming)
+            prefetch(flat_geometry, coming * GEOMETRY)
+            prefetch(slot_counts, coming)
         i = order[rank]
         left, right, top, bottom = _box(boxes, i)
         first, last, slots = left, right, 0
@@ -177,8 +197,13 @@ def count_pairs(worker, workers, order, boxes, geometry, columns, tile_counts, s
 @kernel
 def fill_pairs(worker, workers, order, boxes, geometry, columns, cursors, slot_starts, pair_rows, pair_slots):
     """Write the pairs that `count_pairs` counted; ``cursors`` says where those of each worker begin in each tile."""
-    cursor = cursors[worker]
+    cursor, flat_geometry = cursors[worker], geometry.reshape(-1)
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
+        if rank + AHEAD < len(order):  # depth order leads anywhere in memory
+            coming = np.int64(order[rank + AHEAD])
+            prefetch(boxes, coming)
+            prefetch(flat_geometry, coming * GEOMETRY)
+            prefetch(slot_starts, coming)
         i = order[rank]
         left, right, top, bottom = _box(boxes, i)
         first, last = left, right
