@@ -61,8 +61,7 @@ def run_associate(
         names = {} if done.own_ids else dataset.object_names if dataset.own_ids else None
         made_with = {"scene": str(target.resolve()), "masks": str(dataset.mask_folder.resolve())}
         unmasked = [view for view in dataset.train if view.mask_path is None]
-        mask_repair.write(done, folder, names, made_with, unmasked)
-        summary = mask_repair.summary(done)
+        summary = mask_repair.write(done, folder, names, made_with, unmasked)
         if progress_kind == "json":
             progress({"event": "associated", "path": str(folder), **summary})
     if progress_kind != "json":

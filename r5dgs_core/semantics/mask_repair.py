@@ -52,15 +52,14 @@ class Repair:
         apart = self.result.fallback and len({view.mask_video for view in self.views}) > 1
         return mask_notes.VIDEO if apart else mask_notes.SCENE
 
-    def mask(self, index: int) -> np.ndarray:
-        """New ids of a view; pixels that were unknown stay so. [H, W] int32"""
-        return self.mended[index].astype(np.int32)
-
-    def filled(self, index: int) -> int:
-        """Pixels of a view that went to another object than the rest of their segment, or than the background."""
-        old = self.incoming[index]
-        ids = np.unique(old[old != masks.UNKNOWN])
-        return int((mending.relabel(old, ids, self.result.ids[index]) != self.mended[index]).sum())
+    @property
+    def filled(self) -> int:
+        """Images in which pixels went to another object than the rest of their segment, or than the background."""
+        count = 0
+        for old, new, own in zip(self.incoming, self.mended, self.result.ids, strict=True):
+            ids = np.unique(old[old != masks.UNKNOWN])
+            count += bool((mending.relabel(old, ids, own) != new).any())
+        return count
 
 
 def repair(
@@ -133,7 +132,7 @@ def write(
     names: dict[int, str] | None,
     made_with: dict[str, Any],
     unmasked: Sequence[datasets.View] = (),
-) -> None:
+) -> dict[str, Any]:
     """Write the new masks, the list of segments and what was found of the whole; `train --masks` reads the folder.
 
     Files: the masks by the names of their views; ``segments.csv``, one line for each segment with what became of it,
@@ -148,6 +147,9 @@ def write(
         made_with: For ``masks.json``: what the masks were made from.
         unmasked: Views of the data set without a mask, which get none.
 
+    Returns:
+        What ``association.json`` holds.
+
     Raises:
         DatasetError: A file cannot be written.
     """
@@ -160,33 +162,30 @@ def write(
             path.unlink(missing_ok=True)
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
-    seen: set[int] = set()
-    for index, view in enumerate(done.views):
-        ids = done.mask(index)
-        seen.update(np.unique(ids).tolist())
+    for view, ids in zip(done.views, done.mended, strict=True):
         masks.write(folder / f"{view.name}.png", ids)
-    present = sorted(seen - {0, masks.UNKNOWN})
+    videos, found = _videos(done), summary(done)
     try:
         if names is not None:
+            present = sorted({k for video in videos.values() for k in video.ids})
             called = {str(k): names.get(k, f"object {k}") for k in present}
             files.write(folder / OBJECTS, (json.dumps(called, indent=1) + "\n").encode())
         files.write(folder / SEGMENTS, _segments(done).encode())
-        files.write(folder / SUMMARY, (json.dumps(summary(done), indent=1) + "\n").encode())
+        files.write(folder / SUMMARY, (json.dumps(found, indent=1) + "\n").encode())
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be written: {error}") from error
-    videos = {"all": mask_notes.Video(tuple(view.name for view in done.views), tuple(present))}
-    if done.numbering == mask_notes.VIDEO:
-        videos = _videos(done)
     mask_notes.write(dataclasses.replace(notes, numbering=done.numbering, finished=True, videos=videos), folder)
+    return found
 
 
 def _videos(done: Repair) -> dict[str, mask_notes.Video]:
-    """The videos within which ids that stay hold."""
+    """The images within which the new ids hold, and the ids in them."""
     images: dict[str, list[str]] = {}
     found: dict[str, set[int]] = {}
-    for index, view in enumerate(done.views):
-        images.setdefault(view.mask_video, []).append(view.name)
-        found.setdefault(view.mask_video, set()).update(np.unique(done.mask(index)).tolist())
+    for view, ids in zip(done.views, done.mended, strict=True):
+        name = view.mask_video if done.numbering == mask_notes.VIDEO else "all"
+        images.setdefault(name, []).append(view.name)
+        found.setdefault(name, set()).update(np.unique(ids).tolist())
     return {
         name: mask_notes.Video(tuple(some), tuple(sorted(found[name] - {0, masks.UNKNOWN})))
         for name, some in images.items()
@@ -201,7 +200,7 @@ def summary(done: Repair) -> dict[str, Any]:
         "images": len(done.views),
         "segments": len(result.rows),
         **counts,
-        "mended": sum(done.filled(index) > 0 for index in range(len(done.views))),
+        "mended": done.filled,
         "objects": [int(k) for k in result.objects],
         "confident": round(result.confident, 4),
         "agreement": round(result.agreement, 4),
