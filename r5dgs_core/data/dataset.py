@@ -187,14 +187,9 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
             f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: 'r5dgs masks' with "
             "--from takes masks over that lie flat, --masks none goes without"
         )
-    if folders["train"] == folders["val"]:
-        views = _attach_mask_colors(views)
-    else:
-        views = _attach_mask_colors({"train": views["train"]}) | _attach_mask_colors(
-            {split: views[split] for split in SPLITS[1:]}
-        )
-    for split, folder in folders.items():
-        views[split] = _attach_notes(views[split], folder, hasher)
+    for folder in dict.fromkeys(folders.values()):
+        alike = _attach_mask_colors({split: views[split] for split in SPLITS if folders[split] == folder})
+        views |= _attach_notes(alike, folder, hasher)
     every = [view for split in SPLITS for view in views[split]]
     for view in every:
         for file in (view.image_path, view.mask_path):
@@ -351,20 +346,23 @@ def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[V
     return {split: tuple(replace(view, mask_colors=colors) for view in some) for split, some in views.items()}
 
 
-def _attach_notes(views: tuple[View, ...], folder: Path | None, hasher: Any) -> tuple[View, ...]:
+def _attach_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hasher: Any) -> dict[str, tuple[View, ...]]:
     """The views with what the folder of their masks says of these (`mask_notes`)."""
     if folder is None or not (folder / mask_notes.FILE).exists():
         return views
     notes = mask_notes.read(folder)
-    hasher.update(f"{notes.numbering} {notes.unknown}".encode())
     if not notes.finished:
         _log.warning("%s: masks are missing; give the command that makes them again", folder)
     videos = notes.video_of()
     lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
-    return tuple(
-        replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone)) if view.mask_path else view
-        for view in views
-    )
+
+    def told(view: View) -> View:
+        if view.mask_path is None:
+            return view
+        return replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone))
+
+    hasher.update(f"{notes.numbering} {notes.unknown}".encode() * len(views))  # for each split
+    return {split: tuple(map(told, some)) for split, some in views.items()}
 
 
 def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:

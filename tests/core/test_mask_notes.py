@@ -110,7 +110,7 @@ def test_masks_of_one_video_are_as_good_as_those_of_a_scene(copied):
 def test_masks_that_are_still_being_made_are_told(copied, caplog):
     mask_notes.write(mask_notes.MaskNotes(finished=False), copied / "object_mask")
     datasets.read(copied)
-    assert "masks are missing" in caplog.text
+    assert caplog.text.count("masks are missing") == 1  # though three splits have their masks there
 
 
 def test_an_id_that_16_bits_cannot_hold_is_named(copied, tmp_path):
