@@ -210,15 +210,13 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
     present = (folder / mask_notes.FILE).exists()
     if present and not overwrite:
         notes = mask_notes.read(folder)
-        same = (notes.backend, notes.numbering, dict(notes.made_with)) == (
-            fresh.backend,
-            fresh.numbering,
-            dict(fresh.made_with),
-        )
-        if same:
+        known, wanted = ({**one.made_with, "numbering": one.numbering} for one in (notes, fresh))
+        if notes.backend == fresh.backend and known == wanted:
             return dataclasses.replace(notes, finished=False)
-        changed = [key for key, value in fresh.made_with.items() if notes.made_with.get(key) != value]
-        other = f"other settings ({', '.join(changed)})" if notes.backend == backend.name else f"{notes.backend!r}"
+        changed = [key for key in {**wanted, **known} if known.get(key) != wanted.get(key)]
+        other = repr(notes.backend) if notes.backend else "what masks.json does not say"
+        if notes.backend == backend.name:
+            other = f"other settings ({', '.join(changed)})"
         raise errors.DatasetError(
             f"{folder}: its masks were made with {other}; name another folder with --out, or give --overwrite"
         )

@@ -112,6 +112,13 @@ def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views
         mask_making.make(views, Numbered(kind=2), tmp_path)
     assert mask_making.make(views, Numbered(kind=2), tmp_path, overwrite=True).kept == 0
     assert mask_notes.read(tmp_path).made_with == {"kind": 2}
+    together = Numbered(kind=2)
+    together.numbering = mask_notes.SCENE
+    with pytest.raises(errors.DatasetError, match=r"other settings \(numbering\)"):
+        mask_making.make(views, together, tmp_path)
+    mask_notes.write(mask_notes.MaskNotes(unknown=255), tmp_path)  # by hand, as docs/masks.md says
+    with pytest.raises(errors.DatasetError, match="were made with what masks.json does not say; name another folder"):
+        mask_making.make(views, Numbered(), tmp_path)
 
 
 def test_ids_of_one_video_are_the_folders_own(views, tmp_path):
