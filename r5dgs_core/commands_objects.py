@@ -89,15 +89,12 @@ def run_query(
     Returns:
         The matches, best first; where there are none, no picture is made.
     """
-    from .scene import scene_file
-
     if render is None and context:
         raise errors.ConfigError("--context: is for the picture; name it, too: --render FILE.png")
     check_picture("--render", render, picture.get("camera"), picture.get("t"), picture.get("size"))
-    found = commands_words.run_query(path, text, **options)
+    scene, found = commands_words.run_query(path, text, **options)
     if render is None or not found:
         return found
-    scene = scene_file.read(path)
     standpoint = render_objects(scene, [match.object_id for match in found], render, context=context, **picture)
     if not options.get("as_json"):
         print(f"written: {render} (camera {standpoint.camera.name}, t = {standpoint.t:g})")

@@ -81,7 +81,7 @@ def run_lookup(
 
 def run_query(
     path: Path, text: str, *, encoder: str | None = None, threshold: float | None = None, as_json: bool = False
-) -> list[Match]:
+) -> tuple[Scene, list[Match]]:
     """Say which objects of a scene file a text names or means.
 
     Args:
@@ -93,7 +93,7 @@ def run_query(
         as_json: Print JSON instead of a table.
 
     Returns:
-        The matches, best first.
+        The scene, and the matches, best first.
     """
     from .scene import lookup, scene_file
     from .semantics import query
@@ -105,8 +105,12 @@ def run_query(
         raise errors.ConfigError(f"query {text!r}: expected words for the objects to find, such as 'red mug'")
     scene = scene_file.read(path)
     unknown = query.unknown(scene, text)
-    found = query.find(scene, text, _encoder_for(scene, encoder, unknown, path), least)
-    said = "" if found else nothing(scene, text, unknown if encoder is None else [])
+    opened = _encoder_for(scene, encoder, unknown, path)
+    found = query.find(scene, text, opened, least)
+    if found:
+        said = "\n".join(f"nothing matches {phrase!r}" for phrase in query.unanswered(scene, text, opened, least))
+    else:
+        said = nothing(scene, text, unknown if encoder is None else [])
     if as_json:
         names = {item.id: item.name for item in scene.objects}
         rows = [
@@ -121,15 +125,12 @@ def run_query(
             for match in found
         ]
         print(json.dumps({"query": text, "threshold": least, "matches": rows, "note": said}, indent=1))
-    elif found:
-        _show(scene, found)
-        labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
-        for phrase in lookup.unanswered(labels, text, least, lookup.Meanings.of(scene)):
-            if encoder is None or phrase not in unknown:
-                print(f"nothing matches {phrase!r}")
     else:
-        print(said)
-    return found
+        if found:
+            _show(scene, found)
+        if said:
+            print(said)
+    return scene, found
 
 
 def run_name(
@@ -205,8 +206,7 @@ def nothing(scene: Scene, text: str, unknown: Sequence[str] = ()) -> str:
     """A sentence for a text that finds nothing; ``unknown`` are its phrases that an encoder might have known."""
     from .scene import lookup
 
-    labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id > 0]
-    said = lookup.explain_nothing(labels, text)
+    said = lookup.explain_nothing([label for label in lookup.labels_of(scene) if label.object_id > 0], text)
     if not unknown:
         return said
     asked = " and ".join(repr(phrase) for phrase in unknown)

@@ -61,6 +61,11 @@ class Label:
     aliases: tuple[str, ...] = ()
 
 
+def labels_of(scene: Scene) -> list[Label]:
+    """What the objects of a scene answer to, the background among them."""
+    return [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
+
+
 def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed | None = None) -> list[Match]:
     """Objects that a text names or means, best first.
 
@@ -73,8 +78,7 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed |
     Returns:
         Matches with score >= threshold, ranked by score, then by id; empty where nothing matches.
     """
-    labels = [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
-    return search_labels(labels, text, threshold, Meanings.of(scene), embed)
+    return search_labels(labels_of(scene), text, threshold, Meanings.of(scene), embed)
 
 
 def search_labels(

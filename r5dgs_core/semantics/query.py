@@ -25,15 +25,15 @@ def find(
     Raises:
         BackendError: The encoder is another one, or the scene has no table for it.
     """
-    if encoder is None:
-        return lookup.search(scene, text, threshold)
-    table = scene.lookup
-    if table is None:
-        raise errors.BackendError(
-            f"{scene.name}: has no lookup table for an encoder; make one: r5dgs lookup SCENE --encoder DIR"
-        )
-    check(table.encoder, encoder.card, scene.name)
-    return lookup.search(scene, text, threshold, lambda phrase: encoders.embed_phrases(encoder, [phrase])[0])
+    return lookup.search(scene, text, threshold, _embed(scene, encoder))
+
+
+def unanswered(
+    scene: Scene, text: str, encoder: encoders.Encoder | None = None, threshold: float = lookup.THRESHOLD
+) -> list[str]:
+    """Phrases of a text that no object matches; arguments as of `find`."""
+    meanings = lookup.Meanings.of(scene)
+    return lookup.unanswered(lookup.labels_of(scene), text, threshold, meanings, _embed(scene, encoder))
 
 
 def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
@@ -47,8 +47,18 @@ def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
 
 def unknown(scene: Scene, text: str) -> list[str]:
     """Phrases of a text that only an encoder can answer: no name says them, and no stored word does."""
-    labels = [lookup.Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
-    return lookup.unknown(labels, text, lookup.Meanings.of(scene))
+    return lookup.unknown(lookup.labels_of(scene), text, lookup.Meanings.of(scene))
+
+
+def _embed(scene: Scene, encoder: encoders.Encoder | None) -> lookup.Embed | None:
+    if encoder is None:
+        return None
+    if scene.lookup is None:
+        raise errors.BackendError(
+            f"{scene.name}: has no lookup table for an encoder; make one: r5dgs lookup SCENE --encoder DIR"
+        )
+    check(scene.lookup.encoder, encoder.card, scene.name)
+    return lambda phrase: encoders.embed_phrases(encoder, [phrase])[0]
 
 
 def _said(card: EncoderCard) -> str:

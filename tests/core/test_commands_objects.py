@@ -57,6 +57,13 @@ def test_the_legend_is_of_the_camera_time_and_size_that_were_asked_for(path, cap
     assert images.size(tmp_path / "best.png")[0] >= 1024
 
 
+def test_a_query_reads_its_scene_once(path, tmp_path, monkeypatch):
+    read, opened = scene_file.read, []
+    monkeypatch.setattr(scene_file, "read", lambda *given: opened.append(given) or read(*given))
+    commands_objects.run_query(path, "mug", {}, render=tmp_path / "mug.png", camera="0", t=0.4)
+    assert len(opened) == 1 and (tmp_path / "mug.png").exists()
+
+
 def test_a_query_draws_what_it_finds(path, capsys, tmp_path):
     names = [item.name for item in scene_file.read(path).objects if item.id > 0]
     text = said(capsys, "query", path, names[0], "--render", tmp_path / "one.png", "--camera", 0, "--time", 0.4)

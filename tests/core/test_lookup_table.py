@@ -315,6 +315,11 @@ def test_the_commands_find_by_meaning_without_an_encoder(file, capsys):
 def test_the_encoder_of_the_table_answers_other_words(file, capsys):
     assert cli.main(["query", str(file), "rusty hammers", "--encoder", "plain"]) == 0
     assert "hammer" in capsys.readouterr().out
+    assert cli.main(["query", str(file), "glorp and rusty hammers and lemon", "--encoder", "plain"]) == 0
+    said = capsys.readouterr().out
+    assert "nothing matches 'glorp'" in said and "matches 'rusty" not in said  # that even the encoder does not know
+    assert cli.main(["query", str(file), "elephant, lemon", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["note"] == "nothing matches 'elephant'"
     assert cli.main(["query", str(file), "lemon", "--encoder", "other"]) == 1
     assert "cannot be asked with" in capsys.readouterr().err
 
