@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..scene.cameras import Camera
-from . import cpu_blending, cpu_blending_backward, cpu_projection, cpu_tiles
+from . import cpu_blending, cpu_blending_backward, cpu_projection, cpu_segments, cpu_tiles
 from .compile import run
 from .reference import frustum_slopes
 from .settings import RasterSettings, RasterStats, SplatImage
@@ -211,8 +211,54 @@ def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
     return memory[skip : skip + size].view(dtype).reshape(shape)
 
 
-def _forward(inputs, plan: _Plan, with_state: bool):
-    """Project, sort, assign and blend. Returns the state or None, image, alpha, depth and ids."""
+def segment_weights(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    camera: Camera,
+    segments: np.ndarray,  # [H, W] int32
+    count: int,
+    settings: RasterSettings,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of Gaussians in segments of an image as entries: Gaussians, segments, weights. Of [E]
+
+    Several entries of the same Gaussian and segment, one per tile, add up. Inputs are those of
+    `segment_weights.segment_weights` and are checked there.
+    """
+    limits = pack_limits(settings)
+    plan = _Plan(camera, pack_view(camera, settings), limits, pack_labels(None), None)
+    inputs = (means, quats, scales, opacities, opacities[:, None], None)
+    state, *_ = _forward(inputs, plan, True, with_slots=False)
+    starts = np.append(0, np.cumsum(_kinds_per_tile(segments) * (state.tile_ends - state.tile_starts[:-1])))
+    counts = np.zeros(len(state.tile_ends), np.int64)
+    entries = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
+    run(
+        cpu_segments.weigh_segments, len(counts) // 2,
+        state.tile_starts, state.tile_ends, state.pair_rows, state.pair_blocks, state.geometry, state.depths, limits,
+        state.last_pairs, segments, count, starts, counts, *entries,
+    )  # fmt: skip
+    written = [slice(start, start + of_tile) for start, of_tile in zip(starts, counts, strict=False)]
+    rows, names, weights = (np.concatenate([array[part] for part in written]) for array in entries)
+    return rows, names, weights
+
+
+def _kinds_per_tile(segments: np.ndarray) -> np.ndarray:
+    """Number of segments that the pixels of each tile belong to. [H, W] -> [tiles] int64"""
+    size = cpu_projection.TILE
+    rows, columns = (-(-side // size) for side in segments.shape)
+    padded = np.full((rows * size, columns * size), -1, np.int32)
+    padded[: segments.shape[0], : segments.shape[1]] = segments
+    tiles = padded.reshape(rows, size, columns, size).swapaxes(1, 2).reshape(rows * columns, size * size)
+    tiles = np.sort(np.maximum(tiles, -1), axis=1)
+    return (tiles[:, 0] >= 0) + (np.diff(tiles, axis=1) > 0).sum(axis=1)
+
+
+def _forward(inputs, plan: _Plan, with_state: bool, with_slots: bool = True):
+    """Project, sort, assign and blend. Returns the state or None, image, alpha, depth and ids.
+
+    Without slots the state does not serve for gradients.
+    """
     *shapes, channels = (to_array(t) for t in inputs[:5])
     (n, n_channels), height, width = channels.shape, plan.camera.height, plan.camera.width
     rows = cpu_projection.padded_rows(n)
@@ -221,7 +267,7 @@ def _forward(inputs, plan: _Plan, with_state: bool):
     project(plan.view, shapes, geometry, depths, boxes, radii)
     order = cpu_tiles.sort_by_depth(depths, radii)
     tile_starts, pair_rows, pair_slots, slot_starts = cpu_tiles.assign_tiles(
-        order, boxes, geometry, width, height, with_state
+        order, boxes, geometry, width, height, with_state and with_slots
     )
     names, votes = plan.names_votes
     image = np.empty((height, width, n_channels), np.float32)

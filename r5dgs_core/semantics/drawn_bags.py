@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy import sparse
 
 from ..data import dataset as datasets
 from ..data import masks as id_masks
@@ -57,11 +56,11 @@ def draw(
             len(ids),
             settings=RasterSettings(near_plane=scene.near_plane),
             backend=backend,
-        ).numpy()
-        weights = np.where(weights >= LEAST, weights, 0)[:, known]
-        rows = sparse.csr_matrix(weights.T.astype(np.float32))
+        )[known]
+        weights.data[weights.data < LEAST] = 0
+        weights.eliminate_zeros()
         drawn.append(
-            bags.ImageBags(ids[known].astype(np.int32), pixels[known], rows, number[video_of[view.name]], view.t)
+            bags.ImageBags(ids[known].astype(np.int32), pixels[known], weights, number[video_of[view.name]], view.t)
         )
         if progress is not None:
             progress(done + 1)

@@ -61,7 +61,7 @@ def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: 
         with torch.no_grad():
             splats = pose(view)
         given = (splats.means, splats.quats, splats.scales, splats.opacities)
-        weights += segment_weights(*given, view.camera, target, kinds)
+        weights += torch.from_numpy(segment_weights(*given, view.camera, target, kinds).T.toarray())
     return weights
 
 
