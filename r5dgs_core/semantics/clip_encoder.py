@@ -55,19 +55,11 @@ class ClipEncoder:
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
         """See `encoders.Encoder`."""
-        parts = [np.zeros((0, self.card.dimension), np.float32)]
-        parts += [self._texts(texts[start : start + _BATCH]) for start in range(0, len(texts), _BATCH)]
-        return np.concatenate(parts)
+        return encoders.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
-    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """See `encoders.Encoder`."""
-        parts = [np.zeros((0, self.card.dimension), np.float32)]
-        for start in range(0, len(images), _BATCH):
-            batch = [np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8) for image in images[start : start + _BATCH]]
-            pixels = self._processor(images=batch, return_tensors="pt")["pixel_values"]
-            with self._torch.no_grad():
-                parts.append(_pooled(self._model.get_image_features(pixel_values=pixels)))
-        return np.concatenate(parts)
+        return encoders.in_batches(pictures, _BATCH, self._images, self.card.dimension)
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:
         tokens = self._tokenizer(
@@ -76,7 +68,14 @@ class ClipEncoder:
         with self._torch.no_grad():
             return _pooled(self._model.get_text_features(**{name: tokens[name] for name in self._inputs}))
 
+    def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        from ..data import images  # here, as OpenImageIO is not needed for words
+
+        pixels = self._processor(images=[images.to_uint8(each) for each in pictures], return_tensors="pt")
+        with self._torch.no_grad():
+            return _pooled(self._model.get_image_features(pixel_values=pixels["pixel_values"]))
+
 
 def _pooled(features: Any) -> np.ndarray:
-    """Unit rows of what transformers returns: an output with ``pooler_output``, a tensor before its version 5."""
-    return encoders.unit(getattr(features, "pooler_output", features).float().numpy())
+    """Rows of what transformers returns: an output with ``pooler_output``, a tensor before its version 5."""
+    return getattr(features, "pooler_output", features).float().numpy()

@@ -11,7 +11,7 @@ import importlib.util
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -44,7 +44,7 @@ class Encoder(Protocol):
         """Texts as they are, without templates. [n, D] float32, unit"""
         ...
 
-    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """Pictures [H, W, 3], sRGB in [0, 1]. [n, D] float32, unit. Raises `BackendError` where it cannot see."""
         ...
 
@@ -105,6 +105,14 @@ def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
         for template in encoder.card.templates
     )
     return unit(np.asarray(total))
+
+
+def in_batches(
+    items: Sequence[Any], size: int, embed: Callable[[Sequence[Any]], np.ndarray], dimension: int
+) -> np.ndarray:
+    """Unit embeddings of items, so many at once. [n, D] float32"""
+    parts = [embed(items[start : start + size]) for start in range(0, len(items), size)]
+    return unit(np.concatenate([np.zeros((0, dimension), np.float32), *parts]))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -170,10 +178,10 @@ def quieten() -> None:
     logging.set_verbosity_error()
 
 
-def missing_package(error: ImportError, extra: str = "encoders") -> errors.BackendError:
+def missing_package(error: ImportError) -> errors.BackendError:
     """What to say where an optional package is missing."""
     return errors.BackendError(
-        f"encoder: cannot import {error.name or error}; install what encoders need: pip install 'r5dgs[{extra}]'"
+        f"encoder: cannot import {error.name or error}; install what encoders need: pip install 'r5dgs[encoders]'"
     )
 
 

@@ -48,24 +48,21 @@ class OpenClipEncoder:
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
         """See `encoders.Encoder`."""
-        parts = [np.zeros((0, self.card.dimension), np.float32)]
-        for start in range(0, len(texts), _BATCH):
-            with self._torch.no_grad():
-                found = self._model.encode_text(self._tokenizer(list(texts[start : start + _BATCH])), normalize=True)
-            parts.append(encoders.unit(found.float().numpy()))
-        return np.concatenate(parts)
+        return encoders.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
-    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """See `encoders.Encoder`."""
+        return encoders.in_batches(pictures, _BATCH, self._images, self.card.dimension)
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        with self._torch.no_grad():
+            return self._model.encode_text(self._tokenizer(list(texts)), normalize=True).float().numpy()
+
+    def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         from PIL import Image
 
-        parts = [np.zeros((0, self.card.dimension), np.float32)]
-        for start in range(0, len(images), _BATCH):
-            batch = [
-                self._preprocess(Image.fromarray(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)))
-                for image in images[start : start + _BATCH]
-            ]
-            with self._torch.no_grad():
-                found = self._model.encode_image(self._torch.stack(batch), normalize=True)
-            parts.append(encoders.unit(found.float().numpy()))
-        return np.concatenate(parts)
+        from ..data import images
+
+        batch = [self._preprocess(Image.fromarray(images.to_uint8(each))) for each in pictures]
+        with self._torch.no_grad():
+            return self._model.encode_image(self._torch.stack(batch), normalize=True).float().numpy()

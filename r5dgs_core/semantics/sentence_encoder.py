@@ -53,31 +53,24 @@ class SentenceEncoder:
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
         """See `encoders.Encoder`."""
-        torch = self._torch
-        parts = [np.zeros((0, self.card.dimension), np.float32)]
-        for start in range(0, len(texts), _BATCH):
-            tokens = self._tokenizer(
-                list(texts[start : start + _BATCH]),
-                padding=True,
-                truncation=True,
-                max_length=self._longest,
-                return_tensors="pt",
-            )
-            with torch.no_grad():
-                states = self._model(**tokens).last_hidden_state.float()
-            if self._first:
-                pooled = states[:, 0]
-            else:
-                present = tokens["attention_mask"][..., None].float()
-                pooled = (states * present).sum(1) / present.sum(1).clamp(min=1)
-            parts.append(encoders.unit(pooled.numpy()))
-        return np.concatenate(parts)
+        return encoders.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
-    def embed_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """Refused: a sentence model has no eyes."""
         raise errors.BackendError(
             f"encoder {self.card.name}: a sentence model cannot look at pixels; give a CLIP or SigLIP folder for that"
         )
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        tokens = self._tokenizer(
+            list(texts), padding=True, truncation=True, max_length=self._longest, return_tensors="pt"
+        )
+        with self._torch.no_grad():
+            states = self._model(**tokens).last_hidden_state.float()
+        if self._first:
+            return states[:, 0].numpy()
+        present = tokens["attention_mask"][..., None].float()
+        return ((states * present).sum(1) / present.sum(1).clamp(min=1)).numpy()
 
 
 def _takes_first(folder: Path) -> bool:
