@@ -230,6 +230,7 @@ def segment_weights(
     plan = _Plan(camera, pack_view(camera, settings), limits, pack_labels(None), None)
     inputs = (means, quats, scales, opacities, opacities[:, None], None)
     state, *_ = _forward(inputs, plan, True, with_slots=False)
+    assert state is not None
     starts = np.append(0, np.cumsum(_kinds_per_tile(segments) * (state.tile_ends - state.tile_starts[:-1])))
     counts = np.zeros(len(state.tile_ends), np.int64)
     entries = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32), np.empty(starts[-1], np.float32)
