@@ -29,8 +29,8 @@ def animate(
     scene: Scene,
     motion_id: int,
     times: timeline.Times,
-    tolerance: float = TOLERANCE,
-    reach: float | None = None,
+    tolerance: float,
+    reach: float,
 ) -> None:
     """Key an anchor with the motion of its group; a group that stays put gets no keys.
 
@@ -40,7 +40,7 @@ def animate(
         motion_id: The motion group.
         times: Scene times and their frames.
         tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
-        reach: Of the group, from `reaches`; None to look for it.
+        reach: Of the group, from `reaches`.
     """
     if motion_id == 0:
         return
@@ -58,7 +58,7 @@ def animate(
         write(fcurves, "rotation_quaternion", rotation, times)
 
 
-def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: float | None = None) -> Curves:
+def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: float) -> Curves:
     """Keys of a motion group from the first knot to ``t_end``, over scene time.
 
     Args:
@@ -66,18 +66,17 @@ def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: 
         motion_id: The motion group.
         t_end: Last time; nothing is extrapolated where it is not past t_max.
         tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
-        reach: Of the group, from `reaches`; None to look for it.
+        reach: Of the group, from `reaches`.
 
     Returns:
         Displacement of the pivot and rotation, with a key at t_max unless they never change.
     """
-    radius = float(reaches(scene)[motion_id]) if reach is None else reach
     allowed = tolerance * scene.extent
-    observed = _observed(scene, motion_id, allowed, radius)
+    observed = _observed(scene, motion_id, allowed, reach)
     nearest = NEAREST / scene.frames_per_unit
     if t_end <= scene.t_max:
         return observed
-    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, radius, nearest=nearest)
+    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, reach, nearest=nearest)
     return reduction.join(observed, future)
 
 
