@@ -56,7 +56,7 @@ class R5DGS_OT_show_confidence(actions.NeedsScene, bpy.types.Operator):
             self.report({"WARNING"}, "Nothing moves after the last observed time")
             return {"CANCELLED"}
         context.view_layer.update()
-        self.report({"INFO"}, f"{count} tube{'' if count == 1 else 's'}, as thick as one standard deviation")
+        self.report({"INFO"}, f"{amounts.of(count, 'tube')}, as thick as one standard deviation")
         return {"FINISHED"}
 
 
