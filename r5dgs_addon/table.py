@@ -111,11 +111,6 @@ def entry_of(collection: bpy.types.Collection, object_id: int):
     return next((entry for entry in collection.r5dgs.table if entry.object_id == object_id), None)
 
 
-def is_kept(collection: bpy.types.Collection) -> bool:
-    """Whether changes of a scene's table are saved: not in one that is linked or overrides a linked one."""
-    return collection.library is None and collection.override_library is None
-
-
 def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str:
     """Rename an object: in the table, and its collection, anchor, clouds and shadow with it.
 
