@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core.scene import view_inverse
-from . import compat
+from . import compat, windows
 
 DISPLAY = "sRGB"  # what pictures were trained for
 LOOK_S = 0.25  # between two looks at what is wanted
@@ -251,15 +251,8 @@ def look() -> float:
         _wanted.pop(management, None)
         if management not in _inverses:
             _make(management)
-            _redraw()
+            windows.redraw("VIEW_3D", "PROPERTIES")
     return LOOK_S
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "PROPERTIES"):
-                area.tag_redraw()
 
 
 def register():

@@ -10,7 +10,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..r5dgs_core import errors
-from . import picture, worker
+from . import picture, windows, worker
 
 KEY = "live preview"  # what `worker.busy` knows its pictures by
 LOOK_S = 0.05  # between two looks while a picture is made
@@ -59,13 +59,13 @@ def look() -> float:
             _message = ""
         except errors.R5dgsError as error:
             _message = str(error)
-        _redraw()
+        windows.redraw("VIEW_3D", "IMAGE_EDITOR")
     if worker.busy() or bpy.app.is_job_running("RENDER"):
         return LOOK_S
-    windows = bpy.context.window_manager.windows
-    if not windows:
+    there = bpy.context.window_manager.windows
+    if not there:
         return IDLE_S
-    with bpy.context.temp_override(window=windows[0]):
+    with bpy.context.temp_override(window=there[0]):
         try:
             steps = picture.steps(picture.shown(bpy.context.evaluated_depsgraph_get()))
             if steps == _asked:
@@ -74,16 +74,9 @@ def look() -> float:
         except errors.R5dgsError as error:
             if str(error) != _message:
                 _message = str(error)
-                _redraw()
+                windows.redraw("VIEW_3D", "IMAGE_EDITOR")
             return IDLE_S
     return LOOK_S
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "IMAGE_EDITOR"):
-                area.tag_redraw()
 
 
 @persistent

@@ -13,7 +13,7 @@ import bpy
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import lookup, scene_file
-from . import phrases, picture, selection, table
+from . import phrases, picture, selection, table, windows
 
 HISTORY = 12  # prompts kept
 ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
@@ -145,15 +145,13 @@ def _has_window() -> bool:
 
 def _join(text: str, wrong: str) -> None:
     """Show the answer again, now that the encoder has said its part."""
-    windows = bpy.context.window_manager.windows
-    if not windows or bpy.context.window_manager.r5dgs_words.asked != text:
+    there = bpy.context.window_manager.windows
+    if not there or bpy.context.window_manager.r5dgs_words.asked != text:
         return
-    with bpy.context.temp_override(window=windows[0]):
+    with bpy.context.temp_override(window=there[0]):
         answer = _answer(bpy.context, text)
         _told(bpy.context, text, replace(answer, notes=[*answer.notes, f"Text encoder: {wrong}"]) if wrong else answer)
-    for window in windows:
-        for area in window.screen.areas:
-            area.tag_redraw()
+    windows.redraw()
 
 
 def _told(context: bpy.types.Context, text: str, answer: Answer) -> Answer:

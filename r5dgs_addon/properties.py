@@ -122,25 +122,19 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
     )
 
 
-class R5DGS_PG_session(bpy.types.PropertyGroup):
-    """What the sidebar shows; not saved."""
-
-
-CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene, R5DGS_PG_session)
+CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene)
 
 
 def register():
-    """Register the groups and hang them on objects, collections and the window manager."""
+    """Register the groups and hang them on objects and collections."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.r5dgs = PointerProperty(type=R5DGS_PG_object)
     bpy.types.Collection.r5dgs = PointerProperty(type=R5DGS_PG_scene)
-    bpy.types.WindowManager.r5dgs = PointerProperty(type=R5DGS_PG_session)
 
 
 def unregister():
     """Undo `register`."""
-    del bpy.types.WindowManager.r5dgs
     del bpy.types.Collection.r5dgs
     del bpy.types.Object.r5dgs
     for cls in reversed(CLASSES):

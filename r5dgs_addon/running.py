@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 
 from ..r5dgs_core import errors
+from . import windows
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Running:
         manager.modal_handler_add(self)
         self._timer = manager.event_timer_add(0.01, window=context.window)
         begin(self)
-        _say(context, f"{self.work}: begins; Esc stops")
+        windows.say(context, f"{self.work}: begins; Esc stops")
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
@@ -159,14 +160,14 @@ class Running:
             context.window_manager.progress_update(step.done / max(step.total, 1))
             rest = f", {left:.0f} s left" if step.done else ""
             stands = "" if step.slow else f", {step.done} of {step.total}{rest}; Esc stops"
-            _say(context, f"{self.work}: {step.what}{stands}")
+            windows.say(context, f"{self.work}: {step.what}{stands}")
 
     def _end(self, context):
         end(self)
         context.window_manager.event_timer_remove(self._timer)
         self._timer = None
         context.window_manager.progress_end()
-        _say(context, None)
+        windows.say(context, None)
 
 
 def begin(operator: bpy.types.Operator) -> None:
@@ -197,8 +198,3 @@ def cursor(context: bpy.types.Context) -> Iterator[Callable[[float], None]]:
         yield lambda share: manager.progress_update(100 * share)
     finally:
         manager.progress_end()
-
-
-def _say(context: bpy.types.Context, text: str | None) -> None:
-    if context.workspace is not None:
-        context.workspace.status_text_set(text)

@@ -4,7 +4,6 @@ While a view moves, pictures are small and the latest wish wins; once it rests, 
 Blender's own thread, gives wishes to the worker and takes pictures from it.
 """
 
-import contextlib
 import time
 import weakref
 from typing import Any
@@ -16,7 +15,7 @@ from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, view_inverse
-from . import amounts, engine_color, engine_settings, picture, views, visible, worker
+from . import amounts, engine_color, engine_settings, picture, views, visible, windows, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by
 LOOK_S = 0.01  # between two looks at the worker
@@ -167,14 +166,14 @@ def look() -> float | None:
         if not job.done:
             if job.seconds > 1.0:
                 port.say(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
-                _redraw()
+                windows.redraw("VIEW_3D")
             return LOOK_S if job.seconds < 1.0 else 0.25
         _asked = None
         try:
             port.take(wish, smaller, job.answer())
         except errors.R5dgsError as error:
             port.fail(wish, error)
-        _redraw()
+        windows.redraw("VIEW_3D")
     waiting = [(port, *following) for port in _ports if (following := port.next()) is not None]
     if not waiting:
         return None
@@ -187,7 +186,7 @@ def look() -> float | None:
             _asked = worker.submit(KEY, wish.requests(smaller)), port, wish, smaller
         except errors.R5dgsError as error:
             port.fail(wish, error)
-            _redraw()
+            windows.redraw("VIEW_3D")
         break
     return LOOK_S
 
@@ -199,11 +198,3 @@ def forget() -> None:
     _ports.clear()
     if bpy.app.timers.is_registered(look):
         bpy.app.timers.unregister(look)
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                with contextlib.suppress(ReferenceError):
-                    area.tag_redraw()

@@ -3,7 +3,7 @@
 import bpy
 
 from ..r5dgs_core import errors
-from . import running, worker
+from . import running, windows, worker
 
 
 class Waiting:
@@ -38,7 +38,7 @@ class Waiting:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         if not self._job.done:
-            _say(context, f"{self.waits_for}: {self._job.doing}, {self._job.seconds:.0f} s; Esc stops")
+            windows.say(context, f"{self.waits_for}: {self._job.doing}, {self._job.seconds:.0f} s; Esc stops")
             return {"PASS_THROUGH"}
         self._leave(context)
         return self._answered(context)
@@ -67,15 +67,8 @@ class Waiting:
     def _leave(self, context):
         running.end(self)
         context.window_manager.event_timer_remove(self._timer)
-        _say(context, None)
-        for window in context.window_manager.windows:
-            for area in window.screen.areas:
-                area.tag_redraw()
-
-
-def _say(context, text):
-    if context.workspace is not None:
-        context.workspace.status_text_set(text)
+        windows.say(context, None)
+        windows.redraw()
 
 
 def free(operator: type, key: str) -> bool:

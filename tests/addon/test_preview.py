@@ -236,9 +236,9 @@ def test_a_moved_scene_file_is_found_beside_the_blend_or_missed_by_name(blender,
 class Window:
     """As much of Blender's window and operator as `modal` touches: bpy has no window to run one in."""
 
-    def __init__(self, bpy, operator, job):
+    def __init__(self, operator, job):
         self.workspace, self.window, self.windows, self.said, self.removed = self, self, [], [], []
-        self.window_manager, self.r5dgs = self, bpy.context.window_manager.r5dgs
+        self.window_manager = self
         self.status_text_set, self.event_timer_remove = self.said.append, self.removed.append
         self.reports = []
         members = {"_job": job, "_timer": "timer", "report": lambda _, kind, text: self.reports.append((kind, text))}
@@ -255,7 +255,7 @@ def windowed(blender, loaded):
     """Starts a preview as the window does."""
     operator = importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview
     picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
-    return lambda: Window(blender, operator, picture.start(blender.context))
+    return lambda: Window(operator, picture.start(blender.context))
 
 
 def test_in_a_window_the_picture_comes_while_the_window_stays_free(blender, loaded, worker, windowed):
@@ -411,7 +411,7 @@ def test_who_waits_for_the_compiler_is_told_so(blender, loaded, worker, windowed
             time.sleep(0.01)
         assert "rasterizer" in worker.notice() and job.doing == worker.notice()
         assert worker.notice() in caplog.text
-        window = Window(blender, importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview, job)
+        window = Window(importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview, job)
         window.send("TIMER")
         assert worker.notice() in window.said[-1]
     job.answer()
