@@ -11,7 +11,6 @@ from . import (
     motion_physics,
     motion_pivot,
     panels,
-    phrases,
     preferences,
     properties,
     table,
@@ -34,7 +33,6 @@ MODULES = (
     handlers,
     click,
     worker,
-    phrases,
     live_preview,
 )
 

@@ -1,7 +1,7 @@
 """Embeddings of phrases that no scene file stores: the worker makes them with the encoder that the preferences name.
 
 They are kept for the session. `fetch` waits for the worker; `begin` lets it work beside the window, and a timer takes
-its answer.
+its answer, unless Blender opens another file: that ends the timer.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene.meanings import EncoderCard
@@ -121,22 +120,3 @@ def _keep(where: str, asked: Sequence[str], answer: worker.Answer) -> None:
     card = result["encoder"]
     for phrase, vector in zip(asked, arrays["embeddings"], strict=True):
         _known[where, phrase] = Embedded(card["digest"], card["name"], np.array(vector))
-
-
-@persistent
-def _forget_job(*_):
-    """Another file is about to be opened: what was asked in this one is not answered there."""
-    global _job, _then
-    _job, _then = None, None
-
-
-def register():
-    """Listen to loading."""
-    bpy.app.handlers.load_pre.append(_forget_job)
-
-
-def unregister():
-    """Undo `register`, and drop what is known."""
-    forget()
-    if _forget_job in bpy.app.handlers.load_pre:
-        bpy.app.handlers.load_pre.remove(_forget_job)

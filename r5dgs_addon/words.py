@@ -11,7 +11,7 @@ from bpy.props import (
 )
 
 from ..r5dgs_core.scene import lookup
-from . import prompt
+from . import phrases, prompt
 
 
 def _search(session: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
@@ -100,8 +100,9 @@ def register():
 
 
 def unregister():
-    """Undo `register`, and drop what was read from scene files."""
+    """Undo `register`, and drop what was read from scene files and said by the encoder."""
     prompt.forget()
+    phrases.forget()
     del bpy.types.WindowManager.r5dgs_words
     del bpy.types.Scene.r5dgs_words
     for cls in reversed(CLASSES):

@@ -125,3 +125,10 @@ def test_an_answer_that_comes_later_is_shown_where_its_prompt_still_stands(loade
     prompt()._join("zorb", "it is gone")
     shown = {match.object_id for match in session.matches}
     assert 2 in shown and notes(loaded) == ["Text encoder: it is gone"]
+
+
+def test_what_was_asked_in_another_file_is_not_answered_in_this_one(loaded):
+    phrases, told = importlib.import_module("r5dgs.r5dgs_addon.phrases"), []
+    phrases.begin(["zorb"], told.append)
+    loaded.ops.wm.read_homefile(app_template="")
+    assert not loaded.app.timers.is_registered(phrases.look) and told == []
