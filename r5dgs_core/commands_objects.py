@@ -44,6 +44,7 @@ def run_objects(
         What ``--json`` prints (`report.object_table.to_json`).
     """
     from .report import object_table
+    from .semantics import standpoints
 
     check_picture("--legend", legend, camera, t, size)
     scene, dataset = commands.open_target(target, data)
@@ -54,7 +55,7 @@ def run_objects(
     if dataset is None:
         views: list[Any] = object_table.own_views(scene)
     else:
-        views = object_table.spread((*dataset.val, *dataset.test) or dataset.train)
+        views = standpoints.spread((*dataset.val, *dataset.test) or dataset.train, object_table.MOST_VIEWS)
     rows = object_table.measure(scene, views, mode)
     result = object_table.to_json(scene, rows, len(views))
     if as_json:

@@ -113,16 +113,10 @@ def measure(
     return rows
 
 
-def spread(views: Sequence[Any], most: int = MOST_VIEWS) -> list[Any]:
-    """At most so many of some views, evenly."""
-    at = np.unique(np.linspace(0, max(len(views) - 1, 0), min(most, len(views))).round())
-    return [views[int(k)] for k in at]
-
-
-def own_views(scene: Scene, most: int = MOST_VIEWS) -> list[standpoints.Standpoint]:
+def own_views(scene: Scene) -> list[standpoints.Standpoint]:
     """Views of a scene's own cameras, each at another observed time; where it stores none, an overview at some."""
     first = float(scene.track_times[0])
-    cameras = spread(scene.cameras, most) or [standpoints.overview(scene)] * 3
+    cameras = standpoints.spread(scene.cameras, MOST_VIEWS) or [standpoints.overview(scene)] * 3
     # Steps of the golden ratio: neither the order of the cameras nor that of the times shows in the pairs.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
     times = first + shares * (scene.t_max - first)
@@ -208,25 +202,14 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
 def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
     """The same in JSON types: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
     objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
-    cleaned = {"hygiene": hygiene(scene), "label_hygiene": label_hygiene(scene)}
+    cleaned = {"hygiene": _recorded(scene, "regrouping"), "label_hygiene": _recorded(scene, "label_hygiene")}
     return {"scene": scene.name, "views": views, **cleaned, "objects": objects}
 
 
-def hygiene(scene: Scene) -> dict[str, Any] | None:
-    """What the cleaning of motion labels changed in training, as `train.bake` recorded it; None where it did not run.
-
-    Returns:
-        ``moving``, Gaussians that were asked, and how many of them went elsewhere: ``to_bodies``, ``to_shadows``,
-        ``to_rest`` (`train.groups.Moves`).
-    """
-    found = scene.provenance.get("regrouping")
-    return dict(found) if isinstance(found, dict) else None
-
-
-def label_hygiene(scene: Scene) -> dict[str, Any] | None:
-    """What the cleaning of the objects' labels changed in training (`train.label_hygiene.Changes`); None where it did
-    not run."""
-    found = scene.provenance.get("label_hygiene")
+def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:
+    """Counts that training left in the scene: ``regrouping`` of motion labels (`train.groups.Moves`) or
+    ``label_hygiene`` of the objects' (`train.label_hygiene.Changes`); None where it did not run."""
+    found = scene.provenance.get(key)
     return dict(found) if isinstance(found, dict) else None
 
 
@@ -243,11 +226,11 @@ def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
     parts.append("strays: members that move with another object")
     if any(row.iou is not None for row in rows):
         parts.append("IoU: with the true masks of these views, same ids")
-    found = hygiene(scene)
+    found = _recorded(scene, "regrouping")
     if found is not None:
         moved = sum(int(found.get(key, 0)) for key in ("to_bodies", "to_shadows", "to_rest"))
         parts.append(f"hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
-    cleaned = label_hygiene(scene)
+    cleaned = _recorded(scene, "label_hygiene")
     if cleaned is not None:
         rules = {rule: int(cleaned.get(rule, 0)) for rule in ("neighbours", "motion", "outliers")}
         by = ", ".join(f"{rule} {count}" for rule, count in rules.items())

@@ -103,10 +103,9 @@ def crops(
 
 
 def _standpoints(scene: Scene) -> list[standpoints.Standpoint]:
-    cameras = list(scene.cameras) or [standpoints.overview(scene)]
-    some = np.unique(np.linspace(0, len(cameras) - 1, min(_CAMERAS, len(cameras))).round().astype(int))
+    some = standpoints.spread(scene.cameras, _CAMERAS) or [standpoints.overview(scene)]
     times = np.unique(np.linspace(scene.track_times[0], scene.t_max, _TIMES))
-    return [standpoints.Standpoint(cameras[k], float(t)) for t in times for k in some]
+    return [standpoints.Standpoint(camera, float(t)) for t in times for camera in some]
 
 
 def _sighting(at: standpoints.Standpoint, small: Camera, mask: np.ndarray) -> Sighting:

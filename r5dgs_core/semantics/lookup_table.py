@@ -71,7 +71,10 @@ def make(
     """
     items = [item for item in scene.objects if item.id > 0 and item.count]
     empty = [item.name for item in scene.objects if item.id > 0 and not item.count]
-    found, notes = (_from_pictures if encoder.card.sees else _from_words)(scene, items, encoder, backend, progress)
+    if encoder.card.sees:
+        found, notes = _from_pictures(scene, items, encoder, backend, progress)
+    else:
+        found, notes = _from_words(items, encoder, progress)
     if empty:
         notes.append(f"without Gaussians, and so without an embedding: {', '.join(empty)}")
     if not found:
@@ -84,7 +87,7 @@ def make(
 
 
 def _from_words(
-    scene: Scene, items: Sequence[SceneObject], encoder: encoders.Encoder, _: str, progress: Progress | None
+    items: Sequence[SceneObject], encoder: encoders.Encoder, progress: Progress | None
 ) -> tuple[dict[int, _Views], list[str]]:
     """What objects are called, each phrase an embedding."""
     found, nameless = {}, []

@@ -20,7 +20,7 @@ from ..data import mask_notes, masks
 from ..data.annotations import OBJECTS
 from ..scene import files
 from ..scene.scene import Scene
-from . import association, drawn_bags, drawn_votes, mending
+from . import association, drawn_bags, drawn_votes, mending, standpoints
 
 NEIGHBOURS = 8
 TIMES = 16  # at most, of which places of the Gaussians are compared
@@ -104,10 +104,9 @@ def repair(
     )
     progress({"event": "prepare", "text": "associating segments"})
     _, neighbours = KDTree(scene.means).query(scene.means, min(NEIGHBOURS + 1, len(scene.means)), workers=-1)
-    times = np.unique([view.t for view in views])
-    some = times[np.linspace(0, len(times) - 1, min(TIMES, len(times))).round().astype(int)]
+    times = standpoints.spread(np.unique([view.t for view in views]).tolist(), TIMES)
     result = association.associate(
-        images, neighbours.reshape(len(scene.means), -1)[:, 1:], paths=drawn_bags.paths(scene, some)
+        images, neighbours.reshape(len(scene.means), -1)[:, 1:], paths=drawn_bags.paths(scene, np.array(times))
     )
     made = drawn_votes.mend(scene, views, incoming, images, result, backend=backend)
     mended = tuple(mask.astype(np.uint16) for mask in made)

@@ -66,14 +66,7 @@ def highlight(
     """Draw the whole scene, gray and dark but for some objects.
 
     A pixel keeps its colour by the share that the objects have in it, so their edges are as soft as they are drawn.
-
-    Args:
-        scene: The scene.
-        object_ids: The objects.
-        camera: The camera, in the scene's world.
-        t: Scene time, past t_max too.
-        mode: Way to move past t_max.
-        backend: Rasterizer.
+    Arguments as of `isolate`.
 
     Returns:
         Display-referred sRGB within [0, 1]. [H, W, 3] float32

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from ..scene.scene import Scene
 LOOK = 160  # longest side of the small pictures, pixels
 MOST_CAMERAS = 16  # that are tried
 NOTICED = 5e-4  # share of the picture from which on an object is seen
+
+Item = TypeVar("Item")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +73,7 @@ def candidates(scene: Scene, camera: str | None = None, t: float | None = None) 
     if camera is not None:
         some = [named(scene, camera)]
     elif scene.cameras:
-        at = np.unique(np.linspace(0, len(scene.cameras) - 1, min(MOST_CAMERAS, len(scene.cameras))).round())
-        some = [scene.cameras[int(k)] for k in at]
+        some = spread(scene.cameras, MOST_CAMERAS)
     else:
         some = [overview(scene)]
     first = float(scene.track_times[0])
@@ -101,6 +103,12 @@ def best(
     player = playback.Player(scene, mode)
     scores = [_score(scene, player, standpoint, object_ids, backend) for standpoint in among]
     return among[max(range(len(among)), key=lambda k: scores[k])]
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of some items, evenly, with the first and the last."""
+    at = np.linspace(0, max(len(items) - 1, 0), min(most, len(items))).round()
+    return [items[int(k)] for k in at]
 
 
 def sized(camera: Camera, longest: int) -> Camera:
