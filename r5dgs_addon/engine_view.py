@@ -137,42 +137,24 @@ def want(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
     if neutral not in _inverses and neutral not in _wanted:
         _wanted.clear()
         _wanted[neutral] = time.monotonic() + REST_S
-    return _ready(management)
+    found = _inverses.get(neutral)
+    return found if found is None or neutral == management else _exposed(found, management.exposure)
 
 
-def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> view_inverse.Inverse | None:
-    """The inverse of a scene's view, made now where this is Blender's own thread, else waited for.
+def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> None:
+    """Have the inverse of a scene's view made, now where this is Blender's own thread, else in time or not.
 
     Args:
         scene: Evaluated or not.
         stopped: Whether to wait no longer; called often.
-
-    Returns:
-        The inverse; None where it was not made, or not in time.
     """
-    management = of(scene)
-    neutral = _neutral(management)
-    if bpy.app.background or threading.current_thread() is threading.main_thread():
-        return prepare(scene)
+    neutral = _neutral(of(scene))
+    if neutral not in _inverses and (bpy.app.background or threading.current_thread() is threading.main_thread()):
+        _make(neutral)
     end = time.monotonic() + WAIT_S
     while neutral not in _inverses and time.monotonic() < end and not stopped():
         _wanted.setdefault(neutral, 0.0)
         time.sleep(0.02)
-    return _ready(management)
-
-
-def prepare(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
-    """Make the inverse of a scene's view now, where it was not; for Blender's own thread."""
-    management = of(scene)
-    if _neutral(management) not in _inverses:
-        _make(_neutral(management))
-    return _ready(management)
-
-
-def _ready(management: Management) -> view_inverse.Inverse | None:
-    neutral = _neutral(management)
-    found = _inverses.get(neutral)
-    return found if found is None or neutral == management else _exposed(found, management.exposure)
 
 
 def _neutral(management: Management) -> Management:
