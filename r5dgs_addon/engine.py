@@ -3,6 +3,7 @@
 A picture is what the depsgraph shows, see `picture`; so a frame of an animation is the frame that F12 renders.
 """
 
+import functools
 import time
 
 import bpy
@@ -86,7 +87,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
             )
         passes, transparent = engine_passes.of_layer(layer), scene.render.film_transparent
         mattes = engine_cryptomatte.pass_names(layer)
-        seen = picture.shown(depsgraph, eye=eye)
+        seen = picture.shown(depsgraph, functools.partial(views.of_camera, depsgraph, eye=eye))
         if seen.scenes:
             sky = engine_settings.of(scene).sky and not transparent
             steps = picture.steps(seen, engine_passes.wanted(passes, transparent), sky)

@@ -74,11 +74,21 @@ def pixels(
     if one == COMBINED:
         return engine_color.scene_linear(arrays["color"], arrays["alpha"] if transparent else None, inverse)
     if one == DEPTH:
-        return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING))[..., None].astype(np.float32)
+        return depths(arrays)[..., None]
     if one.name.startswith(engine_cryptomatte.LAYER):
         return engine_cryptomatte.pixels(arrays, seen, int(one.name[len(engine_cryptomatte.LAYER) :]))
-    indices = np.array([*(index_of(instance) for instance in seen.instances), 0], np.float32)
-    return indices[arrays["owners"]][..., None]  # none is -1, the last
+    return indices(arrays, seen)[..., None].astype(np.float32)
+
+
+def depths(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    """Depths of a picture with ``alpha`` and ``depth``, `NOTHING` where it is not solid. [H, W] float32"""
+    return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING)).astype(np.float32)
+
+
+def indices(arrays: dict[str, np.ndarray], seen: picture.Shown) -> np.ndarray:
+    """Object indices of a picture with ``owners``, 0 where nothing is in front. [H, W] int64"""
+    own = [index_of(instance) for instance in seen.instances]
+    return np.array([*own, 0], np.int64)[arrays["owners"]]  # none is -1, the last
 
 
 def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:

@@ -1,5 +1,6 @@
 """Which object each pixel shows, for a range of frames: masks as data sets have them, and index with depth as EXR."""
 
+import functools
 import json
 import time
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import files, image_files
-from . import amounts, engine_passes, export_cameras, export_frames, picture, table, views, visible, worker
+from . import amounts, engine_passes, export_cameras, export_frames, picture, table, views, worker
 from .running import Outcome, Step, Steps
 
 LOOK_S = 0.005  # between two looks at the worker
@@ -41,9 +42,8 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
             yield Step(number, len(frames), f"frame {frame}")
             export_frames.go_to(scene, frame)
             depsgraph = context.evaluated_depsgraph_get()
-            seen = picture.shown(depsgraph)
-            view = views.of_camera(depsgraph, visible.points(seen.instances), border=False)
-            seen = picture.Shown(view, seen.scenes, seen.worlds, seen.instances)
+            whole = functools.partial(views.of_camera, depsgraph, border=False)
+            seen = picture.shown(depsgraph, whole)
             job = worker.start(picture.steps(seen, ("owners", "depth", "alpha"), sky=False))
             try:
                 while not job.done:
@@ -72,10 +72,7 @@ def planes(seen: picture.Shown, arrays: dict[str, np.ndarray]) -> tuple[np.ndarr
     Returns:
         Indices int64, depths along the view and alphas float32. [H, W] each
     """
-    indices = np.array([*(engine_passes.index_of(instance) for instance in seen.instances), 0], np.int64)
-    solid = arrays["alpha"] >= engine_passes.SOLID
-    depth = np.where(solid, arrays["depth"], np.float32(engine_passes.NOTHING)).astype(np.float32)
-    return indices[arrays["owners"]], depth, arrays["alpha"].astype(np.float32)
+    return engine_passes.indices(arrays, seen), engine_passes.depths(arrays), arrays["alpha"].astype(np.float32)
 
 
 def _write(folder: Path, image: str, format: str, indices: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:

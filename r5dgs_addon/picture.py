@@ -6,6 +6,7 @@ they are, saves the same bytes, and linearises them where the compositor needs i
 """
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,17 +46,15 @@ class Shown:
 
 def shown(
     depsgraph: bpy.types.Depsgraph,
-    view: views.View | None = None,
+    looks: Callable[[Callable[[], np.ndarray]], views.View] | None = None,
     space: bpy.types.SpaceView3D | None = None,
-    eye: views.Eye | None = None,
 ) -> Shown:
     """What Blender shows of its loaded scenes at the evaluated frame, sub-frame included.
 
     Args:
         depsgraph: Evaluated; one of a viewport hides what viewports hide, one of a render what renders hide.
-        view: What looks, of `views`; the active camera where None.
+        looks: Gives what looks, of `views`, of points around what is seen; the active camera where None.
         space: A 3D view whose local view hides the rest.
-        eye: What looks instead of the active camera, where no view is given.
 
     Returns:
         View, scenes and instances.
@@ -64,8 +63,8 @@ def shown(
         ConfigError: The camera cannot be expressed, or a cloud has lost its points.
     """
     scenes, instances = visible.instances(depsgraph, space)
-    if view is None:
-        view = views.of_camera(depsgraph, visible.points(instances), eye=eye)
+    points = visible.points(instances)
+    view = views.of_camera(depsgraph, points) if looks is None else looks(points)
     return Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
 
 

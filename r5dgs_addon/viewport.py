@@ -4,6 +4,7 @@ While a view moves, pictures are small and the latest wish wins; once it rests, 
 Blender's own thread, gives wishes to the worker and takes pictures from it.
 """
 
+import functools
 import time
 import weakref
 from typing import Any
@@ -15,7 +16,7 @@ from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, view_inverse
-from . import amounts, engine_color, engine_settings, picture, views, visible, windows, worker
+from . import amounts, engine_color, engine_settings, picture, views, windows, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by
 LOOK_S = 0.01  # between two looks at the worker
@@ -148,11 +149,10 @@ class Port:
 def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
     """What the viewport that is being drawn should show."""
     scene, settings = depsgraph.scene, engine_settings.of(depsgraph.scene)
-    scenes, instances = visible.instances(depsgraph, context.space_data)
-    if not scenes:
+    looks = functools.partial(views.of_region, context.region, context.region_data)
+    seen = picture.shown(depsgraph, looks, context.space_data)
+    if not seen.scenes:
         raise errors.ConfigError("No R5DGS scene is shown; load one from File > Import")
-    view = views.of_region(context.region, context.region_data, visible.points(instances))
-    seen = picture.Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
     transparent = scene.render.film_transparent
     inverse = engine_color.inverse(scene)
     return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving), inverse)

@@ -110,8 +110,6 @@ def of_region(
     region: bpy.types.Region,
     region_3d: bpy.types.RegionView3D,
     points: Callable[[], np.ndarray],  # [P, 3]
-    width: int = 0,
-    height: int = 0,
 ) -> View:
     """What a 3D view shows.
 
@@ -119,15 +117,13 @@ def of_region(
         region: Its window region.
         region_3d: How it looks.
         points: Gives points around what is seen, Blender's world; called for orthographic views alone.
-        width: Width of the picture in pixels; the region's where 0.
-        height: Its height; the region's where 0.
 
     Returns:
         The view.
     """
     world = region_3d.view_matrix.inverted()
-    size = (width or max(region.width, 1), height or max(region.height, 1))
-    return _view(region_3d.window_matrix, world, *size, points, "", behind=not region_3d.is_perspective)
+    width, height = max(region.width, 1), max(region.height, 1)
+    return _view(region_3d.window_matrix, world, width, height, points, "", behind=not region_3d.is_perspective)
 
 
 def size_of(scene: bpy.types.Scene) -> tuple[int, int]:
