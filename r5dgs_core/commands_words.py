@@ -233,12 +233,14 @@ def _encoder_for(scene: Scene, encoder: str | None, unknown: Sequence[str], path
 def _show(scene: Scene, found: Sequence[Match]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     names = {item.id: item.name for item in scene.objects}
     table = Table("id", "name", "score", "cosine", "relevancy", "why")
     for match in found:
         numbers = ("-" if value is None else f"{value:.2f}" for value in (match.cosine, match.relevancy))
-        table.add_row(str(match.object_id), names[match.object_id], f"{match.score:.2f}", *numbers, match.why)
+        cells = (str(match.object_id), names[match.object_id], f"{match.score:.2f}", *numbers, match.why)
+        table.add_row(*map(Text, cells))  # without markup: names may hold brackets
     Console().print(table)
 
 

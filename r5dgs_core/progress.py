@@ -42,7 +42,7 @@ def _rich() -> Iterator[Progress]:
         BarColumn(),
         TextColumn("{task.fields[count]}"),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),  # paths and names may hold brackets
     ]
     with Progress(*columns) as bars:
         tasks: dict[str, TaskID] = {}

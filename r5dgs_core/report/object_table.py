@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -182,7 +183,8 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
         rows: Of `measure`.
         views: Number of views that were looked at.
     """
-    shown = Table(title=f"objects of {scene.name}", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    title = escape(f"objects of {scene.name}")
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     measured, compared = (any(getattr(row, key) is not None for row in rows) for key in ("rigid_rms", "iou"))
     numbers = (*(["bends"] if measured else []), "sure", "strays", *(["IoU"] if compared else []))
     for name in ("id", "name", "count", "pixels", "views", "motion", *numbers):

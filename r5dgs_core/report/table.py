@@ -7,6 +7,7 @@ from typing import Any
 
 from rich import box
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 
 from . import overlap
@@ -63,7 +64,7 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
         table.add_row("[bold]pose at the last time[/bold]", "position error", "rotation error", *rest)
     for row in rows:
         position, angle = f"{row['position_error']:.4f}", f"{row['rotation_error_deg']:.2f} deg"
-        table.add_row(f"{row['name']} ({row['id']})", position, angle, *rest)
+        table.add_row(_called(row["name"], row["id"]), position, angle, *rest)
     return table
 
 
@@ -120,8 +121,13 @@ def _overlaps(
             if same is not None and other is not None and str(other) != key:
                 cell += f" ({metrics['iou_objects_matched'][key]:.3f} as {other})"
             cells.append(cell)
-        rows.append((f"{named[key]} ({key})" if key in named else f"id {key}", cells))
+        rows.append((_called(named[key], key) if key in named else f"id {key}", cells))
     return [("[bold]IoU of each object, same ids[/bold]", [""] * len(columns)), *rows] if rows else []
+
+
+def _called(name: str, object_id: int | str) -> str:
+    """Name and id of an object; brackets in a name are no markup."""
+    return f"{escape(name)} ({object_id})"
 
 
 def _poses(evaluation: dict[str, Any]) -> list[Table]:
@@ -134,7 +140,7 @@ def _poses(evaluation: dict[str, Any]) -> list[Table]:
         table.add_column(name, justify=side)  # type: ignore[arg-type]
     for row in rows:
         errors = (f"{row['position_error']:.4f}", f"{row['rotation_error_deg']:.2f} deg")
-        table.add_row(f"{row['name']} ({row['id']})", *errors)
+        table.add_row(_called(row["name"], row["id"]), *errors)
     return [table]
 
 
@@ -155,18 +161,18 @@ def needs(rows: Sequence[dict[str, Any]]) -> Table:
     for row in rows:
         if row.get("object") != owner:
             table.add_section()
-        shown = "" if row.get("object") == owner else row.get("object", "")
+        shown = "" if row.get("object") == owner else escape(str(row.get("object", "")))
         owner = row.get("object")
         numbers = (f"{float(row.get(key, float('nan'))):.4g}" for key in ("value", "threshold"))
         table.add_row(
-            shown, str(row.get("name", "")), *numbers, str(row.get("decision", "")), str(row.get("reason", ""))
+            shown, str(row.get("name", "")), *numbers, str(row.get("decision", "")), escape(str(row.get("reason", "")))
         )
     return table
 
 
 def _title(evaluation: dict[str, Any]) -> str:
     train = evaluation["train"]
-    parts = [str(evaluation["scene"])]
+    parts = [escape(str(evaluation["scene"]))]
     if train.get("gaussians") is not None:
         parts.append(f"{train['gaussians']} Gaussians")
     if train.get("iterations") is not None:

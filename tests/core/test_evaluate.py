@@ -171,6 +171,16 @@ def test_the_table_shows_every_number_that_there_is(result):
     assert "LPIPS" not in text
 
 
+def test_brackets_in_names_are_shown_as_they_are(result):
+    objects = [{**row, "name": f"{row['name']} [/left]"} for row in result["objects"]]
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(table.make({**result, "scene": "[red]", "objects": objects}))
+    rows = [{"object": "mug [/left]", "name": "rotation", "value": 1.0, "threshold": 1.0, "reason": "[/b]"}]
+    console.print(table.needs(rows))
+    text = console.export_text()
+    assert "mug [/left] (1)" in text and "[red]" in text and "[/b]" in text and text.count("[/left]") == 7
+
+
 def test_several_modes_are_rows_that_fit_a_narrow_terminal(result):
     modes = ("rigid", "rigid/least_squares", "hybrid", "standard")
     splits = {split: {mode: found["rigid"] for mode in modes} for split, found in result["splits"].items()}

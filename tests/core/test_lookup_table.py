@@ -310,6 +310,8 @@ def test_the_commands_find_by_meaning_without_an_encoder(file, capsys):
     assert "'glorp' is not among the stored words; give the table's encoder" in capsys.readouterr().out
     assert cli.main(["query", str(file), "donut and a lemon"]) == 0
     assert "name 'donut'" in capsys.readouterr().out
+    assert cli.main(["name", str(file), "donut", "donut [/left]"]) == cli.main(["query", str(file), "donut"]) == 0
+    assert "donut [/left] │" in capsys.readouterr().out  # no markup
 
 
 def test_the_encoder_of_the_table_answers_other_words(file, capsys):
