@@ -103,7 +103,7 @@ def _moves(strip: bpy.types.NlaStrip) -> bool:
 
 def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.ndarray, np.ndarray]:
     """Location [3] and raw quaternion [4] that an anchor's keys give at a frame; F-curve modifiers left out."""
-    curves = where.curves()
+    curves = {name: curve for name, curve in where.curves().items() if len(curve.keyframe_points)}
     values = []
     for path, count in COMPONENTS:
         still = getattr(anchor, path)
@@ -120,17 +120,17 @@ def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.nd
 
 
 def _value(name: str, curve: bpy.types.FCurve, frame: float) -> float:
-    points = _Points(curve)
+    points = Points(curve)
     k = points.last(frame)
     if k >= 0 and points.at(k, frame):
         return float(points.co[k, 1])
     if k < 0:
-        return float(points.co[0, 1]) if len(points.co) else 0.0
+        return float(points.co[0, 1])
     return float(_cut(name, curve, points, k, frame)[-1, 3, 1])
 
 
-class _Points:
-    """Keys of a curve as arrays: co, left, right [K, 2]."""
+class Points:
+    """Keys of a curve as arrays: co, left, right [K, 2] float32."""
 
     def __init__(self, curve: bpy.types.FCurve):
         points = curve.keyframe_points
@@ -150,7 +150,7 @@ class _Points:
         return abs(float(self.co[k, 0]) - frame) <= AT
 
 
-def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: float) -> np.ndarray:
+def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: float) -> np.ndarray:
     """What the segment that starts with key k is up to a frame: one or two segments. [n, 4, 2]
 
     After the last key, what the curve holds.
@@ -162,7 +162,7 @@ def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: flo
             run, up = start - points.left[k]
             rise = float(up / run) if run > 0 else 0.0
         end = start + (frame - start[0]) * np.array([1.0, rise])
-        return np.stack([start + share * (end - start) for share in (0.0, 1 / 3, 2 / 3, 1.0)])[None]
+        return bezier.line(start, end)[None]
     stop = points.co[k + 1].astype(np.float64)
     kind = curve.keyframe_points[k].interpolation
     if kind not in _CUT:
@@ -174,8 +174,7 @@ def _cut(name: str, curve: bpy.types.FCurve, points: _Points, k: int, frame: flo
         return bezier.split(np.stack([start, points.right[k], points.left[k + 1], stop]).astype(np.float64), frame)[0]
     if kind == "CONSTANT":
         stop = np.array([stop[0], start[1]])
-    line = np.stack([start + share * (stop - start) for share in (0.0, 1 / 3, 2 / 3, 1.0)])
-    return bezier.split(line, frame)[0]
+    return bezier.split(bezier.line(start, stop), frame)[0]
 
 
 def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: dict[str, Keys]) -> None:
@@ -203,7 +202,7 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
         for index in range(count):
             if (path, index) in curves:
                 component = None if not changes else _component(tail, index)
-                _replace(anchor.name, curves[path, index], frame, component)
+                _replace(anchor, curves[path, index], frame, component)
     if where.strip is not None:
         _stretch(where.strip)
 
@@ -224,17 +223,18 @@ def _start(curve: bpy.types.FCurve, frame: float, value: float) -> None:
     curve.update()
 
 
-def _replace(name: str, curve: bpy.types.FCurve, frame: float, tail: Keys | None) -> None:
-    before = _Points(curve)
+def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, tail: Keys | None) -> None:
+    before = Points(curve)
     keep = before.last(frame) + 1
     points = curve.keyframe_points
     if keep == 0:  # the user took all keys before it; what is held there stays held
-        value = float(before.co[0, 1]) if before.count else 0.0
+        still = getattr(anchor, curve.data_path)[curve.array_index]  # of a curve without any
+        value = float(before.co[0, 1]) if before.count else still
         _shorten(curve, 0)
         _start(curve, frame, value)
-        before, keep = _Points(curve), 1
+        before, keep = Points(curve), 1
     elif not before.at(keep - 1, frame) and (tail is not None or keep < before.count):
-        parts = _cut(name, curve, before, keep - 1, frame)
+        parts = _cut(anchor.name, curve, before, keep - 1, frame)
         bends = curve.keyframe_points[keep - 1].interpolation == "BEZIER" and keep < before.count
         left_of_last = before.left[keep - 1].copy()
         _shorten(curve, keep)
@@ -246,7 +246,7 @@ def _replace(name: str, curve: bpy.types.FCurve, frame: float, tail: Keys | None
                 _free(points[keep - 1], left_of_last, part[1])
             left_of_last = part[2]
             keep += 1
-        before = _Points(curve)
+        before = Points(curve)
     _shorten(curve, keep)
     if tail is not None:
         gaps = np.diff(tail.times)
@@ -302,9 +302,9 @@ def _fill(
         points.foreach_set(field, whole)
 
 
-def _restore(curve: bpy.types.FCurve, before: _Points, keep: int) -> None:
+def _restore(curve: bpy.types.FCurve, before: Points, keep: int) -> None:
     """Put handles back that Blender moved by itself (automatic ones, as their neighbours changed)."""
-    after = _Points(curve)
+    after = Points(curve)
     for k in range(keep):
         last = k == keep - 1
         right = after.right[k] if last else before.right[k]
@@ -342,7 +342,7 @@ def digest(where: Place, frame: float) -> str:
     """A digest of all keys after a frame, to notice that somebody edited them."""
     found = hashlib.sha1(usedforsecurity=False)
     for (path, index), curve in sorted(where.curves().items(), key=lambda item: item[0]):
-        points = _Points(curve)
+        points = Points(curve)
         later = slice(points.last(frame) + 1, None)
         if len(points.co[later]):
             found.update(f"{path}{index}".encode())

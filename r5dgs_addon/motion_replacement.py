@@ -116,17 +116,11 @@ def apply(plan: Replacement) -> None:
 
 
 def _read(curve: bpy.types.FCurve) -> Curve:
-    points = curve.keyframe_points
-    handles, enums = [], []
-    for field in ("co", "handle_left", "handle_right"):
-        values = np.empty(2 * len(points), np.float32)
-        points.foreach_get(field, values)
-        handles.append(values.reshape(-1, 2))
-    for field in _ENUMS:
-        values = np.empty(len(points), np.int32)
-        points.foreach_get(field, values)
-        enums.append(values)
-    return Curve(*handles, np.stack(enums))
+    points = motion_curves.Points(curve)
+    enums = np.empty((len(_ENUMS), points.count), np.int32)
+    for field, values in zip(_ENUMS, enums, strict=True):
+        curve.keyframe_points.foreach_get(field, values)
+    return Curve(points.co, points.left, points.right, enums)
 
 
 def _constant(frame: float, value: float) -> Curve:

@@ -50,7 +50,7 @@ def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, flo
     times, place = motion_extrapolate.times_of(anchor), motion_curves.place(anchor)
     if place.strip is not None:
         raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
-    curves = place.curves()
+    curves = {name: curve for name, curve in place.curves().items() if len(curve.keyframe_points)}
     parts = {name: _segments(anchor.name, curve) for name, curve in curves.items()}
     if all(len(curve.keyframe_points) == 1 for curve in curves.values()):
         return times, allowed, {}
@@ -62,17 +62,14 @@ def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, flo
 
 def _segments(name: str, curve: bpy.types.FCurve) -> np.ndarray:
     """The segments of a curve; a single point where it has one key. [K, 4, 2]"""
-    points = curve.keyframe_points
-    co, left, right = (np.empty(2 * len(points), np.float32) for _ in range(3))
-    for field, values in (("co", co), ("handle_left", left), ("handle_right", right)):
-        points.foreach_get(field, values)
-    co, left, right = (values.reshape(-1, 2).astype(np.float64) for values in (co, left, right))
+    points = motion_curves.Points(curve)
+    co, left, right = (values.astype(np.float64) for values in (points.co, points.left, points.right))
     if len(co) == 1:
         return np.repeat(co[:, None], 4, axis=1)
     result = np.stack([co[:-1], right[:-1], left[1:], co[1:]], axis=1)
-    for k, point in enumerate(list(points)[:-1]):
+    for k, point in enumerate(list(curve.keyframe_points)[:-1]):
         if point.interpolation == "LINEAR":
-            result[k] = co[k] + np.array([[0.0], [1 / 3], [2 / 3], [1.0]]) * (co[k + 1] - co[k])
+            result[k] = bezier.line(co[k], co[k + 1])
         elif point.interpolation != "BEZIER" and co[k, 1] != co[k + 1, 1]:
             raise errors.ConfigError(
                 f"{name}: {curve.data_path}[{curve.array_index}] has the interpolation {point.interpolation.title()} "

@@ -24,6 +24,11 @@ def within(segment: np.ndarray) -> np.ndarray:
     return segment
 
 
+def line(start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+    """The segment that goes straight and steadily from one point to another. [2], [2] -> [4, 2]"""
+    return start + np.array([[0.0], [1 / 3], [2 / 3], [1.0]]) * (stop - start)
+
+
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Cut a segment at a time into segments that are the same curve together (de Casteljau).
 

@@ -608,3 +608,21 @@ def test_an_end_beyond_all_measure_is_refused_and_nothing_changes(blender, loade
         with pytest.raises(RuntimeError, match="expected an end up to 15.75"):
             blender.ops.r5dgs.extrapolate_until(t_end=t_end)
     assert motions.keys(mug) == before and loaded.r5dgs.t_end == 1.0
+
+
+def test_a_curve_that_has_lost_all_keys_holds_and_the_others_get_fewer(blender, loaded, mug):
+    curve = motions.curves(mug)["location", 2]
+    for point in list(curve.keyframe_points)[::-1]:
+        curve.keyframe_points.remove(point)
+    mug.location[2] = 0.3
+    assert blender.ops.r5dgs.simplify_keys(tolerance=1e-3) == {"FINISHED"}
+    assert motions.curves(mug)["location", 2].evaluate(20.0) == pytest.approx(0.3)
+
+
+def test_what_a_curve_without_keys_leaves_alone_is_where_the_new_motion_begins(blender, loaded, mug):
+    curve = motions.curves(mug)["location", 2]
+    for point in list(curve.keyframe_points)[::-1]:
+        curve.keyframe_points.remove(point)
+    mug.location[2] = 0.3
+    blender.ops.r5dgs.re_extrapolate()
+    assert motions.curves(mug)["location", 2].evaluate(LAST) == pytest.approx(0.3)
