@@ -112,22 +112,17 @@ def run_evaluate(
 
     from .progress import make
     from .report import evaluate, table
-    from .scene import playback
     from .train import checkpoint
 
     for mode in modes:
-        try:
-            playback.split(mode)
-        except ValueError:
-            raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
+        check_mode(mode)
     _check_json(json_path)
     scene, dataset = open_target(target, data)
     if dataset is None:
         raise errors.DatasetError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
     default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
     for mode in modes:
-        if not playback.available(scene, mode):
-            raise errors.ConfigError(f"--mode {mode}: {target} has data for {', '.join(playback.modes(scene))} only")
+        check_mode(mode, scene, target)
     with make(progress_kind) as progress:
         result = evaluate.evaluate(
             scene,
@@ -193,6 +188,18 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data than this; it is used all the same", dataset.root, target)
     return scene, dataset
+
+
+def check_mode(mode: str, scene: Scene | None = None, place: object = "") -> None:
+    """Refuse a playback mode that there is not, or that a scene, which is said by its place, has no data for."""
+    from .scene import playback
+
+    try:
+        playback.split(mode)
+    except ValueError:
+        raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
+    if scene is not None and not playback.available(scene, mode):
+        raise errors.ConfigError(f"--mode {mode}: {place} has data for {', '.join(playback.modes(scene))} only")
 
 
 def _check_json(path: Path | None) -> None:

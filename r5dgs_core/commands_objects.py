@@ -47,8 +47,9 @@ def run_objects(
     from .semantics import standpoints
 
     check_picture("--legend", legend, camera, t, size)
+    commands.check_mode(mode)
     scene, dataset = commands.open_target(target, data)
-    _check_mode(scene, target, mode)
+    commands.check_mode(mode, scene, target)
     standpoint = (
         None if legend is None else _standpoint(scene, [o.id for o in scene.objects if o.id > 0], camera, t, mode)
     )
@@ -93,6 +94,7 @@ def run_query(
     if render is None and context:
         raise errors.ConfigError("--context: is for the picture; name it, too: --render FILE.png")
     check_picture("--render", render, picture.get("camera"), picture.get("t"), picture.get("size"))
+    commands.check_mode(picture.get("mode", "rigid"))
     scene, found = commands_words.run_query(path, text, **options)
     if render is None or not found:
         return found
@@ -135,7 +137,7 @@ def render_objects(
     from .semantics import pictures, standpoints
 
     check_picture("--render", out, camera, t, size)
-    _check_mode(scene, scene.name, mode)
+    commands.check_mode(mode, scene, scene.name)
     empty = [item.name for item in scene.objects if item.id in object_ids and item.count == 0]
     if empty and len(empty) == len(object_ids):
         raise errors.ConfigError(f"--render {out}: {', '.join(empty)}: no Gaussians, so there is nothing to draw")
@@ -171,14 +173,3 @@ def _standpoint(
     from .semantics import standpoints
 
     return standpoints.best(scene, standpoints.candidates(scene, camera, t), object_ids, mode)
-
-
-def _check_mode(scene: Scene, place: object, mode: str) -> None:
-    from .scene import playback
-
-    try:
-        known = playback.available(scene, mode)
-    except ValueError:
-        raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
-    if not known:
-        raise errors.ConfigError(f"--mode {mode}: {place} has data for {', '.join(playback.modes(scene))} only")

@@ -15,7 +15,7 @@ from ..data import dataset as datasets
 from ..data import images
 from ..scene.scene import Scene
 from . import metrics, overlap
-from .evaluate import Rendering, render, truth_background
+from .evaluate import Rendering, is_later, render, truth_background
 
 COLUMNS = 4
 GAIN = 4.0
@@ -131,7 +131,7 @@ def draw(
             if column == 0:
                 axes.set_ylabel(rows[row], fontsize=11)
             if row == 0:
-                future = view.t > scene.t_max + 1e-9
+                future = is_later(scene, view.t)
                 when = f"t = {view.t:.3f}, past t_max" if future else f"t = {view.t:.3f}, observed"
                 score = metrics.psnr(shown.color, truth)
                 title = f"{when}\n{view.name} ({view.camera.name}), {score:.1f} dB"

@@ -40,8 +40,6 @@ METRICS = (
     "images",
     "images_later",
 )
-
-
 _SAME_TIME = 1e-9  # scene time
 
 
@@ -149,7 +147,7 @@ def measure(
         draw(scene, view.camera, view.t, move, backend=backend)  # compiles, fills what is kept; not timed
     for view in views:
         rendering = draw(scene, view.camera, view.t, move, backend=backend)
-        later = view.t > scene.t_max + _SAME_TIME
+        later = is_later(scene, view.t)
         tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view), later)
         if measured is not None:
             measured()
@@ -253,6 +251,11 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
         errors = {"position_error": float(position[0]), "rotation_error_deg": float(angle[0])}
         rows[body.object_id].update(errors)
     return [rows[key] for key in sorted(rows)]
+
+
+def is_later(scene: Scene, t: float) -> bool:
+    """Whether a time is past the scene's t_max: what it shows is extrapolated."""
+    return t > scene.t_max + _SAME_TIME
 
 
 class _Tally:

@@ -55,7 +55,7 @@ def draw(
     longest = max(camera.width, camera.height, LONGEST) if longest is None else longest
     camera = standpoints.sized(camera, longest)
     shown = evaluate.render(scene, camera, standpoint.t, mode, backend=backend)
-    future = standpoint.t > scene.t_max + 1e-9
+    future = evaluate.is_later(scene, standpoint.t)
     when = f"t = {standpoint.t:.4g}, past t_max = {scene.t_max:.4g}" if future else f"t = {standpoint.t:.4g}"
     return annotate(scene, shown.color, shown.ids, f"{scene.name}, camera {camera.name or '-'}, {when}")
 

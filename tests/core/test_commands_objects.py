@@ -105,6 +105,8 @@ def test_what_no_picture_can_be_made_of_is_refused_before_the_work(path, capsys,
         for lone in (["--camera", "1"], ["--time", "1"], ["--size", "64"]):
             assert f"{option} FILE.png" in complaint(capsys, *command, *lone)
     assert "--render FILE.png" in complaint(capsys, "query", path, "mug", "--context")
+    for command in (["objects", path], ["query", path, "mug"]):
+        assert "--mode wild: expected one of" in complaint(capsys, *command, "--mode", "wild")
 
 
 def test_a_camera_mode_or_time_that_is_not_there_is_named(path, capsys, tmp_path):
