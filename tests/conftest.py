@@ -41,8 +41,11 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """End at once where the bpy module is loaded and pytest is the program.
 
-    The module lets go of its types when the last reference to it goes. Where one is left, 4.2 does so after Python has
-    ended, and crashes; what pytest found would then not be its exit status.
+    The module frees Blender when the last reference to it goes; where one is left when Python has ended, 4.2 crashes,
+    and that would be the exit status instead of what pytest found. Two things leave one in a test run: pytest's
+    session, which its import hook keeps alive to the end with all that hangs on it, the tracebacks of a failure among
+    it; and a timer that is registered when another file is opened, which Blender lets go in the next pass of its event
+    loop, and the module has none. That the extension itself leaves none is for `addon/test_life.py` to say.
     """
     bpy = sys.modules.get("bpy")
     if bpy is None or bpy.app.binary_path or config.invocation_params.plugins or STATUS not in config.stash:

@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.scene import cameras, playback, scene_file
 from tests import layouts, scenes
+from tests.addon import conftest
 
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups", "scenes")
 
@@ -291,6 +293,22 @@ def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blen
             extension.register()
         assert {name.split(" at 0x")[0] for name in traces(blender)} == {name.split(" at 0x")[0] for name in present}
     assert plays(blender, load(blender, scene_path), scene_path)
+
+
+def test_a_script_that_uses_the_module_ends_as_it_should(blender, scene_path):
+    if blender.app.binary_path:
+        pytest.skip("Blender's Python has no module bpy outside of Blender")
+    lines = (
+        "import sys",
+        f"sys.path.insert(0, {str(conftest.ROOT)!r})",
+        "from tests.addon import conftest",
+        "conftest.load_extension().register()",
+        "import bpy",
+        f"assert bpy.ops.r5dgs.load_scene(filepath={str(scene_path)!r}) == {{'FINISHED'}}",
+        "assert bpy.ops.r5dgs.select_by_prompt(text='mug', mode='SET') == {'FINISHED'}",
+    )
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_what_was_loaded_lives_on_without_the_extension_and_is_known_again_after_it(blender, extension, scene_path):
