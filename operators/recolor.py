@@ -6,6 +6,15 @@ from bpy.props import FloatVectorProperty
 from ..r5dgs_addon import look, selection, table
 
 
+def tint(operator: bpy.types.Operator, context: bpy.types.Context, factors) -> set[str]:
+    """Tint the selected objects, and say which are not ours to tint. Returns what operators return."""
+    wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
+    linked = look.recolor(wanted, factors)
+    if linked:
+        operator.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
+    return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
+
+
 class R5DGS_OT_recolor(bpy.types.Operator):
     """Multiply the colors of the selected objects; previews, renders and exports obey it"""
 
@@ -32,11 +41,7 @@ class R5DGS_OT_recolor(bpy.types.Operator):
         return True
 
     def execute(self, context):
-        wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
-        linked = look.recolor(wanted, self.tint)
-        if linked:
-            self.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
-        return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
+        return tint(self, context, self.tint)
 
 
 CLASSES = (R5DGS_OT_recolor,)

@@ -3,6 +3,7 @@
 import bpy
 
 from ..r5dgs_addon import look, selection, table
+from . import recolor
 
 
 class R5DGS_OT_reset_color(bpy.types.Operator):
@@ -20,9 +21,7 @@ class R5DGS_OT_reset_color(bpy.types.Operator):
         return True
 
     def execute(self, context):
-        wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
-        look.recolor(wanted, look.NONE)
-        return {"FINISHED"}
+        return recolor.tint(self, context, look.NONE)
 
 
 CLASSES = (R5DGS_OT_reset_color,)

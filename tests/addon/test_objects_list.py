@@ -153,6 +153,18 @@ def test_of_a_linked_scene_only_what_is_kept_here_changes(blender, loaded, tmp_p
     assert all(obj.visible_get() for obj in clouds)
 
 
+def test_a_tint_that_is_linked_stays_and_that_is_said(blender, loaded, tmp_path, capfd):
+    loaded.all_objects["mug"].r5dgs_look.tint = TINT
+    blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    blender.ops.wm.read_homefile(app_template="", use_empty=True)
+    with blender.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    blender.context.scene.collection.children.link(target.collections[0])
+    blender.ops.r5dgs.select_by_prompt(text="mug")
+    assert blender.ops.r5dgs.reset_color() == {"CANCELLED"}
+    assert "Linked from another file, make a library override first: mug" in capfd.readouterr().out
+
+
 def test_the_list_filters_by_the_names_that_it_shows(blender, loaded):
     lists = importlib.import_module("r5dgs.r5dgs_addon.panels.objects")
     row_of(loaded, "mug").label = "Teapot"
