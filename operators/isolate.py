@@ -40,12 +40,13 @@ class R5DGS_OT_isolate(bpy.types.Operator):
             wanted = answer.objects
         else:
             wanted = selection.selected(context)
-        wanted = [(collection, object_id) for collection, object_id in wanted if object_id in table.present(collection)]
+        known = {collection: (table.names(collection), table.present(collection)) for collection, _ in wanted}
+        wanted = [(collection, object_id) for collection, object_id in wanted if object_id in known[collection][1]]
         if not wanted:
             self.report({"WARNING"}, "Select an object of a loaded scene, or type its name first")
             return {"CANCELLED"}
         hidden = isolation.isolate(context, wanted)
-        shown = ", ".join(table.names(collection)[object_id] for collection, object_id in wanted)
+        shown = ", ".join(known[collection][0][object_id] for collection, object_id in wanted)
         self.report({"INFO"}, f"{shown}: {amounts.of(hidden, 'other')} hidden; Un-Isolate shows all again")
         return {"FINISHED"}
 

@@ -103,7 +103,8 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
 
 def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:
     """A sentence for the user when nothing matched."""
-    labels = [label for each in loaded for label in table.labels(each) if label.object_id in table.present(each)]
+    there = [(table.labels(each), table.present(each)) for each in loaded]
+    labels = [label for own, ids in there for label in own if label.object_id in ids]
     said = lookup.explain_nothing(labels, text)
     return ". ".join([said[0].upper() + said[1:], *answer.notes])
 
