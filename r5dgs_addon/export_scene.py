@@ -45,18 +45,21 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
         SceneFileError: The scene's own file is gone, or the new one cannot be written.
     """
     _refuse_sources(path)
-    source = scene_file.read(picture.scene_path(collection))
+    own = picture.scene_path(collection)
+    source = scene_file.read(own)
     times = timeline.of_collection(collection)
     members, names = _members(collection)
     if any(member.cloud.r5dgs.start + member.cloud.r5dgs.count > len(source.means) for member in members):
         raise errors.SceneFileError(
-            f"{picture.scene_path(collection)}: expected the scene that '{collection.name}' was loaded from, found "
-            "another one; load it again"
+            f"{own}: expected the scene that '{collection.name}' was loaded from, found another one; load it again"
         )
     when = np.concatenate([source.track_times, _later(times)])
     earlier = _earlier(context.scene, times)
     with export_frames.frame_kept(context.scene):
-        before = [_matrices(context, collection, members, frame) for frame in earlier]
+        before = []
+        for frame in earlier:
+            depsgraph, back = _go_to(context, collection, frame)
+            before.append([back @ _matrix(member.cloud, depsgraph) for member in members])
         for number, t in enumerate(when):
             yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
@@ -85,7 +88,7 @@ def _refuse_sources(path: Path) -> None:
             own = picture.scene_path(collection)
         except errors.R5dgsError:
             continue
-        if path.exists() and own.exists() and path.samefile(own):
+        if path.exists() and path.samefile(own):
             raise errors.ConfigError(
                 f"{path}: '{collection.name}' plays from this file; save the edited scene under another name"
             )
@@ -106,15 +109,14 @@ def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
     return sorted({int(frame) for frame in np.linspace(first, end - 1, MOST_EARLIER)}) if first < end else []
 
 
-def _matrices(
-    context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float
-) -> list[np.ndarray]:
-    """Where clouds are at a frame, in the world of the file. [4, 4] each"""
+def _go_to(
+    context: bpy.types.Context, collection: bpy.types.Collection, frame: float
+) -> tuple[bpy.types.Depsgraph, np.ndarray]:
+    """Blender at a frame, and the map of its world to the file's then. [4, 4]"""
     whole = int(np.floor(frame))
     context.scene.frame_set(whole, subframe=min(float(frame - whole), 0.999999))
     depsgraph = context.evaluated_depsgraph_get()
-    back = np.linalg.inv(visible.world_of(collection, depsgraph))
-    return [back @ _matrix(member.cloud, depsgraph) for member in members]
+    return depsgraph, np.linalg.inv(visible.world_of(collection, depsgraph))
 
 
 def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allowed: float, extent: float) -> list[str]:
@@ -159,11 +161,9 @@ def _look(
     context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float, bind: bool
 ) -> None:
     """Note where clouds are at a frame, in the world of the file; at t_max where their anchors stand, too."""
-    matrices = _matrices(context, collection, members, frame)
-    depsgraph = context.evaluated_depsgraph_get()
-    back = np.linalg.inv(visible.world_of(collection, depsgraph))
-    for member, matrix in zip(members, matrices, strict=True):
-        member.matrices.append(matrix)
+    depsgraph, back = _go_to(context, collection, frame)
+    for member in members:
+        member.matrices.append(back @ _matrix(member.cloud, depsgraph))
         if bind and member.anchor is not None:
             member.pivot = (back @ _matrix(member.anchor, depsgraph))[:3, 3]
             parent = member.anchor.parent
@@ -184,6 +184,7 @@ def _pieces(member: _Member, source: Scene) -> list[edited.Piece]:
         return []
     remembers = anchor is not None and motion_physics.has_motion(anchor)
     keys = motion_physics.key_error(anchor)[0] if remembers else 0.0
+    model = motion_physics.model(anchor) if remembers else None
     return [
         edited.Piece(
             name=cloud.name,
@@ -195,7 +196,7 @@ def _pieces(member: _Member, source: Scene) -> list[edited.Piece]:
             matrices=matrices,
             pivot=member.pivot,
             parent=member.parent,
-            model=motion_physics.model(anchor) if remembers else None,
+            model=model,
             allowed=TOLERANCE * source.extent + KEY_SHARE * keys,
             tint=look.tint(cloud) if look.is_tinted(cloud) else None,
         )
