@@ -25,9 +25,7 @@ def helper_of(anchor: bpy.types.Object) -> bpy.types.Object | None:
 
 def moves(anchor: bpy.types.Object, times: timeline.Times) -> bool:
     """Whether an anchor has a path past t_max."""
-    state = anchor.r5dgs_motion
-    mover = anchor if motion_physics.follow_matrix(state) is None else state.leader
-    return times.t_end > times.t_max and not motion_physics.model(mover).is_static
+    return times.t_end > times.t_max and not motion_physics.model(motion_physics.mover(anchor)).is_static
 
 
 def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | None:
@@ -89,9 +87,8 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     """
     tau = np.linspace(0.0, times.t_end - times.t_max, STEPS + 1)
     start, _ = motion_curves.pose_at(anchor, motion_curves.place(anchor), times.frame(times.t_max))
-    state = anchor.r5dgs_motion
-    follow = motion_physics.follow_matrix(state)
-    model = motion_physics.model(anchor if follow is None else state.leader)
+    follow = motion_physics.follow_matrix(anchor.r5dgs_motion)
+    model = motion_physics.model(motion_physics.mover(anchor))
     _, displacements = models.evaluate(model, tau)
     sigmas = confidence.position_sigma(model, tau)
     if follow is not None:

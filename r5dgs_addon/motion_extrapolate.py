@@ -125,9 +125,7 @@ def _sampler(
     Raises:
         ConfigError: The motion cannot be, or would take minutes to integrate.
     """
-    state = anchor.r5dgs_motion
-    follow = motion_physics.follow_matrix(state)
-    mover = anchor if follow is None else state.leader
+    follow, mover = motion_physics.follow_matrix(anchor.r5dgs_motion), motion_physics.mover(anchor)
     model = motion_physics.model(mover)
     if follow is None and model.inertia is not None:
         turn = rotations.quats_to_rotmats(rotations.normalize(quat))

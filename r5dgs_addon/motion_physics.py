@@ -361,6 +361,11 @@ def follow_matrix(state: bpy.types.PropertyGroup) -> np.ndarray | None:
     return np.eye(3) if matrix is None else np.array(matrix, np.float64)
 
 
+def mover(anchor: bpy.types.Object) -> bpy.types.Object:
+    """The anchor whose motion moves an anchor: the one that it follows, or itself."""
+    return anchor.r5dgs_motion.leader or anchor
+
+
 def register():
     """Register the group and hang it on objects."""
     bpy.utils.register_class(R5DGS_PG_motion)
