@@ -141,6 +141,9 @@ def _check(
 
 def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
     """What was done, and what to do next."""
+    from .data import dataset as datasets
+    from .data import mask_notes
+
     objects = "1 object" if made.objects == 1 else f"{made.objects} objects"
     lines = [f"{made.folder}: masks of {made.images} of {wanted} training images, {objects}"]
     if made.kept:
@@ -149,8 +152,8 @@ def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
         lines.append(f"nothing is known of {100 * made.unknown:.1f} % of the pixels")
     if in_place:
         lines.append("they can be read, and nothing was written")
-    if made.numbering == "video" and made.videos > 1:
-        own = "" if made.folder == root / "object_mask" else f" --masks {made.folder}"
+    if made.numbering == mask_notes.VIDEO and made.videos > 1:
+        own = "" if made.folder == root / datasets.MASKS else f" --masks {made.folder}"
         lines.append(
             f"ids hold within each of {made.videos} videos only. Next: r5dgs train {root} --masks none --out RUN, "
             f"then r5dgs associate RUN{own}"

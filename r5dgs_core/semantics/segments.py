@@ -96,7 +96,8 @@ def new_ones(segments: Sequence[Segment], known: Sequence[np.ndarray], overlap: 
         known: Masks of objects. [s, s] bool
         overlap: A segment whose IoU with one of them is this or more is that object.
     """
-    return [segment for segment in segments if all(iou(segment.mask, mask) < overlap for mask in known)]
+    pairs = [(segment, segment.mask) for segment in segments]
+    return [segment for segment, mask in pairs if all(iou(mask, other) < overlap for other in known)]
 
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:

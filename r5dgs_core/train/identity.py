@@ -279,16 +279,15 @@ class JointIdentity:
             features: Blended encodings out of the pass that drew the colours; of "joint". [H, W, 16]
         """
         section = self._section
+        weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
         terms = []
         if view.mask is not None and section.weight > 0:
             if not self.with_geometry and iteration % section.every == 0:
                 features = _rasterize(splats, gaussians.identities, view)
             if features is not None:
                 target = class_map(view, self._classes)
-                weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
                 terms.append(section.weight * identity_losses.pixel_cross_entropy(features, weight, bias, target))
         if iteration % section.regularise_every == 0 and self._agreement.counts:
-            weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
             near = self._neighbours(gaussians, iteration)
             terms.append(self._agreement.loss(gaussians.identities, weight, bias, near, self._generator))
         return sum(terms[1:], terms[0]) if terms else None
