@@ -27,6 +27,7 @@ class Precomputed:
 
     Raises:
         DatasetError: It holds none of the views' masks, or they cannot be understood.
+        ConfigError: ``unknown`` cannot be a value of theirs.
     """
 
     name = "precomputed"
@@ -53,6 +54,10 @@ class Precomputed:
                 "their images"
             )
         self._colors = masks.color_table(found)
+        if self._colors and unknown is not None:
+            raise errors.ConfigError(
+                f"--unknown {unknown}: the masks in {folder} are coded by colour, of which none says that; leave it out"
+            )
         own_names = self.folder / OBJECTS
         self.own_names = own_names if own_names.is_file() else None
         self.made_with: dict[str, Any] = {"folder": str(self.folder.resolve()), "unknown": self.unknown}

@@ -163,6 +163,8 @@ def test_coloured_masks_of_a_folder_become_ids(copied, tmp_path):
     view = datasets.read(copied).train[7]
     got = masks.read(tmp_path / "ids" / f"{view.name}.png")
     np.testing.assert_array_equal(got, np.array([0, 2, 1])[datasets.load_mask(view)])
+    with pytest.raises(errors.ConfigError, match="--unknown 255: the masks in .* are coded by colour"):
+        commands_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "other", unknown=255)
 
 
 def test_masks_in_their_place_are_checked_and_left_alone(copied, capsys):
