@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r5dgs_core.data import images
+from r5dgs_core.data import dataset, images
 from r5dgs_core.motion import rotations
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import cameras, playback
@@ -19,8 +19,8 @@ OBSERVED, LATER = (0.0, 0.3, 0.75), (0.85, 1.0)
 BACKEND = "reference"
 
 
-def write_dataset(root: Path, scene: Scene) -> None:
-    """The scene's own pictures, id maps and poses in the layout that `dataset.read` knows."""
+def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
+    """The scene's own pictures, id maps and poses, written in a layout that `dataset.read` knows and read back."""
     views = {
         "train": [(k, t) for t in OBSERVED for k in (0, 1)],
         "val": [(2, 0.1), (2, 0.6)],
@@ -54,3 +54,4 @@ def write_dataset(root: Path, scene: Scene) -> None:
             matrices.append((motion @ offset).tolist())
         rows.append({"id": group.object_id, "name": scene.object(group.object_id).name, "matrices": matrices})
     (root / "ground_truth.json").write_text(json.dumps({"t_max": 0.75, "times": times, "objects": rows}))
+    return dataset.read(root)

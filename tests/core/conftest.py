@@ -1,10 +1,11 @@
-"""The tiny data set and one training of it, made once for all tests that look at them."""
+"""What is made once for all tests that look at it: the tiny data set, one training of it, a scene and its pictures."""
 
 import pytest
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import bake, run
 from tests import datasets as tiny_datasets
+from tests import pictures, scenes
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +25,15 @@ def trained(tiny, tmp_path_factory):
 def baked(trained, tiny):
     """The scene of that run."""
     return bake.bake(trained, datasets.read(tiny.root))
+
+
+@pytest.fixture(scope="session")
+def scene():
+    """A synthetic scene of three objects."""
+    return scenes.make_scene(n=240, objects=3, seed=5)
+
+
+@pytest.fixture(scope="session")
+def data(scene, tmp_path_factory):
+    """A data set of its own pictures."""
+    return pictures.write_dataset(tmp_path_factory.mktemp("own pictures"), scene)

@@ -3,25 +3,12 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from r5dgs_core.data import dataset, images
 from r5dgs_core.report import contact_sheet, evaluate
-from tests import pictures, scenes
+from tests import pictures
 
 BACKEND = pictures.BACKEND
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return scenes.make_scene(n=240, objects=3, seed=5)
-
-
-@pytest.fixture(scope="module")
-def data(scene, tmp_path_factory):
-    root = tmp_path_factory.mktemp("own pictures")
-    pictures.write_dataset(root, scene)
-    return dataset.read(root)
 
 
 def test_the_contact_sheet_takes_two_observed_and_two_later_times_of_one_camera(scene, data, tmp_path):

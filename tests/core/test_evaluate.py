@@ -17,18 +17,6 @@ BACKEND = pictures.BACKEND
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return scenes.make_scene(n=240, objects=3, seed=5)
-
-
-@pytest.fixture(scope="module")
-def data(scene, tmp_path_factory):
-    root = tmp_path_factory.mktemp("own pictures")
-    pictures.write_dataset(root, scene)
-    return dataset.read(root)
-
-
-@pytest.fixture(scope="module")
 def result(scene, data):
     return evaluate.evaluate(scene, data, backend=BACKEND)
 

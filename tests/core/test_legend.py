@@ -12,11 +12,6 @@ from tests import scenes
 BACKEND = "reference"
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return scenes.make_scene(n=240, objects=3, seed=5)
-
-
 def board(height=720, width=960):
     """An id map: object 1 large, object 2 small, object 3 not there."""
     ids = np.zeros((height, width), np.int32)

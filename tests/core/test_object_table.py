@@ -8,23 +8,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from r5dgs_core.data import dataset
 from r5dgs_core.report import evaluate, object_table
-from tests import pictures, scenes
+from tests import pictures
 
 BACKEND = pictures.BACKEND
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return scenes.make_scene(n=240, objects=3, seed=5)
-
-
-@pytest.fixture(scope="module")
-def data(scene, tmp_path_factory):
-    root = tmp_path_factory.mktemp("own pictures")
-    pictures.write_dataset(root, scene)
-    return dataset.read(root)
 
 
 def shown(scene, rows, width=100):

@@ -16,11 +16,6 @@ CAMERA = scenes.orbit_camera(0.5, 48, 36)
 LATER = 1.1
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return scenes.make_scene(n=240, objects=3, seed=5)
-
-
 def drawn(scene, t, background):
     frame = playback.frame(scene, t)
     return scene_render.render_frame(scene, frame, CAMERA, background=background, backend=BACKEND)

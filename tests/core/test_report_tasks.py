@@ -62,9 +62,7 @@ def field(scene):
 
 @pytest.fixture(scope="module")
 def data(scene, tmp_path_factory):
-    root = tmp_path_factory.mktemp("own pictures")
-    pictures.write_dataset(root, scene)
-    return datasets.read(root)
+    return pictures.write_dataset(tmp_path_factory.mktemp("own pictures"), scene)
 
 
 def changed_group(scene, index, **model):
