@@ -192,7 +192,7 @@ def is_similarity(linear: np.ndarray) -> bool:
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
-    """The rotation nearest to a linear map, without mirror. [3, 3] -> [3, 3]"""
+    """The rotation nearest to a linear map, without mirror. [..., 3, 3] -> [..., 3, 3]"""
     u, _, vt = np.linalg.svd(linear)
     return _unmirrored(u, vt)
 
@@ -202,7 +202,9 @@ def _even(singular: np.ndarray) -> bool:
 
 
 def _unmirrored(u: np.ndarray, vt: np.ndarray) -> np.ndarray:
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    u = u.copy()
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
 
 
 def map_shapes(

@@ -140,9 +140,7 @@ class _Course:
 def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
     """The motion P of maps M. [T, 4, 4] and the index of t_max"""
     maps = matrices @ np.linalg.inv(matrices[bind])
-    u, _, vt = np.linalg.svd(maps[:, :3, :3])
-    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    quats = rotations.rotmats_to_quats(u @ vt)
+    quats = rotations.rotmats_to_quats(carried.nearest_rotation(maps[:, :3, :3]))
     quats[bind] = (1.0, 0, 0, 0)
     maps[bind] = np.eye(4)
     return Motion(quats, maps[:, :3, :3], maps[:, :3, 3])
@@ -192,12 +190,13 @@ def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
     return change
 
 
-def _track(sampled: Motion, knots: slice, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float):
+def _track(
+    sampled: Motion, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float
+) -> tuple[np.ndarray, bool]:
     """Poses of a group at the knots, relative to the new bind state.
 
     Args:
-        sampled: What Blender shows, at the knots and later.
-        knots: Its rows at the knots; the last one is t_max.
+        sampled: What Blender shows, at the S knots and later.
         pivot: Of the group, at t_max. [3]
         known: What the file has, turned: taken where Blender shows the same. [S, 7]
         reach: Largest distance of a member from the pivot.
@@ -206,7 +205,7 @@ def _track(sampled: Motion, knots: slice, pivot: np.ndarray, known: np.ndarray, 
     Returns:
         The poses [S, 7], and whether they are the known ones.
     """
-    quats, moves = sampled.quats[knots], sampled.moves(pivot)[knots]
+    quats, moves = sampled.quats[: len(known)], sampled.moves(pivot)[: len(known)]
     if (drawn.pose_errors(known[:, :4], known[:, 4:], quats, moves, reach) <= allowed).all():
         return known, True
     poses = np.concatenate([rotations.make_continuous(quats[::-1])[::-1], moves], axis=-1)
@@ -231,8 +230,8 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
         motion = _since_bind(np.asarray(piece.matrices, np.float64), last)
         if motion.bent > RIGID_TOLERANCE:
             notes.append(f"{piece.name}: its scale changes with time, which a scene file cannot hold")
-        reach = _reach(scene, piece)
-        if source is pinned and (_apart(motion, None, reach) <= piece.allowed).all():
+        reach = _reach(scene, piece, np.zeros(3))
+        if source is pinned and (_apart(motion, still, reach) <= piece.allowed).all():
             found[0].pieces.append(piece)
             continue
         for cluster in found[1:]:
@@ -259,21 +258,17 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
     return [replace(cluster, id=number) for number, cluster in enumerate(found)]
 
 
-def _apart(motion: Motion, other: Motion | None, reach: float) -> np.ndarray:
-    """How far two motions bring points apart that lie within ``reach`` of the origin; from rest where None. [T]"""
-    linears = np.eye(3) if other is None else other.linears
-    shifts = np.zeros(3) if other is None else other.shifts
-    return np.linalg.norm(motion.shifts - shifts, axis=-1) + reach * np.linalg.norm(
-        motion.linears - linears, axis=(-2, -1)
-    )
+def _apart(motion: Motion, other: Motion, reach: float) -> np.ndarray:
+    """How far two motions bring points apart, at most, that lie within ``reach`` of the origin. [T]"""
+    turned = np.linalg.norm(motion.linears - other.linears, axis=(-2, -1))
+    return np.linalg.norm(motion.shifts - other.shifts, axis=-1) + reach * turned
 
 
-def _reach(scene: Scene, piece: Piece) -> float:
-    """Largest distance of a piece's Gaussians from the origin in the new bind state."""
-    last = len(scene.track_times) - 1
+def _reach(scene: Scene, piece: Piece, point: np.ndarray) -> float:
+    """Largest distance of a piece's Gaussians from a point in the new bind state. [3]"""
+    bind = piece.matrices[len(scene.track_times) - 1]
     means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
-    placed = means @ piece.matrices[last][:3, :3].T + piece.matrices[last][:3, 3]
-    return float(np.linalg.norm(placed, axis=-1).max())
+    return float(np.linalg.norm(means @ bind[:3, :3].T + bind[:3, 3] - point, axis=-1).max())
 
 
 def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[Moved]:
@@ -327,12 +322,12 @@ def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
     allowed = max(piece.allowed for piece in cluster.pieces)
     parent = np.eye(3) if first.parent is None else first.parent
     pivot = _pivot(scene, cluster, allowed)
-    reach = _radius(scene, cluster, pivot)
+    reach = max(1e-9 * scene.extent, *(_reach(scene, piece, pivot) for piece in cluster.pieces))
     if source.id == 0:
         before = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
     else:
         before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], parent), axis=-1)
-    poses, observed = _track(cluster.motion, slice(0, count), pivot, before, reach, allowed)
+    poses, observed = _track(cluster.motion, pivot, before, reach, allowed)
     if observed and (before == known[source.id]).all() and source.id:
         poses = scene.track_poses[source.id].copy()  # signs included
     return _Course(poses, pivot, parent, reach, allowed, observed and bool((parent == np.eye(3)).all()))
@@ -347,16 +342,6 @@ def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
         own = np.median(scene.means[first.start : first.start + first.count].astype(np.float64), axis=0)
     pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
     return own if np.linalg.norm(pivot - own) <= allowed else pivot
-
-
-def _radius(scene: Scene, cluster: Cluster, pivot: np.ndarray) -> float:
-    """Largest distance of a member from the pivot in the new bind state."""
-    last, best = len(scene.track_times) - 1, 1e-9 * scene.extent
-    for piece in cluster.pieces:
-        means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
-        placed = means @ piece.matrices[last][:3, :3].T + piece.matrices[last][:3, 3]
-        best = max(best, float(np.linalg.norm(placed - pivot, axis=-1).max()))
-    return best
 
 
 def _go_on(
