@@ -166,8 +166,8 @@ def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
         meanings: What the scene stores.
         query: Embedding of the phrase, unit. [D]
     """
+    query, table = np.asarray(query, np.float64), meanings.table
     answers = [one for row in range(len(meanings.object_ids)) if (one := _answer(meanings, row, query)) is not None]
-    table = meanings.table
     if table is not None and answers:
         least = max(one.cosine for one in answers) - table.margin
         answers = [one if one.cosine >= least else replace(one, score=min(one.score, _BESIDE)) for one in answers]
@@ -180,18 +180,18 @@ def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
 
 
 def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
-    """The best that an object's embeddings say, None where it has none."""
+    """The best that an object's embeddings say, None where it has none. query: float64"""
     rows, thresholds = _rows(meanings, row)
-    table, canonical = meanings.table, meanings.canonical_embeddings
+    if not len(rows):
+        return None
+    cosines = np.clip(rows @ query, -1, 1)
+    best = int(np.argmax(cosines - thresholds))
+    cosine, above = float(cosines[best]), float(cosines[best] - thresholds[best])
+    table, canonical, found = meanings.table, meanings.canonical_embeddings, None
+    if table is not None and canonical is not None and len(canonical):
+        found = relevancy(cosine, canonical @ rows[best], table.encoder.scale)
     spread = _SPREAD if table is None else table.margin
-    answers = []
-    for own, threshold in zip(rows, thresholds.tolist(), strict=True):
-        cosine = float(np.clip(own @ np.asarray(query, np.float64), -1, 1))
-        found = None
-        if table is not None and canonical is not None and len(canonical):
-            found = relevancy(cosine, canonical.astype(np.float64) @ own, table.encoder.scale)
-        answers.append(Meant(meanings.object_ids[row], _score(cosine - threshold, spread), cosine, found))
-    return max(answers, key=lambda one: one.score, default=None)
+    return Meant(meanings.object_ids[row], _score(above, spread), cosine, found)
 
 
 def _score(above: float, spread: float) -> float:
