@@ -60,9 +60,7 @@ def check(scene: Scene, place: str) -> None:
             continue
         if not isinstance(array, np.ndarray):
             _fail(place, name, "a numpy array", type(array).__name__)
-        if len(array.shape) != len(shape) or any(
-            n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
-        ):
+        if array.shape != shape:
             _fail(place, name, f"shape {shape}", array.shape)
         if dtype is not None and array.dtype != dtype:
             _fail(place, name, f"dtype {np.dtype(dtype)}", array.dtype)
