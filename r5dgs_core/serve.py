@@ -32,7 +32,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -42,6 +42,9 @@ from .scene import playback, quality, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
 from .semantics import encoders, query
+
+if TYPE_CHECKING:
+    from .raster import scene_render
 
 PROTOCOL = 3
 NEEDED = ("torch", "numba")
@@ -174,8 +177,10 @@ class Server:
         near = asked.near_of(request)
         scene_render = self._rasterizer()
         started = time.perf_counter()
+        instances = []
         if moved:
-            output, ms_motion, count = self._instances(request, scenes, camera, near)
+            instances = [asked.instance_of(entry, self._numbers) for entry in asked.need(request, "instances", list)]
+            output, ms_motion, count = self._instances(request, instances, scenes, camera, near)
         else:
             output, ms_motion, count = self._playback(request, scenes, camera, near)
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
@@ -184,15 +189,16 @@ class Server:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
         if moved and request.get("coverage") is not None:
-            arrays |= self._coverage(request, camera, near)
+            arrays |= self._coverage(request, instances, camera, near)
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}
         return result, arrays
 
-    def _coverage(self, request: dict[str, Any], camera: Camera, near: float | None) -> dict[str, np.ndarray]:
+    def _coverage(
+        self, request: dict[str, Any], instances: list[scene_render.Instance], camera: Camera, near: float | None
+    ) -> dict[str, np.ndarray]:
         """Which groups of instances share each pixel, and how much of it each has."""
         assert self._stage is not None  # the picture was drawn just now
         groups, ranks = asked.coverage_of(request)
-        instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
         found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
         return {"coverage_groups": found, "coverage": shares}
 
@@ -205,10 +211,16 @@ class Server:
             for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
         ]
 
-    def _instances(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
+    def _instances(
+        self,
+        request: dict[str, Any],
+        instances: list[scene_render.Instance],
+        scenes: list[Scene],
+        camera: Camera,
+        near: float | None,
+    ):
         from .raster import stage
 
-        instances = [asked.instance_of(entry, self._numbers) for entry in request["instances"]]
         sky = request.get("sky")
         if sky is not None:
             if not isinstance(sky, dict):
