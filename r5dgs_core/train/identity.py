@@ -30,30 +30,18 @@ VOTE_VIEWS = 80
 NEIGHBOURS_EVERY = 300  # steps after which neighbours are looked for anew, where the Gaussians are still the same
 
 
-def vote(
-    views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], fallback: Tensor
-) -> Tensor:
-    """Class of each Gaussian: the one whose mask pixels it contributes most to.
+def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
+    """What each Gaussian contributes to the mask pixels of each class.
 
     Args:
         views: Training views; those without a mask are passed over, and a spread of 80 of the rest is used.
         pose: Splats of a view.
         classes: Class of each object id; ids that are not in it do not vote.
-        fallback: Class of Gaussians that no mask pixel shows. [N]
+        count: Number of Gaussians, N.
 
     Returns:
-        The classes. [N] int64
+        Sums of blending weights, pixels. [N, C]
     """
-    return elect(votes(views, pose, classes, len(fallback)), fallback)
-
-
-def elect(weights: Tensor, fallback: Tensor) -> Tensor:
-    """Class with most of some `votes`, and the ``fallback`` [N] where there are none. [N] int64"""
-    return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
-
-
-def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
-    """What each of ``count`` Gaussians contributes to the mask pixels of each class, pixels; see `vote`. [N, C]"""
     kinds = max(classes.values(), default=0) + 1
     weights = torch.zeros(count, kinds)
     for view in spread([v for v in views if v.mask is not None], VOTE_VIEWS):
@@ -63,6 +51,11 @@ def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: 
         given = (splats.means, splats.quats, splats.scales, splats.opacities)
         weights += torch.from_numpy(segment_weights(*given, view.camera, target, kinds).T.toarray())
     return weights
+
+
+def elect(weights: Tensor, fallback: Tensor) -> Tensor:
+    """Class of each Gaussian, that with most of its `votes`, and the ``fallback`` [N] where it has none. [N] int64"""
+    return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
 
 
 def train_encodings(

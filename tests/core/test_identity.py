@@ -34,22 +34,25 @@ def row_of_blobs(opacities=(0.9, 0.9, 0.9)):
 CLASSES = {0: 0, 3: 1, 5: 2}
 
 
+def label(classes, view, splats, fallback):
+    """Classes of the Gaussians, by the vote of one view."""
+    weights = identity.votes([view], lambda _: splats, classes, len(fallback))
+    return identity.elect(weights, torch.tensor(fallback)).tolist()
+
+
 def test_each_gaussian_gets_the_class_of_the_pixels_that_it_paints():
     view, splats = row_of_blobs()
-    labels = identity.vote([view], lambda _: splats, CLASSES, torch.zeros(3, dtype=torch.int64))
-    assert labels.tolist() == [0, 2, 1]
+    assert label(CLASSES, view, splats, [0, 0, 0]) == [0, 2, 1]
 
 
 def test_gaussians_that_no_mask_shows_keep_what_they_had():
     view, splats = row_of_blobs(opacities=(0.9, 0.0, 0.9))
-    labels = identity.vote([view], lambda _: splats, CLASSES, torch.tensor([1, 1, 2]))
-    assert labels.tolist() == [0, 1, 1]
+    assert label(CLASSES, view, splats, [1, 1, 2]) == [0, 1, 1]
 
 
 def test_ids_without_a_class_do_not_vote():
     view, splats = row_of_blobs()
-    labels = identity.vote([view], lambda _: splats, {0: 0, 3: 1}, torch.tensor([1, 0, 0]))
-    assert labels.tolist() == [0, 0, 1]
+    assert label({0: 0, 3: 1}, view, splats, [1, 0, 0]) == [0, 0, 1]
     assert identity.class_map(view, {0: 0, 3: 1})[0].tolist() == [0] * 10 + [-1] * 10 + [1] * 10
 
 

@@ -71,10 +71,10 @@ def test_unknown_pixels_have_no_gradient(seen):
 
 
 def test_a_mask_that_knows_nothing_votes_for_nothing(seen, pose):
-    fallback = torch.full((len(pose(seen[0]).means),), 1)
-    assert torch.equal(identity.vote([unknown(v) for v in seen], pose, CLASSES, fallback), fallback)
-    several = identity.vote([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, fallback)
-    assert torch.equal(several, identity.vote(seen[:6], pose, CLASSES, fallback))
+    count = len(pose(seen[0]).means)
+    assert not identity.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
+    several = identity.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
+    assert torch.equal(several, identity.votes(seen[:6], pose, CLASSES, count)) and several.any()
 
 
 def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen, pose):
@@ -86,7 +86,7 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
         some = [  # every camera keeps a third of its masks
             v if (k + k // 6) % 3 == 0 else marked(v, v.mask == tiny_datasets.BALL, missed) for k, v in enumerate(seen)
         ]
-        labels = identity.vote(some, pose, CLASSES, fallback)
+        labels = identity.elect(identity.votes(some, pose, CLASSES, len(truth)), fallback)
         settings = config.load(None, ["identity.iterations=60"])
         means = torch.from_numpy(tiny.truth.means)
         encodings, weight, bias = identity.train_encodings(
