@@ -230,7 +230,8 @@ def _by_meaning(one: stored.Meant, said: str) -> Match:
 
 
 def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
-    return [match for label in labels if (match := _match(label, wish)) is not None]
+    asked = tuple(wish)
+    return [match for label in labels if (match := _match(label, asked)) is not None]
 
 
 def _ends_with(label: Label, word: str) -> bool:
@@ -242,7 +243,8 @@ def _ranked(matches: Iterable[Match]) -> list[Match]:
     return sorted(matches, key=lambda match: (-round(match.score, 6), match.object_id))
 
 
-def _match(label: Label, wish: list[str]) -> Match | None:
+@functools.lru_cache(maxsize=1 << 14)  # what is unknown, what is found and what is void ask for the same
+def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
     """Best of the object's name and aliases for one wish; an alias counts a little less than a name."""
     best: Match | None = None
     for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
