@@ -44,7 +44,7 @@ def steps(
     collection = objects.active_collection(context)
     if axes == "FILE" and collection is None:
         raise errors.ConfigError("export: expected a loaded scene for the axes 'Scene File', found none; choose others")
-    frames = export_frames.frames_of(scene, every, step)
+    frames, folders = export_frames.frames_of(scene, every, step), _folders(scene)
     with export_frames.frame_kept(scene):
         for number, frame in enumerate(frames):
             yield Step(number, len(frames), f"frame {frame}")
@@ -52,7 +52,7 @@ def steps(
             depsgraph, t = context.evaluated_depsgraph_get(), time_of(scene, collection, frame, every)
             world = np.eye(4) if collection is None else visible.world_of(collection, depsgraph)
             for camera in _cameras(scene, which, notes):
-                name = image_name(frame) if which == "ACTIVE" else f"images/{plain(camera.name)}/{frame:04d}.png"
+                name = image_name(frame) if which == "ACTIVE" else f"images/{folders[camera]}/{frame:04d}.png"
                 found.append(View(name, in_axes(depsgraph, camera, axes, world), t))
     if not found:
         raise errors.ConfigError(f"{scene.name}: expected a camera, found none; add one to the scene")
@@ -72,9 +72,23 @@ def image_name(frame: int) -> str:
     return f"images/frame_{frame:04d}.png"
 
 
-def plain(name: str) -> str:
-    """A name as every file system and COLMAP take it."""
-    return re.sub(r"[^\w.+-]+", "_", name)
+def _folders(scene: bpy.types.Scene) -> dict[bpy.types.Object, str]:
+    """A folder for each camera, called as every file system and COLMAP take it; those of like names are numbered."""
+    found: dict[bpy.types.Object, str] = {}
+    taken: set[str] = set()
+    for camera in _sorted(scene):
+        plain = re.sub(r"[^\w.+-]+", "_", camera.name)
+        found[camera], number = plain, 1
+        while found[camera].casefold() in taken:
+            number += 1
+            found[camera] = f"{plain}_{number}"
+        taken.add(found[camera].casefold())
+    return found
+
+
+def _sorted(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The cameras of a Blender scene by name."""
+    return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
 
 
 def time_of(scene: bpy.types.Scene, collection: bpy.types.Collection | None, frame: int, every: bool) -> float | None:
@@ -119,7 +133,7 @@ def _cameras(scene: bpy.types.Scene, which: str, notes: list[str]) -> list[bpy.t
             )
         return [] if camera is None or camera.type != "CAMERA" else [camera]
     found = []
-    for camera in sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name):
+    for camera in _sorted(scene):
         if camera.data.type == "PERSP":
             found.append(camera)
         elif (note := f"{camera.name}: left out, as it is {camera.data.type.lower()} and not perspective") not in notes:

@@ -105,6 +105,15 @@ def test_colmap_text_holds_all_cameras_and_their_times(blender, view, loaded, tm
     assert json.loads((tmp_path / "times.json").read_text())["times"][names[1]] == pytest.approx(4 / 60)
 
 
+def test_cameras_whose_names_differ_in_signs_alone_have_views_of_their_own(blender, view, tmp_path):
+    for name in ("top view", "top_view", "Top/View", "top_view_2"):
+        blender.context.scene.collection.objects.link(blender.data.objects.new(name, view.data))
+    options = {"directory": str(tmp_path), "which": "ALL", "format": "COLMAP", "frames": "CURRENT"}
+    assert blender.ops.r5dgs.export_cameras(**options) == {"FINISHED"}
+    names = [image.name for image in colmap_model.read(tmp_path / "sparse" / "0").images]
+    assert len({name.casefold() for name in names}) == len(names) == 5
+
+
 def test_what_is_no_pinhole_camera_is_refused_and_nothing_written(blender, view, tmp_path):
     view.data.type = "PANO"
     with pytest.raises(RuntimeError, match="perspective"):
