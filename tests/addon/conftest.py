@@ -1,4 +1,7 @@
-"""Blender for the add-on's tests: the extension loaded once as package `r5dgs`, factory settings around each test."""
+"""Blender for the add-on's tests: the extension loaded once as package `r5dgs`, factory settings around each test.
+
+Modules that need another scene than the one here have a ``scene_path`` or a ``loaded`` of their own.
+"""
 
 import importlib
 import importlib.abc
@@ -8,6 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from r5dgs_core.scene import scene_file
+from tests import scenes
+from tests.addon import motions
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = "r5dgs.r5dgs_core"
@@ -65,3 +72,23 @@ def blender(extension):
 
     bpy.ops.wm.read_homefile(app_template="")
     return bpy
+
+
+@pytest.fixture
+def scene_path(tmp_path):
+    """The file of a synthetic scene of five objects."""
+    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
+
+
+@pytest.fixture
+def loaded(blender, scene_path):
+    """Its collection in Blender."""
+    return motions.load(blender, scene_path)
+
+
+@pytest.fixture
+def mug(blender, loaded):
+    """The anchor of its first object, selected."""
+    anchor = blender.data.objects["mug anchor"]
+    motions.choose(blender, anchor)
+    return anchor

@@ -9,6 +9,7 @@ import pytest
 from r5dgs_core.motion import models
 from r5dgs_core.scene import playback, scene_file
 from tests import scenes
+from tests.addon import motions
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -26,13 +27,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path):
-    return load(blender, tmp_path / "scene.r5dgs")
-
-
-def load(bpy, path, **options):
-    before = set(bpy.data.collections)
-    assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
-    return next(c for c in bpy.data.collections if c.r5dgs.is_scene and c not in before)
+    return motions.load(blender, tmp_path / "scene.r5dgs")
 
 
 def save(bpy, path):
@@ -83,7 +78,7 @@ def assert_same_motion(bpy, before, after, tolerance):
 def test_an_unedited_scene_is_the_same_file(blender, tmp_path, key_tolerance):
     made = scenes.make_scene(n=300, objects=5, sh_degree=1, seed=7, world_convention="opengl")
     scene_file.write(made, tmp_path / "scene.r5dgs")
-    load(blender, tmp_path / "scene.r5dgs", key_tolerance=key_tolerance)
+    motions.load(blender, tmp_path / "scene.r5dgs", key_tolerance=key_tolerance)
     blender.context.scene.frame_set(17, subframe=0.25)
     save(blender, tmp_path / "again.r5dgs")
     assert (tmp_path / "again.r5dgs").read_bytes() == (tmp_path / "scene.r5dgs").read_bytes()
@@ -103,7 +98,7 @@ def test_what_was_moved_in_its_anchor_or_by_a_parent_is_there_again(blender, sce
     saved = save(blender, tmp_path / "b.r5dgs")
     assert [group.model.kind for group in saved.groups] == [group.model.kind for group in scene.groups]
     np.testing.assert_array_equal(saved.track_poses[1], scene.track_poses[1])
-    assert_same_motion(blender, loaded, load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
+    assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
 def test_edited_curves_are_there_again(blender, scene, loaded, tmp_path):
@@ -114,7 +109,7 @@ def test_edited_curves_are_there_again(blender, scene, loaded, tmp_path):
     saved = save(blender, tmp_path / "b.r5dgs")
     changed = [g for g in range(len(scene.groups)) if (saved.track_poses[g] != scene.track_poses[g]).any()]
     assert changed == [2]
-    again = load(blender, tmp_path / "b.r5dgs")
+    again = motions.load(blender, tmp_path / "b.r5dgs")
     for k, t in enumerate(scene.track_times):
         frame = 1 + 60 * t
         blender.context.scene.frame_set(int(frame), subframe=float(frame % 1))
@@ -143,7 +138,7 @@ def test_edited_physics_are_the_model_of_the_new_file(blender, scene, loaded, tm
     model = saved.groups[2].model
     assert model.kind == "translation" and model.velocity == pytest.approx((0.2, 0.4, 1.0))
     np.testing.assert_array_equal(saved.track_poses, scene.track_poses)
-    assert_same_motion(blender, loaded, load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
+    assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
 def test_names_colours_and_deletions_are_kept(blender, scene, loaded, tmp_path):
@@ -223,7 +218,7 @@ def test_residuals_survive(blender, scene, tmp_path):
         residual_quats=np.tile(np.float32([1, 0, 0, 0]), (2, knots, 1)),
     )  # fmt: skip
     scene_file.write(bent, tmp_path / "bent.r5dgs")
-    load(blender, tmp_path / "bent.r5dgs")
+    motions.load(blender, tmp_path / "bent.r5dgs")
     save(blender, tmp_path / "again.r5dgs")
     assert (tmp_path / "again.r5dgs").read_bytes() == (tmp_path / "bent.r5dgs").read_bytes()
 
@@ -237,7 +232,7 @@ def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loade
     assert blender.ops.r5dgs.replace_motion() == {"FINISHED"}
     saved = save(blender, tmp_path / "b.r5dgs")
     assert saved.groups[3].model.kind == scene.groups[1].model.kind
-    assert_same_motion(blender, loaded, load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
+    assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
 @pytest.mark.parametrize("observed", [1, 4], ids=["still scene", "scene that begins late"])
@@ -248,7 +243,7 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
     if observed == 1:
         still = [dataclasses.replace(group, model=models.STATIC) for group in late.groups]
         late = dataclasses.replace(late, groups=tuple(still))
-    collection = load(blender, scene_file.write(late, tmp_path / "late.r5dgs"))
+    collection = motions.load(blender, scene_file.write(late, tmp_path / "late.r5dgs"))
     first = blender.context.scene.frame_start
     assert first > 20
     blender.context.scene.frame_start = 1

@@ -1,6 +1,5 @@
 """The life of a session: files that move, scenes that are appended, linked, loaded twice, or loaded in odd places."""
 
-import importlib
 import inspect
 import shutil
 import subprocess
@@ -10,9 +9,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.scene import scene_file
 from tests import layouts, scenes
-from tests.addon import conftest
+from tests.addon import conftest, motions
 
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups", "scenes")
 
@@ -24,16 +23,6 @@ def scene_path(tmp_path):
     return scene_file.write(scenes.make_scene(n=300, objects=3, seed=1), folder / "synthetic.r5dgs")
 
 
-def addon(name):
-    return importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
-
-
-def load(bpy, path, **options):
-    before = set(bpy.data.collections)
-    assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
-    return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
-
-
 def loaded(bpy):
     (collection,) = (
         c for c in bpy.data.collections if c.r5dgs.is_scene and c in bpy.context.scene.collection.children[:]
@@ -41,34 +30,15 @@ def loaded(bpy):
     return collection
 
 
-def plays(bpy, collection, path, times=(0.0, 0.333, scenes.T_MAX, 0.9)):
-    """Whether every point of a loaded scene stands where the core has it, to 1e-5 of the scene's size."""
+def plays(bpy, collection, path):
+    """Whether every point of a loaded scene stands where the core has it."""
     scene = scene_file.read(path)
-    world = cameras.WORLD_TO_BLENDER[scene.world_convention]
-    worst = 0.0
-    for t in times:
-        frame = collection.r5dgs.frame_zero + t * collection.r5dgs.frames_per_unit
-        bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        expected = playback.frame(scene, t).means.astype(np.float64) @ world.T
-        seen = 0
-        for obj in collection.all_objects:
-            if obj.r5dgs.role != "CLOUD":
-                continue
-            evaluated = obj.evaluated_get(depsgraph)
-            points = np.empty(3 * len(evaluated.data.points), np.float32)
-            evaluated.data.attributes["position"].data.foreach_get("vector", points)
-            matrix = np.array(evaluated.matrix_world, np.float64)
-            placed = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-            rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
-            worst = max(worst, float(np.linalg.norm(placed - expected[rows], axis=-1).max()))
-            seen += len(placed)
-        assert seen == len(expected)
-    return worst <= 1e-5 * scene.extent
+    found = [motions.offsets(bpy, collection, scene, t) for t in (0.0, 0.333, scenes.T_MAX, 0.9)]
+    return bool((np.array(found) <= motions.POSITION_TOLERANCE).all())
 
 
 def draw_panels(bpy):
-    classes = [cls for module in addon("panels").MODULES for cls in module.CLASSES]
+    classes = [cls for module in motions.addon("panels").MODULES for cls in module.CLASSES]
     return layouts.draw(bpy, *(cls for cls in classes if issubclass(cls, bpy.types.Panel)))
 
 
@@ -82,7 +52,7 @@ def library(blender, scene_path, tmp_path):
     blend = tmp_path / "library" / "library.blend"
     blend.parent.mkdir()
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(blend))
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
     return blend
@@ -100,30 +70,30 @@ def bring(bpy, blend, *, link):
 
 
 def test_a_blend_and_its_scene_can_move_together(blender, scene_path, tmp_path):
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(scene_path.parent / "work.blend"))
     moved = tmp_path / "elsewhere" / "far"
     moved.parent.mkdir()
     blender.ops.wm.read_homefile(app_template="")
     shutil.move(scene_path.parent, moved)
     blender.ops.wm.open_mainfile(filepath=str(moved / "work.blend"))
-    assert addon("picture").scene_path(loaded(blender)).resolve() == (moved / "synthetic.r5dgs").resolve()
+    assert motions.addon("picture").scene_path(loaded(blender)).resolve() == (moved / "synthetic.r5dgs").resolve()
     assert plays(blender, loaded(blender), moved / "synthetic.r5dgs")
 
 
 def test_a_lost_scene_is_asked_for_by_name_and_found_where_the_user_says(blender, scene_path, tmp_path):
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"))
     hidden = tmp_path / "hidden" / "renamed.r5dgs"
     hidden.parent.mkdir()
     scene_path.rename(hidden)
     with pytest.raises(errors.SceneFileError, match="synthetic.r5dgs.*'Scene File'"):
-        addon("picture").scene_path(collection)
+        motions.addon("picture").scene_path(collection)
     assert plays(blender, collection, hidden)  # which needs no file
     blender.ops.wm.save_mainfile()  # the lost path is kept as it was
     assert collection.r5dgs.filepath == "//captured/synthetic.r5dgs"
     collection.r5dgs.filepath = "//hidden/renamed.r5dgs"
-    assert addon("picture").scene_path(collection).resolve() == hidden.resolve()
+    assert motions.addon("picture").scene_path(collection).resolve() == hidden.resolve()
 
 
 # --- append, link, override ---
@@ -136,7 +106,7 @@ def test_an_appended_scene_plays_and_finds_its_file_from_another_folder(blender,
     collection = bring(blender, library, link=False)
     assert collection.library is None and collection.r5dgs.root in collection.objects[:]
     assert plays(blender, collection, scene_path)
-    assert addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    assert motions.addon("picture").scene_path(collection).resolve() == scene_path.resolve()
     blender.ops.wm.save_mainfile()  # from here on by the new .blend's own relative path
     assert collection.r5dgs.filepath == "//../../captured/synthetic.r5dgs"
     assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
@@ -148,7 +118,7 @@ def test_a_linked_scene_plays_and_nothing_is_written_to_it(blender, library, sce
     collection = bring(blender, library, link=True)
     before = library.read_bytes(), collection.r5dgs.filepath, collection.r5dgs.seen_at
     assert collection.library is not None and plays(blender, collection, scene_path)
-    assert addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    assert motions.addon("picture").scene_path(collection).resolve() == scene_path.resolve()
     assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
     with pytest.raises(RuntimeError, match="linked from another file"):
         blender.ops.r5dgs.set_display(display="ELLIPSOIDS")
@@ -169,7 +139,7 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
         blender.context.scene.collection.children.unlink(linked)
     assert override.r5dgs.is_scene and override.override_library is not None
     assert plays(blender, override, scene_path)
-    assert addon("picture").scene_path(override).resolve() == scene_path.resolve()
+    assert motions.addon("picture").scene_path(override).resolve() == scene_path.resolve()
     assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
     root = next(obj for obj in override.all_objects if obj.r5dgs.role == "ROOT")
     assert root.library is None
@@ -180,7 +150,7 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
     assert not plays(blender, again, scene_path)  # it stands higher
     next(obj for obj in again.all_objects if obj.r5dgs.role == "ROOT").location = (0, 0, 0)
     assert plays(blender, again, scene_path)
-    assert addon("picture").scene_path(again).resolve() == scene_path.resolve()
+    assert motions.addon("picture").scene_path(again).resolve() == scene_path.resolve()
 
 
 # --- several scenes, odd places ---
@@ -188,13 +158,13 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
 
 def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene_path, tmp_path):
     other = scene_file.write(scenes.make_scene(n=200, objects=2, seed=7), tmp_path / "other.r5dgs")
-    first = load(blender, scene_path)
-    second = load(blender, other, frame_zero=31.5)
-    third = load(blender, scene_path, display="ELLIPSOIDS")
+    first = motions.load(blender, scene_path)
+    second = motions.load(blender, other, frame_zero=31.5)
+    third = motions.load(blender, scene_path, display="ELLIPSOIDS")
     names = [obj.name for collection in (first, second, third) for obj in collection.all_objects]
     assert len(names) == len(set(names))
     assert plays(blender, first, scene_path) and plays(blender, second, other)
-    objects = addon("objects")
+    objects = motions.addon("objects")
     for collection in (first, second, third):
         blender.context.view_layer.objects.active = objects.members(collection, "CLOUD")[0]
         assert objects.active_collection(blender.context) == collection
@@ -205,7 +175,7 @@ def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene
 @pytest.mark.parametrize("fps", [24, 60, 120])
 def test_frames_say_the_time_whatever_the_frame_rate(blender, scene_path, fps):
     blender.context.scene.render.fps = fps
-    assert plays(blender, load(blender, scene_path), scene_path)
+    assert plays(blender, motions.load(blender, scene_path), scene_path)
 
 
 def test_in_edit_mode_loading_asks_for_object_mode_and_changes_nothing(blender, scene_path):
@@ -224,7 +194,7 @@ def test_an_excluded_or_hidden_active_collection_does_not_swallow_the_scene(blen
     layer = blender.context.view_layer
     layer.active_layer_collection = layer.layer_collection.children["hidden"]
     layer.layer_collection.children["hidden"].exclude = True
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     assert all(obj.visible_get() for obj in collection.all_objects)
     assert plays(blender, collection, scene_path)
 
@@ -232,7 +202,7 @@ def test_an_excluded_or_hidden_active_collection_does_not_swallow_the_scene(blen
 def test_it_loads_into_the_scene_of_the_context_and_no_other(blender, scene_path):
     empty = blender.data.scenes.new("empty")
     with blender.context.temp_override(scene=empty, view_layer=empty.view_layers[0]):
-        collection = load(blender, scene_path)
+        collection = motions.load(blender, scene_path)
     assert collection in empty.collection.children[:]
     assert collection not in blender.context.window.scene.collection.children[:]
 
@@ -292,7 +262,7 @@ def test_unregistering_leaves_nothing_and_registering_again_brings_all_back(blen
         finally:
             extension.register()
         assert {name.split(" at 0x")[0] for name in traces(blender)} == {name.split(" at 0x")[0] for name in present}
-    assert plays(blender, load(blender, scene_path), scene_path)
+    assert plays(blender, motions.load(blender, scene_path), scene_path)
 
 
 def test_a_script_that_uses_the_module_ends_as_it_should(blender, scene_path):
@@ -312,7 +282,7 @@ def test_a_script_that_uses_the_module_ends_as_it_should(blender, scene_path):
 
 
 def test_what_was_loaded_lives_on_without_the_extension_and_is_known_again_after_it(blender, extension, scene_path):
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     before = {obj.name for obj in blender.data.objects}
     extension.unregister()
     try:

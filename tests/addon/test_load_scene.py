@@ -9,10 +9,10 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import models
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.scene import playback, scene_file
 from tests import scenes
+from tests.addon import motions
 
-POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
 
 
@@ -21,24 +21,14 @@ def scene_path(tmp_path):
     return scene_file.write(scenes.make_scene(n=400, objects=5, sh_degree=1, seed=1), tmp_path / "synthetic.r5dgs")
 
 
-def load(bpy, path, **options):
-    before = set(bpy.data.collections)
-    assert bpy.ops.r5dgs.load_scene(filepath=str(path), **options) == {"FINISHED"}
-    return next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
-
-
 def drawn_scenes():
     """`tests.datasets`, which draws with torch; a Blender may lack that."""
     pytest.importorskip("torch", reason="torch is not installed here")
     return importlib.import_module("tests.datasets")
 
 
-def clouds(collection):
-    return [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"]
-
-
 def anchor_of(collection, name):
-    cloud = next(obj for obj in clouds(collection) if obj.name.split(".")[0] == name)
+    cloud = next(obj for obj in motions.clouds(collection) if obj.name.split(".")[0] == name)
     return cloud.parent
 
 
@@ -48,33 +38,6 @@ def attribute(cloud, name, field, width):
     return values.reshape(-1, width)
 
 
-def evaluated_points(bpy, collection, n):
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    points = np.full((n, 3), np.nan)
-    for obj in clouds(collection):
-        evaluated = obj.evaluated_get(depsgraph)
-        local = np.empty(3 * len(evaluated.data.points), np.float32)
-        evaluated.data.attributes["position"].data.foreach_get("vector", local)
-        matrix = np.array(evaluated.matrix_world, np.float64)
-        rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
-        points[rows] = local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-    return points
-
-
-def go_to(bpy, collection, t):
-    frame = collection.r5dgs.frame_zero + t * collection.r5dgs.frames_per_unit
-    bpy.context.scene.frame_set(int(np.floor(frame)), subframe=float(frame % 1))
-
-
-def assert_plays_like_the_core(bpy, collection, scene, times):
-    world = cameras.WORLD_TO_BLENDER[scene.world_convention]
-    for t in times:
-        go_to(bpy, collection, t)
-        expected = playback.frame(scene, t).means.astype(np.float64) @ world.T
-        distance = np.linalg.norm(evaluated_points(bpy, collection, len(expected)) - expected, axis=-1)
-        assert distance.max() <= POSITION_TOLERANCE * scene.extent, f"t = {t}"
-
-
 TIMES = (0.0, 0.013, 0.22, 0.3334, 0.61, 0.7499, scenes.T_MAX, 0.7507, 0.8, 0.9111, 1.0)
 
 
@@ -82,7 +45,7 @@ TIMES = (0.0, 0.013, 0.22, 0.3334, 0.61, 0.7499, scenes.T_MAX, 0.7507, 0.8, 0.91
 def test_points_stand_where_playback_has_them_at_any_time(blender, tmp_path, convention):
     scene = scenes.make_scene(n=300, objects=5, world_convention=convention)
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
-    assert_plays_like_the_core(blender, load(blender, path), scene_file.read(path), TIMES)
+    motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
 
 
 def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
@@ -90,14 +53,14 @@ def test_loading_says_what_bends_and_is_not_played(blender, tmp_path, capfd):
     scene = datasets.make_truth()
     bending = datasets.breathing(scene, 0.3)
     for name, wanted in (("rigid", scene), ("bending", bending)):
-        load(blender, scene_file.write(wanted, tmp_path / f"{name}.r5dgs"))
+        motions.load(blender, scene_file.write(wanted, tmp_path / f"{name}.r5dgs"))
         warned = f"{len(bending.residual_rows)} Gaussians bend" in capfd.readouterr().out
         assert warned == (name == "bending")
 
 
 def test_frame_mapping_and_later_horizon_keep_playback(blender, scene_path):
-    collection = load(blender, scene_path, frame_zero=-7.5, t_end=1.6)
-    assert_plays_like_the_core(blender, collection, scene_file.read(scene_path), (*TIMES, 1.333, 1.6))
+    collection = motions.load(blender, scene_path, frame_zero=-7.5, t_end=1.6)
+    motions.assert_plays_like_the_core(blender, collection, scene_file.read(scene_path), (*TIMES, 1.333, 1.6))
 
 
 def test_far_from_the_origin_playback_still_holds(blender, tmp_path):
@@ -106,7 +69,7 @@ def test_far_from_the_origin_playback_still_holds(blender, tmp_path):
     groups = tuple(dataclasses.replace(g, pivot=g.pivot + shift) for g in scene.groups)
     far = dataclasses.replace(scene, means=(scene.means + shift).astype(np.float32), groups=groups)
     path = scene_file.write(far, tmp_path / "far.r5dgs")
-    assert_plays_like_the_core(blender, load(blender, path), scene_file.read(path), TIMES)
+    motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
 
 
 def test_noisy_tracks_get_one_key_per_knot_and_play_exactly(blender, tmp_path):
@@ -117,15 +80,15 @@ def test_noisy_tracks_get_one_key_per_knot_and_play_exactly(blender, tmp_path):
     poses[..., :4] /= np.linalg.norm(poses[..., :4], axis=-1, keepdims=True)
     path = scene_file.write(dataclasses.replace(scene, track_poses=poses), tmp_path / "noisy.r5dgs")
     scene = scene_file.read(path)
-    collection = load(blender, path)
-    assert_plays_like_the_core(blender, collection, scene, TIMES)
+    collection = motions.load(blender, path)
+    motions.assert_plays_like_the_core(blender, collection, scene, TIMES)
     frames = [round(p.co[0], 3) for p in curves_of(anchor_of(collection, "mug"))[("location", 0)].keyframe_points]
     assert set(np.round(1 + 60 * scene.track_times, 3).astype(np.float32)) <= set(np.float32(frames))
 
 
 def test_the_collection_tree_is_the_table(blender, scene_path):
     scene = scene_file.read(scene_path)
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     assert collection.name == "R5DGS synthetic"
     assert {child.name for child in collection.children} == {item.name for item in scene.objects}
     for item in scene.objects:
@@ -133,13 +96,13 @@ def test_the_collection_tree_is_the_table(blender, scene_path):
         cloud = next(obj for obj in inside if obj.name == item.name)
         assert cloud.type == "POINTCLOUD" and cloud.parent in inside
         assert cloud.parent.type == "EMPTY" and cloud.parent.parent == collection.r5dgs.root
-    assert sum(len(obj.data.points) for obj in clouds(collection)) == len(scene.means)
+    assert sum(len(obj.data.points) for obj in motions.clouds(collection)) == len(scene.means)
     assert [entry.name for entry in collection.r5dgs.table] == [item.name for item in scene.objects]
 
 
 def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_path):
     scene = scene_file.read(scene_path)
-    for obj in clouds(load(blender, scene_path)):
+    for obj in motions.clouds(motions.load(blender, scene_path)):
         rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
         np.testing.assert_array_equal(attribute(obj, "position", "vector", 3), scene.means[rows])
         np.testing.assert_allclose(attribute(obj, "scale", "vector", 3), np.exp(scene.log_scales[rows]), rtol=1e-6)
@@ -158,10 +121,10 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
 
 def test_what_points_are_made_with_is_gone_afterwards(blender, scene_path):
     before = len(blender.data.objects), len(blender.data.pointclouds)
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     assert len(blender.data.scenes) == 1 and not blender.data.node_groups
     assert len(blender.data.objects) == before[0] + len(collection.all_objects)
-    assert len(blender.data.pointclouds) == before[1] + len(clouds(collection))
+    assert len(blender.data.pointclouds) == before[1] + len(motions.clouds(collection))
 
 
 @pytest.mark.parametrize("degree, kept", [("0", 0), ("1", 3), ("2", 8), ("3", 15), ("ALL", 15)])
@@ -169,7 +132,7 @@ def test_only_the_wanted_harmonics_are_stored(blender, tmp_path, degree, kept):
     scene = scenes.make_scene(n=5000, objects=2, sh_degree=3)
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
     stored = scene_file.read(path)
-    for obj in clouds(load(blender, path, sh_degree=degree)):
+    for obj in motions.clouds(motions.load(blender, path, sh_degree=degree)):
         names = {a.name for a in obj.data.attributes if a.name.startswith("radiance:sh_")}
         assert names == {f"radiance:sh_{k}" for k in range(kept)}
         for k in range(kept):
@@ -184,7 +147,7 @@ def curves_of(anchor):
 
 
 def test_keys_past_t_max_are_of_another_type_and_t_max_has_a_key(blender, scene_path):
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     frame_of_t_max = 1 + 60 * scenes.T_MAX
     for fcurve in curves_of(anchor_of(collection, "mug")).values():
         frames = np.array([point.co[0] for point in fcurve.keyframe_points])
@@ -197,7 +160,7 @@ def test_keys_past_t_max_are_of_another_type_and_t_max_has_a_key(blender, scene_
 
 
 def test_only_what_moves_has_curves(blender, scene_path):
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     assert not curves_of(anchor_of(collection, "background"))
     assert not curves_of(anchor_of(collection, "wooden block"))
     assert {path for path, _ in curves_of(anchor_of(collection, "red apple"))} == {"location"}  # it slides
@@ -214,19 +177,19 @@ def test_what_only_slides_has_two_keys(blender, tmp_path):
     still = dataclasses.replace(truth.groups[2], model=models.STATIC)
     groups = (truth.groups[0], dataclasses.replace(truth.groups[1], model=slide), still)
     sliding = dataclasses.replace(truth, track_poses=poses, groups=groups)
-    collection = load(blender, scene_file.write(sliding, tmp_path / "sliding.r5dgs"))
+    collection = motions.load(blender, scene_file.write(sliding, tmp_path / "sliding.r5dgs"))
     curves = curves_of(anchor_of(collection, "brick"))
     assert {path for path, _ in curves} == {"location"}
     assert [len(curves["location", axis].keyframe_points) for axis in range(3)] == [2, 2, 1]  # it does not rise
     assert not curves_of(anchor_of(collection, "ball"))
-    assert_plays_like_the_core(blender, collection, sliding, np.linspace(0.0, 1.0, 9))
+    motions.assert_plays_like_the_core(blender, collection, sliding, np.linspace(0.0, 1.0, 9))
 
 
 def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scene_path):
     scene = scene_file.read(scene_path)
     counts = {}
     for tolerance in (3e-6, 1e-3):
-        collection = load(blender, scene_path, key_tolerance=tolerance)
+        collection = motions.load(blender, scene_path, key_tolerance=tolerance)
         counts[tolerance] = sum(
             len(fcurve.keyframe_points)
             for obj in collection.all_objects
@@ -234,15 +197,15 @@ def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scen
             for fcurve in curves_of(obj).values()
         )
         for t in TIMES:
-            go_to(blender, collection, t)
-            points = evaluated_points(blender, collection, len(scene.means))
+            motions.go_to(blender, collection, t)
+            points = motions.all_points(blender, collection, len(scene.means))
             distance = np.linalg.norm(points - playback.frame(scene, t).means, axis=-1)
             assert distance.max() <= (tolerance + 2e-6) * scene.extent
     assert counts[1e-3] < 0.7 * counts[3e-6]
 
 
 def test_the_timeline_is_fitted_and_t_max_marked(blender, scene_path):
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     scene = blender.context.scene
     assert (scene.frame_start, scene.frame_end) == (1, 61)
     assert [(marker.name, marker.frame) for marker in scene.timeline_markers] == [("t_max", 46)]
@@ -251,30 +214,30 @@ def test_the_timeline_is_fitted_and_t_max_marked(blender, scene_path):
 def test_the_timeline_stays_when_asked_to(blender, scene_path):
     scene = blender.context.scene
     before = (scene.frame_start, scene.frame_end)
-    load(blender, scene_path, fit_timeline=False)
+    motions.load(blender, scene_path, fit_timeline=False)
     assert (scene.frame_start, scene.frame_end) == before and not scene.timeline_markers
 
 
 def test_moving_an_anchors_parent_moves_its_points(blender, scene_path):
-    collection = load(blender, scene_path)
-    go_to(blender, collection, 0.4)
+    collection = motions.load(blender, scene_path)
+    motions.go_to(blender, collection, 0.4)
     n = collection.r5dgs.gaussians
-    before = evaluated_points(blender, collection, n)
+    before = motions.all_points(blender, collection, n)
     collection.r5dgs.root.location = (1, 2, 3)
     blender.context.view_layer.update()
-    np.testing.assert_allclose(evaluated_points(blender, collection, n), before + [1, 2, 3], atol=1e-5)
+    np.testing.assert_allclose(motions.all_points(blender, collection, n), before + [1, 2, 3], atol=1e-5)
 
 
 def test_saving_reloading_and_scrubbing_keeps_everything(blender, scene_path, tmp_path):
     scene = scene_file.read(scene_path)
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     blend = tmp_path / "deeper" / "saved.blend"
     blend.parent.mkdir()
     blender.ops.wm.save_as_mainfile(filepath=str(blend))
     blender.ops.wm.read_homefile(app_template="")
     blender.ops.wm.open_mainfile(filepath=str(blend))
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
-    assert_plays_like_the_core(blender, collection, scene, TIMES)
+    motions.assert_plays_like_the_core(blender, collection, scene, TIMES)
     assert collection.r5dgs.filepath == "//../synthetic.r5dgs"
     assert [alias.name for alias in collection.r5dgs.table["mug"].aliases] == ["cup"]
 
@@ -285,7 +248,7 @@ def open_path(bpy):
 
 
 def test_a_saved_copy_and_the_open_file_both_find_the_scene(blender, scene_path, tmp_path):
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     near, far = tmp_path / "near.blend", tmp_path / "deep" / "er" / "copy.blend"
     far.parent.mkdir(parents=True)
     blender.ops.wm.save_as_mainfile(filepath=str(far), copy=True)  # from a file that was never saved
@@ -300,7 +263,7 @@ def test_a_saved_copy_and_the_open_file_both_find_the_scene(blender, scene_path,
 
 
 def test_a_save_that_failed_changes_no_path(blender, scene_path, tmp_path):
-    collection = load(blender, scene_path)
+    collection = motions.load(blender, scene_path)
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "open.blend"))
     with pytest.raises(RuntimeError):
         blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "absent" / "open.blend"))
@@ -311,22 +274,22 @@ def test_one_undo_takes_back_the_whole_scene_and_redo_brings_it(blender, scene_p
     blender.ops.ed.undo_push(message="before")
     names = {kind: {data.name for data in getattr(blender.data, kind)} for kind in KINDS}
     range_before = blender.context.scene.frame_end
-    load(blender, scene_path)
+    motions.load(blender, scene_path)
     blender.ops.ed.undo_push(message="Load Scene")  # the window does this after an operator of the user
     blender.ops.ed.undo()
     assert {kind: {data.name for data in getattr(blender.data, kind)} for kind in KINDS} == names
     assert blender.context.scene.frame_end == range_before
     blender.ops.ed.redo()
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
-    assert_plays_like_the_core(blender, collection, scene_file.read(scene_path), (0.3, 0.9))
+    motions.assert_plays_like_the_core(blender, collection, scene_file.read(scene_path), (0.3, 0.9))
 
 
 def test_two_loads_are_independent(blender, scene_path):
-    first, second = load(blender, scene_path), load(blender, scene_path)
+    first, second = motions.load(blender, scene_path), motions.load(blender, scene_path)
     scene = scene_file.read(scene_path)
     for obj in list(first.all_objects):
         blender.data.objects.remove(obj)
-    assert_plays_like_the_core(blender, second, scene, (0.3, 0.9))
+    motions.assert_plays_like_the_core(blender, second, scene, (0.3, 0.9))
 
 
 def damaged(path, tmp_path, kind):
@@ -367,11 +330,11 @@ def test_an_error_half_way_leaves_nothing_behind(blender, scene_path, monkeypatc
 
 
 def test_the_light_is_left_alone_a_scene_renders_in_its_own_colours(blender, scene_path, tmp_path):
-    collection = load(blender, scene_path)
-    material = clouds(collection)[0].data.materials[0]
+    collection = motions.load(blender, scene_path)
+    material = motions.clouds(collection)[0].data.materials[0]
     kinds = {node.bl_idname for node in material.node_tree.nodes}
     assert kinds == {"ShaderNodeAttribute", "ShaderNodeEmission", "ShaderNodeOutputMaterial"}
-    shown = attribute(clouds(collection)[1], "display_color", "color", 4)
+    shown = attribute(motions.clouds(collection)[1], "display_color", "color", 4)
     assert shown.min() >= 0 and shown.max() <= 1
 
 
@@ -395,8 +358,8 @@ def test_an_anchor_stays_with_its_own_object_whoever_moves_with_it(blender, tmp_
     arrays = {name: getattr(scene, name)[order] for name in fields}
     scene = dataclasses.replace(scene, **arrays, motion_ids=motion_ids[order], object_ids=object_ids[order])
     path = scene_file.write(scene, tmp_path / "mixed.r5dgs")
-    collection = load(blender, path)
-    assert_plays_like_the_core(blender, collection, scene_file.read(path), (0.2, 0.9))
+    collection = motions.load(blender, path)
+    motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (0.2, 0.9))
     by_name = {obj.name: obj for obj in collection.all_objects}
     assert by_name["red apple anchor"].users_collection[0].name == "red apple"
     assert by_name["background with red apple"].parent == by_name["red apple anchor"] == by_name["red apple"].parent

@@ -17,23 +17,6 @@ LAST = 1 + 60 * T_MAX  # frame of t_max
 TIMES = (0.0, 0.3334, 0.7499, T_MAX, 0.7507, 0.9111, 1.0)
 
 
-@pytest.fixture
-def scene_path(tmp_path):
-    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
-
-
-@pytest.fixture
-def loaded(blender, scene_path):
-    return motions.load(blender, scene_path)
-
-
-@pytest.fixture
-def mug(blender, loaded):
-    anchor = blender.data.objects["mug anchor"]
-    motions.choose(blender, anchor)
-    return anchor
-
-
 def per_second(bpy, value, power=1):
     """A rate per unit of scene time in Blender's units."""
     return value * (bpy.context.scene.render.fps / 60.0) ** power

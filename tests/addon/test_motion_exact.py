@@ -29,11 +29,6 @@ def scene(scene_path):
     return scene_file.read(scene_path)
 
 
-@pytest.fixture
-def loaded(blender, scene_path):
-    return motions.load(blender, scene_path)
-
-
 def listeners():
     handlers = importlib.import_module("bpy").app.handlers
     return [f.__name__ for f in handlers.frame_change_pre + handlers.frame_change_post if "r5dgs" in f.__module__]

@@ -17,11 +17,6 @@ PIVOT = np.array([0.4, -0.3, 0.9])
 
 
 @pytest.fixture
-def scene_path(tmp_path):
-    return scene_file.write(scenes.make_scene(n=400, objects=5, seed=1), tmp_path / "synthetic.r5dgs")
-
-
-@pytest.fixture
 def loaded(blender, scene_path):
     """A scene whose root was moved, turned and scaled."""
     collection = motions.load(blender, scene_path)
@@ -30,13 +25,6 @@ def loaded(blender, scene_path):
     root.rotation_mode, root.rotation_quaternion = "QUATERNION", (0.6, 0.0, 0.8, 0.0)
     blender.context.view_layer.update()
     return collection
-
-
-@pytest.fixture
-def mug(blender, loaded):
-    anchor = blender.data.objects["mug anchor"]
-    motions.choose(blender, anchor)
-    return anchor
 
 
 def set_up(state, kind, **fields):

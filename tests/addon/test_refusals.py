@@ -6,7 +6,6 @@ import shutil
 
 import pytest
 
-from r5dgs_core.scene import scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -15,23 +14,6 @@ from tests.addon import motions  # noqa: E402
 
 KINDS = ("collections", "objects", "pointclouds", "meshes", "actions", "materials", "node_groups", "images")
 LAST = 46  # frame of the last observed time
-
-
-@pytest.fixture
-def scene_path(tmp_path):
-    return scene_file.write(scenes.make_scene(n=300, objects=3, seed=1), tmp_path / "synthetic.r5dgs")
-
-
-@pytest.fixture
-def loaded(blender, scene_path):
-    return motions.load(blender, scene_path)
-
-
-@pytest.fixture
-def mug(blender, loaded):
-    anchor = blender.data.objects["mug anchor"]
-    motions.choose(blender, anchor)
-    return anchor
 
 
 def fields(anchor):
