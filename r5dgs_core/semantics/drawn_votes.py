@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
 
 from ..data import dataset as datasets
-from ..raster import scene_render
+from ..raster import RasterSettings, rasterize_splats, scene_render
 from ..scene import playback
 from ..scene.scene import Scene
 from . import association, bags, mending
@@ -44,10 +45,16 @@ def mend(
         if not mending.lacks(found, image):
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
-        channels = np.zeros((len(scene.means), part.shape[1]), np.float32)
-        channels[seen] = part
-        drawn = scene_render.render_frame(
-            scene, playback.frame(scene, view.t), view.camera, background=None, backend=backend, features=channels
-        ).features
-        assert drawn is not None
+        posed = scene_render.PosedGaussians(scene_render.pose_frame(scene, playback.frame(scene, view.t)))
+        shown = torch.from_numpy(seen)  # what the image does not show covers nothing of it either
+        drawn = rasterize_splats(
+            posed.means[shown],
+            posed.quats[shown],
+            posed.scales[shown],
+            posed.opacities[shown],
+            torch.from_numpy(part),
+            view.camera,
+            settings=RasterSettings(near_plane=scene.near_plane),
+            backend=backend,
+        ).image
         yield mending.mend(mask, images[image].ids, drawn.numpy(), found, image)
