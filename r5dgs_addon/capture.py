@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from . import capture_files, capture_objects, capture_render, capture_views
+from . import capture_files, capture_objects, capture_render, capture_views, export_frames
 from .capture_overrides import Overrides
 from .running import Step
 
@@ -226,7 +226,7 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Ste
     scene = context.scene
     plan = plan_times(settings, scene.frame_start, scene.frame_end)
     with Overrides() as overrides, capture_files.new_folder(Path(settings.directory)) as folder:
-        overrides.keep_frame(scene)
+        overrides.enter_context(export_frames.frame_kept(scene))
         survey = capture_objects.survey(context, plan.frames, overrides)
         objects = capture_objects.choose(context.view_layer, survey, settings.objects, settings.object_collection)
         highest = max(o.id for o in objects)

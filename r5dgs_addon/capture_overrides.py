@@ -18,10 +18,6 @@ class Overrides(ExitStack):
         self.callback(setattr, owner, name, getattr(owner, name))
         setattr(owner, name, value)
 
-    def keep_frame(self, scene: bpy.types.Scene) -> None:
-        """Return to the scene's present frame and sub-frame in the end."""
-        self.callback(scene.frame_set, scene.frame_current, subframe=scene.frame_subframe)
-
     def keep_image_format(self, settings: bpy.types.ImageFormatSettings) -> None:
         """Keep a scene's output format; what may be chosen depends on what stands before, so the order is fixed."""
         names = (

@@ -1,4 +1,4 @@
-"""The frames that an export goes through, and how its options are drawn."""
+"""The frames that an export or a capture goes through, and how the options of exports are drawn."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
