@@ -138,16 +138,11 @@ def things() -> tuple[str, ...]:
     return tuple(word for word in words() if word not in kinds)
 
 
-def related(one: str, other: str) -> bool:
-    """Whether two nouns are the same, one is a kind of the other, or both are of one kind."""
-    rows = _rows()
-    return bool(relations()[rows[one], rows[other]])
-
-
 @functools.cache
 def relations() -> np.ndarray:
-    """Whether each two of `words` are related. [W, W] bool"""
-    rows, above = _rows(), np.eye(len(_rows()), dtype=np.float32)
+    """Whether each two of `words` are the same, one a kind of the other, or both of one kind. [W, W] bool"""
+    rows = {word: row for row, word in enumerate(words())}
+    above = np.eye(len(rows), dtype=np.float32)
     for word, kinds in broader().items():
         above[rows[word], [rows[kind] for kind in kinds]] = 1
     return above @ above.T > 0
@@ -158,11 +153,6 @@ def known(phrase: str) -> str | None:
     nouns = _by_words()
     said = lookup.words_of(phrase)
     return next((nouns[tuple(said[k:])] for k in range(len(said)) if tuple(said[k:]) in nouns), None)
-
-
-@functools.cache
-def _rows() -> dict[str, int]:
-    return {word: row for row, word in enumerate(words())}
 
 
 @functools.cache

@@ -44,11 +44,6 @@ class Overlaps:
         """Share of each segment that lies in each object. [s, K + 1]"""
         return self.common / np.maximum(self.segments[:, None], 1e-9)
 
-    @property
-    def recalls(self) -> np.ndarray:
-        """Share of each object in the image that lies in each segment. [s, K + 1]"""
-        return self.common / np.maximum(self.objects[None], 1e-9)
-
 
 def cast(stack: bags.Stack, labels: np.ndarray, count: int) -> sparse.csr_matrix:
     """Sum the weights of segments by object.

@@ -109,7 +109,7 @@ def clean(
         found[rows], motion[rows] = _decide(rows, shares, trust, start, opacities, *near, pull)
     found = _keep_objects(start, found, count)
     settled = found
-    found = _keep_objects(start, _without_outliers(votes, shares, trust, total, settled, points, opacities), count)
+    found = _keep_objects(start, _without_outliers(votes, shares, total, settled, points, opacities), count)
     changed = found != start
     apart = changed & (found != settled)
     by_motion, outliers = int((changed & ~apart & motion).sum()), int(apart.sum())
@@ -247,7 +247,6 @@ def _decide(
 def _without_outliers(
     votes: np.ndarray,
     shares: np.ndarray,
-    trust: np.ndarray,
     total: np.ndarray,
     labels: np.ndarray,
     points: np.ndarray,
