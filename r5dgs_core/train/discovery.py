@@ -101,17 +101,11 @@ def _short(config: Config, last: float) -> Config:
     )
 
 
-@torch.no_grad()
 def parts(trainer: Trainer, config: Config) -> np.ndarray:
     """Rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
-    gaussians = trainer.gaussians
     rows, opacities = _movers(trainer)
     rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
-    rng = np.random.default_rng(config.train.seed)
-    found = motion_clusters.find(_paths(trainer, rows), opacities, TOLERANCE, config.discovery.fewest, rng)
-    labels = np.full(len(gaussians), -1)
-    labels[rows] = found
-    return needed(trainer, labels)
+    return _labelled(trainer, config, rows, opacities, _paths(trainer, rows))
 
 
 def sort(trainer: Trainer) -> np.ndarray:
@@ -120,10 +114,21 @@ def sort(trainer: Trainer) -> np.ndarray:
     Args:
         trainer: A finished run of a field.
     """
-    labels = parts(trainer, trainer.config)
     rows, opacities = _movers(trainer)
-    labels[rows] = motion_clusters.attach(_paths(trainer, rows), opacities, TOLERANCE, labels[rows])
+    paths, opaque = _paths(trainer, rows), opacities > OPAQUE
+    labels = _labelled(trainer, trainer.config, rows[opaque], opacities[opaque], paths[opaque])
+    labels[rows] = motion_clusters.attach(paths, opacities, TOLERANCE, labels[rows])
     return labels
+
+
+def _labelled(
+    trainer: Trainer, config: Config, rows: np.ndarray, opacities: np.ndarray, paths: np.ndarray
+) -> np.ndarray:
+    """Part of each Gaussian of a field, by the paths of some rows; -1 for others and for none. [N]"""
+    rng = np.random.default_rng(config.train.seed)
+    labels = np.full(len(trainer.gaussians), -1)
+    labels[rows] = motion_clusters.find(paths, opacities, TOLERANCE, config.discovery.fewest, rng)
+    return needed(trainer, labels)
 
 
 @torch.no_grad()

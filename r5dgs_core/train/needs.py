@@ -52,17 +52,20 @@ def resolve(config: Config) -> Config:
 def discovery(dataset: Dataset, config: Config) -> bool:
     """Whether a run looks for what moves: it starts with tracks, there is no mask, and there are several times."""
     tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
-    unmasked = all(view.mask_path is None for view in dataset.train)
-    several = len({view.t for view in dataset.train}) > 1
-    return tracks and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
+    return tracks and _looks_for_parts(dataset, config)
 
 
 def sorting(dataset: Dataset, config: Config) -> bool:
     """Whether a finished run sorts its Gaussians into what moves as one: it is a field, and no mask says it."""
     field = config.train.representation == "field" and config.field.tracks_share == 0
+    return field and _looks_for_parts(dataset, config)
+
+
+def _looks_for_parts(dataset: Dataset, config: Config) -> bool:
+    """Whether nobody says what the objects are, and what moves could: there is no mask, and there are several times."""
     unmasked = all(view.mask_path is None for view in dataset.train)
     several = len({view.t for view in dataset.train}) > 1
-    return field and unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
+    return unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
 
 
 def is_pinned(role: str, poses: np.ndarray, radius: float, wanted: NeedsSection) -> bool:
