@@ -87,3 +87,13 @@ def test_rows_say_what_was_repaired(load, plan, tmp_path, capsys, monkeypatch):
     assert all(row["in"] <= row["ours"] <= row["oracle"] + 1e-9 for row in rows)
     assert all(row["ours"] > row["in"] for row in rows if row["error_px"] == 0)
     assert len(out.with_suffix(".md").read_text().splitlines()) == 5 and "| tiny | C |" in capsys.readouterr().out
+
+
+def test_time_is_told_by_stages_that_add_up(load, tmp_path):
+    file = tmp_path / "time.json"
+    sizes = {"gaussians": 3000, "objects": 4, "images": 20, "pixels": 48}
+    load("association_time").main([f"--{key}={value}" for key, value in sizes.items()] + [f"--json={file}"])
+    found = json.loads(file.read_text())
+    assert {key: found[key] for key in sizes} == sizes and 0 <= found["in"] < found["out"] <= 1
+    stages = found["read_s"] + found["draw_s"] + found["rest_s"]
+    assert stages == pytest.approx(found["whole_s"], abs=0.003) and min(stages, found["draw_s"], found["rest_s"]) > 0
