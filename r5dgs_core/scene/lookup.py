@@ -30,6 +30,17 @@ _FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "
 # Said before what is counted, they are no part of its name; "mug two" keeps its number.
 _COUNTS = frozenset(("both", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "some", "few"))
 _HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
+# Plurals that no ending tells, and words that only look like one.
+_PLURALS = {
+    **{"men": "man", "women": "woman", "children": "child", "people": "person", "lives": "life"},
+    **{"feet": "foot", "teeth": "tooth", "geese": "goose", "mice": "mouse", "quizzes": "quiz"},
+    **{f"{word}es": word for word in ("gas", "lens", "iris", "canvas", "atlas", "potato", "tomato", "mango", "hero")},
+}
+_NO_PLURALS = frozenset(("gas", "lens", "canvas", "atlas"))
+_PLURAL_ENDINGS = (
+    *((f"{start}ves", f"{start}f") for start in ("lea", "loa", "el", "hal", "cal", "wol", "scar", "hoo", "thie")),
+    *(("knives", "knife"), ("wives", "wife")),
+)
 _SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
 
 
@@ -173,20 +184,27 @@ def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
 
 
 def words_of(text: str) -> list[str]:
-    """Words in lower case without accents, in the singular; digits are words."""
+    """Words in lower case without accents, as `singular` spells them; digits are words."""
     plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
     return [singular(word) for word in re.findall(r"[^\W_]+", plain.casefold())]
 
 
 def singular(word: str) -> str:
-    """The word without a regular English plural ending."""
-    if len(word) > 4 and word.endswith("ies"):
-        return word[:-3] + "y"
-    if len(word) > 4 and word.endswith(("ches", "shes", "xes", "sses", "zes")):
-        return word[:-2]
-    if len(word) > 3 and word.endswith("ves"):
-        return word[:-3] + "f"
-    if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")):
+    """One spelling for an English noun and its plural: the singular, but for endings that a plural does not tell.
+
+    "cookies" and "berries" end alike, as "caches" and "torches" and "fuses" and "buses" do; so "cookie", "cache" and
+    "fuse" are spelled "cooky", "cach" and "fus".
+    """
+    if word in _PLURALS:
+        return _PLURALS[word]
+    for plural, one in _PLURAL_ENDINGS:
+        if word.endswith(plural):
+            return word.removesuffix(plural) + one
+    if word.endswith("s") and not word.endswith(("ss", "us", "is")) and word not in _NO_PLURALS and len(word) > 3:
+        word = word[:-1]
+    if len(word) > 3 and word.endswith("ie"):
+        return word[:-2] + "y"
+    if len(word) > 3 and (word.endswith(("che", "she", "xe", "sse", "ze")) or re.search("[^ao]use$", word)):
         return word[:-1]
     return word
 

@@ -94,12 +94,32 @@ def test_other_scripts_and_accents_are_words():
         ("berries", "berry"),
         ("glass", "glass"),
         ("dishes", "dish"),
-        ("knives", "knif"),
+        ("knives", "knife"),
+        ("bookshelves", "bookshelf"),
+        ("gloves", "glove"),
+        ("olives", "olive"),
         ("cactus", "cactus"),
     ],
 )
 def test_plurals_become_singular(plural, singular):
     assert lookup.singular(plural) == singular
+
+
+NOUNS = {
+    "cookie": "cookies", "movie": "movies", "pie": "pies", "tie": "ties", "cherry": "cherries", "key": "keys",
+    "tray": "trays", "cache": "caches", "torch": "torches", "niche": "niches", "dish": "dishes", "size": "sizes",
+    "maze": "mazes", "quiz": "quizzes", "box": "boxes", "axe": "axes", "glass": "glasses", "mattress": "mattresses",
+    "fuse": "fuses", "bus": "buses", "cactus": "cactuses", "house": "houses", "mouse": "mice", "vase": "vases",
+    "rose": "roses", "lens": "lenses", "gas": "gases", "iris": "irises", "canvas": "canvases", "glove": "gloves",
+    "wave": "waves", "leaf": "leaves", "loaf": "loaves", "scarf": "scarves", "knife": "knives", "potato":
+    "potatoes", "shoe": "shoes", "foot": "feet", "child": "children", "person": "people",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("one", "many"), NOUNS.items())
+def test_a_noun_and_its_plural_are_one_word(one, many):
+    for name, said in ((one, many), (many, one), (many, many)):
+        assert [match.score for match in lookup.search_labels([lookup.Label(1, name)], said)] == [1.0]
 
 
 def test_stored_embeddings_answer_words_that_no_name_has(scene):
