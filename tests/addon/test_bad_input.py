@@ -147,16 +147,37 @@ def test_bad_input_says_what_to_do_and_changes_nothing(saved, bad, kind):
         saved.ops.r5dgs.load_scene(filepath=str(path))
 
 
-NEEDING_A_SCENE = (
-    "add_alias", "exact_mode", "export_masks", "export_ply", "export_scene", "extrapolate_until", "isolate", "preview",
-    "remove_alias", "rename_object", "select_by_prompt", "select_object", "set_display", "show_confidence",
-)  # fmt: skip
+WITHOUT_A_SCENE = {
+    "Load an R5DGS scene first": (
+        "add_alias", "exact_mode", "export_masks", "export_ply", "export_scene", "extrapolate_until", "isolate",
+        "preview", "remove_alias", "rename_object", "select_by_prompt", "select_object", "set_display",
+        "show_confidence",
+    ),
+    "Select an object of an R5DGS scene first": (
+        "delete_object", "duplicate_object", "pivot_to_cursor", "re_extrapolate", "reset_motion", "simplify_keys",
+    ),
+    "Select an object of a loaded scene first": ("recolor",),
+    "Select an object that is tinted first": ("reset_color",),
+    "Select the objects that shall move": ("replace_motion",),
+    "Nothing is isolated": ("unisolate",),
+    "Live preview needs a window": ("live_preview",),
+}  # fmt: skip
+NEEDING_NONE = {
+    "capture_dataset", "check_worker", "export_cameras", "load_scene", "show_colors_as_trained", "use_engine",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NEEDING_A_SCENE)
-def test_without_a_scene_every_action_asks_for_one(blender, name):
-    with pytest.raises(RuntimeError, match="Load an R5DGS scene first"):
+@pytest.mark.parametrize(
+    ("asked", "name"), [(asked, name) for asked, names in WITHOUT_A_SCENE.items() for name in names]
+)
+def test_without_a_scene_an_action_says_what_it_needs(blender, asked, name):
+    with pytest.raises(RuntimeError, match=asked):
         getattr(blender.ops.r5dgs, name)()
+
+
+def test_every_action_needs_a_scene_or_is_known_to_need_none(blender):
+    needing = {name for names in WITHOUT_A_SCENE.values() for name in names}
+    assert needing | NEEDING_NONE == {name for name in dir(blender.ops.r5dgs) if not name.startswith("_")}
 
 
 def test_no_file_at_all_is_asked_for(blender):

@@ -17,6 +17,13 @@ LAST = 1 + 60 * T_MAX  # frame of t_max
 TIMES = (0.0, 0.3334, 0.7499, T_MAX, 0.7507, 0.9111, 1.0)
 
 
+def remove_key_at_t_max(curve):
+    """Returns which one it was."""
+    at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
+    curve.keyframe_points.remove(curve.keyframe_points[at])
+    return at
+
+
 def per_second(bpy, value, power=1):
     """A rate per unit of scene time in Blender's units."""
     return value * (bpy.context.scene.render.fps / 60.0) ** power
@@ -178,8 +185,7 @@ def test_handles_of_any_type_before_t_max_stay_where_they_are(blender, mug, hand
 @pytest.mark.parametrize("interpolation", ["BEZIER", "LINEAR", "CONSTANT"])
 def test_a_curve_without_a_key_at_t_max_is_cut_there_and_keeps_its_shape(blender, loaded, mug, interpolation):
     for curve in motions.curves(mug).values():
-        at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
-        curve.keyframe_points.remove(curve.keyframe_points[at])
+        remove_key_at_t_max(curve)
         for point in curve.keyframe_points:
             point.interpolation = interpolation
         curve.update()
@@ -195,9 +201,7 @@ def test_a_curve_without_a_key_at_t_max_is_cut_there_and_keeps_its_shape(blender
 @pytest.mark.parametrize("reach", [0.5, 0.75, 0.9, 0.97])
 def test_a_curve_whose_handles_overlap_keeps_its_shape_when_it_is_cut(blender, loaded, mug, reach):
     for curve in motions.curves(mug).values():
-        points = curve.keyframe_points
-        at = next(k for k, point in enumerate(points) if abs(point.co[0] - LAST) < 1e-3)
-        points.remove(points[at])
+        at, points = remove_key_at_t_max(curve), curve.keyframe_points
         left, right = points[at - 1], points[at]
         gap = right.co[0] - left.co[0]
         for point in (left, right):
@@ -216,8 +220,7 @@ def test_a_curve_whose_handles_overlap_keeps_its_shape_when_it_is_cut(blender, l
 
 def test_what_cannot_be_cut_is_refused_and_nothing_changes(blender, mug):
     for curve in motions.curves(mug).values():
-        at = next(k for k, point in enumerate(curve.keyframe_points) if abs(point.co[0] - LAST) < 1e-3)
-        curve.keyframe_points.remove(curve.keyframe_points[at])
+        remove_key_at_t_max(curve)
         for point in curve.keyframe_points:
             point.interpolation = "ELASTIC"
     before = motions.keys(mug)

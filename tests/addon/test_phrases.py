@@ -1,6 +1,5 @@
 """Prompts in words that no scene stores: the worker embeds them with the encoder of the preferences."""
 
-import importlib
 import sys
 import time
 
@@ -8,6 +7,7 @@ import pytest
 
 from r5dgs_core.scene import scene_file
 from tests import encoder_folders, scenes
+from tests.addon import motions
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -34,13 +34,17 @@ def folders(tmp_path_factory):
 def loaded(blender, folders, monkeypatch):
     monkeypatch.setenv("R5DGS_PYTHON", sys.executable)
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[0]))
-    importlib.import_module("r5dgs.r5dgs_addon.phrases").forget()
+    motions.addon("phrases").forget()
     blender.ops.r5dgs.load_scene(filepath=str(folders[2]))
     return blender
 
 
-def prompt():
-    return importlib.import_module("r5dgs.r5dgs_addon.prompt")
+def wait_for_the_answer():
+    """Look as often as Blender's timer does until there is nothing more to look for."""
+    deadline = time.monotonic() + 60
+    while motions.addon("phrases").look() is not None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def ask(bpy, text):
@@ -58,7 +62,7 @@ def test_the_encoder_of_the_preferences_knows_other_words(loaded):
 
 
 def test_a_phrase_is_embedded_once_and_names_need_nobody(loaded, monkeypatch):
-    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    worker = motions.addon("worker")
     asked, run = [], worker.run
     monkeypatch.setattr(worker, "run", lambda steps: asked.append(steps[0][2]["texts"]) or run(steps))
     ask(loaded, "zorb")
@@ -88,47 +92,52 @@ def test_a_damaged_encoder_is_said_and_names_are_searched_all_the_same(loaded, t
 
 
 def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
-    phrases, told = importlib.import_module("r5dgs.r5dgs_addon.phrases"), []
+    phrases, told = motions.addon("phrases"), []
     phrases.begin(["zorb", "glorp"], told.append)
     assert phrases.missing(["zorb", "glorp"]) == ["zorb", "glorp"]
-    deadline = time.monotonic() + 60
-    while phrases.look() is not None:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for_the_answer()
     assert told == [""] and phrases.missing(["zorb", "glorp", "other"]) == ["other"]
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", "/nowhere")
     phrases.begin(["zorb"], told.append)
-    while phrases.look() is not None:
-        time.sleep(0.02)
+    wait_for_the_answer()
     assert "expected the folder of an encoder, found nothing" in told[1]
 
 
-def test_a_window_shows_at_once_what_is_known_and_then_the_rest(loaded, monkeypatch):
-    phrases, session = importlib.import_module("r5dgs.r5dgs_addon.phrases"), loaded.context.window_manager.r5dgs_words
-    monkeypatch.setattr(prompt(), "_has_window", lambda: True)
-    assert ask(loaded, "mug and zorb") == {"FINISHED"}
+@pytest.fixture
+def windowed(loaded, monkeypatch):
+    """`loaded` as if somebody looked at a window, which must not wait."""
+    monkeypatch.setattr(motions.addon("prompt"), "_has_window", lambda: True)
+    return loaded
+
+
+def test_a_window_shows_at_once_what_is_known_and_then_the_rest(windowed):
+    session = windowed.context.window_manager.r5dgs_words
+    assert ask(windowed, "mug and zorb") == {"FINISHED"}
     assert [match.object_id for match in session.matches] == [1]
-    assert notes(loaded) == ["Asking the text encoder for 'zorb'"]
-    while phrases.look() is not None:
-        time.sleep(0.02)
-    assert {1, 2} <= {match.object_id for match in session.matches} and notes(loaded) == []
+    assert notes(windowed) == ["Asking the text encoder for 'zorb'"]
+    wait_for_the_answer()
+    assert {1, 2} <= {match.object_id for match in session.matches} and notes(windowed) == []
 
 
-def test_an_answer_that_comes_later_is_shown_where_its_prompt_still_stands(loaded):
-    session, phrases = loaded.context.window_manager.r5dgs_words, importlib.import_module("r5dgs.r5dgs_addon.phrases")
-    phrases.fetch(["zorb"])
-    ask(loaded, "mug")
-    prompt()._join("zorb", "")
-    assert session.asked == "mug"
-    session.asked = session.prompt = "zorb"
-    session.matches.clear()
-    prompt()._join("zorb", "it is gone")
-    shown = {match.object_id for match in session.matches}
-    assert 2 in shown and notes(loaded) == ["Text encoder: it is gone"]
+def test_an_answer_that_comes_later_is_not_shown_where_another_prompt_stands(windowed):
+    session = windowed.context.window_manager.r5dgs_words
+    ask(windowed, "zorb")
+    ask(windowed, "mug")
+    wait_for_the_answer()
+    assert motions.addon("phrases").missing(["zorb"]) == []
+    assert session.asked == "mug" and [match.object_id for match in session.matches] == [1]
+
+
+def test_what_goes_wrong_later_is_said_beside_what_is_known(windowed, monkeypatch):
+    monkeypatch.setenv("R5DGS_TEXT_ENCODER", "/nowhere")
+    ask(windowed, "mug and zorb")
+    wait_for_the_answer()
+    assert [match.object_id for match in windowed.context.window_manager.r5dgs_words.matches] == [1]
+    assert "Text encoder: /nowhere: expected the folder of an encoder" in notes(windowed)[-1]
 
 
 def test_what_was_asked_in_another_file_is_not_answered_in_this_one(loaded):
-    phrases, told = importlib.import_module("r5dgs.r5dgs_addon.phrases"), []
+    phrases, told = motions.addon("phrases"), []
     phrases.begin(["zorb"], told.append)
     loaded.ops.wm.read_homefile(app_template="")
     assert not loaded.app.timers.is_registered(phrases.look) and told == []

@@ -10,6 +10,7 @@ from r5dgs_core.data import images
 from r5dgs_core.raster import scene_render, stage
 from r5dgs_core.scene import cameras, playback, scene_file
 from tests import datasets, scenes
+from tests.addon import motions
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -33,10 +34,7 @@ def load(blender, tmp_path):
     def loaded(name, **options):
         made = dataclasses.replace(scenes.make_scene(world_convention="colmap", **options), name=name)
         path = scene_file.write(made, tmp_path / f"{name}.r5dgs")
-        before = set(blender.data.collections)
-        assert blender.ops.r5dgs.load_scene(filepath=str(path)) == {"FINISHED"}
-        collection = next(c for c in blender.data.collections if c.r5dgs.is_scene and c not in before)
-        return collection, scene_file.read(path)
+        return motions.load(blender, path), scene_file.read(path)
 
     return loaded
 
