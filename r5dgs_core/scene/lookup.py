@@ -1,6 +1,7 @@
 """Find objects by words, without any network: names and aliases first, then what stored embeddings say.
 
-A query is cut into wishes at "and", "," and the like; each wish is compared with every name and alias of the table.
+A query is cut into wishes at "and", "," and the like, unless it is a name with such a word; each wish is compared with
+every name and alias of the table.
 Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo. A name that says a
 wish whole settles it; other wishes are asked of the embeddings, too (`meanings`), where their words have one.
 """
@@ -101,7 +102,7 @@ def search_labels(
 ) -> list[Match]:
     """As `search`, on names and aliases, and on stored embeddings where they are given."""
     best: dict[int, Match] = {}
-    for said, wish in _parts(text):
+    for said, wish in _asked(labels, text):
         for match in _fulfil(labels, said, wish, meanings, embed):
             if match.score >= threshold and (match.object_id not in best or match.score > best[match.object_id].score):
                 best[match.object_id] = match
@@ -118,7 +119,7 @@ def unanswered(
     """Phrases of a text that nothing matches; arguments as of `search_labels`."""
     return [
         said
-        for said, wish in _parts(text)
+        for said, wish in _asked(labels, text)
         if all(match.score < threshold for match in _fulfil(labels, said, wish, meanings, embed))
     ]
 
@@ -127,7 +128,7 @@ def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> li
     """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
     return [
         said
-        for said, wish in _parts(text)
+        for said, wish in _asked(labels, text)
         if not any(match.score >= _SETTLED for match in _named(labels, wish))
         and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
     ]
@@ -207,6 +208,15 @@ def singular(word: str) -> str:
     if len(word) > 3 and (word.endswith(("che", "she", "xe", "sse", "ze")) or re.search("[^ao]use$", word)):
         return word[:-1]
     return word
+
+
+def _asked(labels: Sequence[Label], text: str) -> list[tuple[str, list[str]]]:
+    """As `_parts`; a text that is a name as it stands asks for that alone."""
+    said, words = " ".join(text.casefold().split()), words_of(text)
+    names = (name for label in labels for name in (label.name, *label.aliases))
+    if words and any(" ".join(name.casefold().split()) == said for name in names):
+        return [(text.strip(), words)]
+    return _parts(text)
 
 
 def _parts(text: str) -> list[tuple[str, list[str]]]:

@@ -105,6 +105,16 @@ def test_plurals_become_singular(plural, singular):
     assert lookup.singular(plural) == singular
 
 
+@pytest.mark.parametrize("name", ["salt and pepper", "R/C car", "mug, chipped", "the mug", "two mugs"])
+def test_a_name_that_reads_like_several_wishes_is_found_as_a_whole(name):
+    others = ["pepper mill", "car", "mug", "lemon"]
+    labels = [lookup.Label(1, name), *(lookup.Label(2 + k, other) for k, other in enumerate(others))]
+    first = lookup.search_labels(labels, name.upper())[0]
+    assert (first.object_id, first.score) == (1, 1.0)
+    assert lookup.unanswered(labels, name) == lookup.unknown(labels, name, None) == []
+    assert {match.object_id for match in lookup.search_labels(labels, "car and lemon")} >= {3, 5}
+
+
 NOUNS = {
     "cookie": "cookies", "movie": "movies", "pie": "pies", "tie": "ties", "cherry": "cherries", "key": "keys",
     "tray": "trays", "cache": "caches", "torch": "torches", "niche": "niches", "dish": "dishes", "size": "sizes",
