@@ -34,18 +34,25 @@ def test_truth_is_of_exact_places_whatever_the_error(load, plan):
         assert (np.diff(a.weights, axis=1) <= 0).all() and (a.weights.sum(axis=1) <= 1 + 1e-6).all()
 
 
-@pytest.mark.parametrize(("model", "constant"), [("drift", True), ("jitter", False)])
-def test_errors_are_as_large_as_they_are_called(load, plan, model, constant):
+def test_errors_are_as_large_as_they_are_called(load, plan):
     scenes = load("association_scenes")
     scene = scenes.make(replace(plan, gaussians=9000), 1)
-    moved = scenes.displaced(scene, 2.0, model, np.random.default_rng(0)) - scene.paths
-    if not constant:
-        assert not moved.any()
-        return
+    moved = scenes.displaced(scene, 2.0, "drift", np.random.default_rng(0)) - scene.paths
     floor = moved[scene.objects == 0] / scene.pixel
     assert np.allclose(floor, floor[:, :1], atol=1e-9)
     assert floor[:, 0].std() == pytest.approx(2.0, rel=0.1)
     assert np.ptp(moved[scene.objects == 1], axis=1).max() > 0
+
+
+@pytest.mark.parametrize(("model", "stays"), [("drift", True), ("jitter", False)])
+def test_errors_of_the_floor_stay_with_drift_and_are_new_in_each_image_with_jitter(load, plan, model, stays):
+    scenes = load("association_scenes")
+    scene = scenes.make(replace(plan, still=1.0), 1)
+    seen = list(scenes.observe(scene, 2.0, model, 5))[:2]
+    assert seen[0].view == seen[1].view
+    floor = [((image.indices >= 0) & (scene.objects[image.indices] == 0)).all(axis=1) for image in seen]
+    same = (seen[0].indices == seen[1].indices).all(axis=1)[floor[0] & floor[1]]
+    assert len(same) > 100 and (same.mean() > 0.95 if stays else same.mean() < 0.1)
 
 
 def test_without_errors_masks_are_the_truth_and_score_one(load, plan):

@@ -146,7 +146,7 @@ def test_a_halo_that_rests_while_its_object_moves_is_background():
     weights, said = plant(votes_for(truth), truth, halo, LEFT, 0.53)
     around = label_hygiene.clean(weights, said, points, opacities)[0][halo]
     moving = np.array([False, True, True, True])
-    told, _ = label_hygiene.clean(weights, said, points, opacities, np.where(truth == 0, 0, truth), moving)
+    told, _ = label_hygiene.clean(weights, said, points, opacities, truth, moving)
     assert (told[halo] == 0).sum() > (around == 0).sum()
 
 
@@ -242,7 +242,7 @@ def test_a_run_cleans_its_labels_says_how_many_and_can_be_told_not_to(tiny, tmp_
     counts = label_hygiene.changes_of(states["on"])
     differ = int((states["on"]["labels"] != states["off"]["labels"]).sum())
     assert counts["gaussians"] == len(states["on"]["labels"])
-    assert counts["neighbours"] + counts["motion"] + counts["outliers"] == differ
+    assert counts["neighbours"] + counts["motion"] + counts["outliers"] == differ > 0
     # The encodings follow the masks' edges by themselves: the maps of ids stay what they were, bit by bit.
     for name in ("identities", "classifier.weight", "classifier.bias", "gaussians.means"):
         assert torch.equal(states["on"][name], states["off"][name])
