@@ -180,7 +180,7 @@ def _pieces(member: _Member, source: Scene) -> list[edited.Piece]:
     """A cloud as what the core writes: each stretch of its rows that was not deleted."""
     cloud, anchor, matrices = member.cloud, member.anchor, np.array(member.matrices)
     bind = matrices[len(source.track_times) - 1]
-    if np.linalg.matrix_rank(bind[:3, :3], tol=1e-9) < 3:  # scaled to nothing: nothing is left of it
+    if visible.flat([bind])[0]:  # scaled to nothing: nothing is left of it
         return []
     remembers = anchor is not None and motion_physics.has_motion(anchor)
     keys = motion_physics.key_error(anchor)[0] if remembers else 0.0

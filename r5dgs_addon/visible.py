@@ -79,7 +79,7 @@ def instances(
     """
     homes, scenes = _homes(), _scenes(depsgraph)
     seen = [(obj, matrix, parent, homes.get(obj) or _by_root(obj)) for obj, matrix, parent in _clouds(depsgraph, space)]
-    seen = [one for one, flat in zip(seen, _flat([one[1] for one in seen]), strict=True) if one[3] and not flat]
+    seen = [one for one, nothing in zip(seen, flat([one[1] for one in seen]), strict=True) if one[3] and not nothing]
     there = {one[3] for one in seen}
     scenes = [one for one in scenes if one in there or not there]
     scenes += [one for one in dict.fromkeys(one[3] for one in seen) if one not in scenes]
@@ -104,10 +104,10 @@ def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | 
         return np.eye(4)
     evaluated = root if depsgraph is None else root.evaluated_get(depsgraph)
     matrix = np.array(evaluated.matrix_world, np.float64)
-    return np.eye(4) if _flat([matrix])[0] else matrix
+    return np.eye(4) if flat([matrix])[0] else matrix
 
 
-def _flat(matrices: list[np.ndarray]) -> np.ndarray:
+def flat(matrices: list[np.ndarray]) -> np.ndarray:
     """Which maps flatten space, as far as single precision tells: what is scaled to nothing is not seen. [n]"""
     if not matrices:
         return np.zeros(0, bool)

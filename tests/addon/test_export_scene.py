@@ -261,3 +261,12 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
     said = capfd.readouterr().out
     assert f"mug: what moves before frame {1 + 60 * late.track_times[0]:.4g}, the first observed time" in said
     assert "red apple" not in said
+
+
+@pytest.mark.parametrize("scale", [(0.0, 0.0, 0.0), (1e-8, 1.0, 1.0)])
+def test_what_is_too_flat_to_be_seen_is_not_in_the_file(blender, loaded, scale, tmp_path):
+    cloud(loaded, "mug").scale = scale
+    visible = importlib.import_module("r5dgs.r5dgs_addon.visible")
+    _, seen = visible.instances(blender.context.evaluated_depsgraph_get())
+    assert "mug" not in {one.object.name for one in seen}
+    assert "mug" not in {item.name for item in save(blender, tmp_path / "b.r5dgs").objects}
