@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from r5dgs_core.data import images
+from r5dgs_core.data import dataset, images, mask_notes
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.raster import scene_render
@@ -226,6 +226,17 @@ def orbit_camera(angle_rad: float, width: int, height: int) -> cameras.Camera:
     matrix[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
     matrix[:3, 3] = position
     return scenes.camera_from_field_of_view(matrix, FIELD_OF_VIEW, width, height)
+
+
+def number_by_camera(root: Path, folder: Path, ids: tuple[int, ...]) -> mask_notes.MaskNotes:
+    """Note in a folder of masks that those of each training camera of a data set have a numbering of their own."""
+    videos = {}
+    for view in dataset.read(root).train:
+        before = videos.get(view.camera.name, mask_notes.Video((), ids))
+        videos[view.camera.name] = dataclasses.replace(before, images=(*before.images, view.name))
+    notes = mask_notes.MaskNotes("tracker", mask_notes.VIDEO, videos=videos)
+    mask_notes.write(notes, folder)
+    return notes
 
 
 def _floor(rng: np.random.Generator):

@@ -1,5 +1,7 @@
 """What is made once for all tests that look at it: the tiny data set, one training of it, a scene and its pictures."""
 
+import shutil
+
 import pytest
 
 from r5dgs_core.data import dataset as datasets
@@ -12,6 +14,12 @@ from tests import pictures, scenes
 def tiny(tmp_path_factory):
     """The data set of `tests/datasets.py` with masks."""
     return tiny_datasets.make_dataset(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture
+def copied(tiny, tmp_path):
+    """The folder of a copy of it, to be changed."""
+    return shutil.copytree(tiny.root, tmp_path / "data")
 
 
 @pytest.fixture(scope="session")

@@ -127,12 +127,6 @@ def test_ids_of_one_video_are_the_folders_own(views, tmp_path):
     assert json.loads((tmp_path / "objects.json").read_text())["3"] == "object 3"
 
 
-@pytest.fixture
-def copied(tiny, tmp_path):
-    shutil.copytree(tiny.root, tmp_path / "data")
-    return tmp_path / "data"
-
-
 def test_masks_of_a_folder_are_taken_over_as_ids(copied, tmp_path, capsys):
     """Colours become ids, other sizes the images' own, 255 unknown; names by path or by the file alone."""
     source = tmp_path / "theirs"

@@ -1,7 +1,6 @@
 """What a folder says of its masks is read back, and decides how they may be used."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -20,23 +19,6 @@ NOTES = mask_notes.MaskNotes(
     {"cam0": mask_notes.Video(("train/r_0", "train/r_1"), (1, 4)), "cam1": mask_notes.Video((), ())},
     {"points": 8, "model": "abc"},
 )
-
-
-@pytest.fixture
-def copied(tiny, tmp_path):
-    """The tiny data set, to be changed."""
-    shutil.copytree(tiny.root, tmp_path / "data")
-    return tmp_path / "data"
-
-
-def by_camera(root):
-    """Notes that number the masks of each camera on their own."""
-    videos = {}
-    for view in datasets.read(root).train:
-        videos.setdefault(view.camera.name, []).append(view.name)
-    return mask_notes.MaskNotes(
-        "sam2", mask_notes.VIDEO, videos={name: mask_notes.Video(tuple(v), (1, 2)) for name, v in videos.items()}
-    )
 
 
 def test_notes_come_back_as_they_were_written(tmp_path):
@@ -91,7 +73,7 @@ def test_unknown_of_16_bits_needs_no_notes(copied):
 
 
 def test_masks_numbered_per_video_are_not_trained_with(copied, tmp_path):
-    mask_notes.write(by_camera(copied), copied / "object_mask")
+    tiny_datasets.number_by_camera(copied, copied / "object_mask", (1, 2))
     dataset = datasets.read(copied)
     assert len({view.mask_video for view in dataset.train}) == 6
     with pytest.raises(errors.DatasetError, match=r"hold within a video only \(6 of them.*--masks none.*associate"):

@@ -13,6 +13,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
 from r5dgs_core.scene import scene_file
 from r5dgs_core.semantics import association, drawn_bags, mask_repair
+from tests import datasets as tiny_datasets
 
 
 def rewrite(root, folder, change):
@@ -50,10 +51,7 @@ def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
         folder,
         lambda view, ids: exchanged(ids) if names.index(view.camera.name) % 2 else np.where(ids == 1, 9, ids),
     )
-    videos = {
-        name: mask_notes.Video(tuple(v.name for v in data.train if v.camera.name == name), (1, 2, 9)) for name in names
-    }
-    mask_notes.write(mask_notes.MaskNotes("tracker", mask_notes.VIDEO, videos=videos), folder)
+    tiny_datasets.number_by_camera(tiny.root, folder, (1, 2, 9))
     with pytest.raises(errors.DatasetError, match="r5dgs associate RUN"):
         datasets.read(tiny.root, str(folder)).require_one_numbering()
 
@@ -148,12 +146,7 @@ def test_no_masks_at_all_is_an_error(baked, tiny):
 def split_into_videos(root, folder):
     """Masks that say that each camera's have a numbering of its own."""
     data = rewrite(root, folder, lambda view, ids: exchanged(ids) if view.camera.name.endswith("1") else ids)
-    names = sorted({view.camera.name for view in data.train})
-    videos = {
-        name: mask_notes.Video(tuple(v.name for v in data.train if v.camera.name == name), (1, 2)) for name in names
-    }
-    mask_notes.write(mask_notes.MaskNotes("tracker", mask_notes.VIDEO, videos=videos), folder)
-    return data, videos
+    return data, tiny_datasets.number_by_camera(root, folder, (1, 2)).videos
 
 
 def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny, tmp_path, capsys, monkeypatch):
