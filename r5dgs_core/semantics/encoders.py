@@ -122,11 +122,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return np.divide(wide, norms, out=np.zeros_like(wide), where=norms > 0).astype(np.float32)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object of an encoder's folder. Raises `BackendError`."""
+def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
+    """A JSON object of a model's folder. Raises `BackendError`."""
     if not path.is_file():
         raise errors.BackendError(
-            f"{path}: expected in the folder of an encoder, found {_what(path)}; download or copy the model again"
+            f"{path}: expected in the folder of {of}, found {_what(path)}; download or copy the model again"
         )
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -138,7 +138,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
-    """The files of an encoder's weights, each opened once to see that it is whole. Raises `BackendError`."""
+    """The files of a model's weights, each opened once to see that it is whole. Raises `BackendError`."""
     try:
         import safetensors
     except ImportError as error:

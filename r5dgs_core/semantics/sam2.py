@@ -7,7 +7,6 @@ video (`video`). Nothing is fetched, and no weight is made up: what a folder lac
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,13 +47,14 @@ class Sam2:
         folder = Path(folder)
         transformers = _transformers()
         _check(folder)
+        weights = encoders.weights_of(folder)
         with _quiet(transformers):
             self.video = _load(transformers.Sam2VideoModel, folder).to(self.device)
             self.image = _load(transformers.Sam2Model, folder).to(self.device)
         size = self.video.config.image_size
         self.size = int(size if isinstance(size, int) else max(size))
         self.name = folder.resolve().name
-        self.digest = encoders.digest_of(_weights(folder))
+        self.digest = encoders.digest_of(weights)
 
     def pixels(self, image: np.ndarray) -> Tensor:
         """An RGB image [H, W, 3] uint8 as the networks take it. [1, 3, S, S]"""
@@ -101,24 +101,10 @@ def _check(folder: Path) -> None:
     if not folder.is_dir():
         raise errors.BackendError(f"{folder}: {wanted}, found {'a file' if folder.exists() else 'nothing'}")
     path = folder / "config.json"
-    if not path.is_file():
-        raise errors.BackendError(f"{path}: the file is missing; {wanted}")
-    try:
-        config = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise errors.BackendError(f"{path}: cannot be read ({error}); get the model's files again") from error
-    kind = config.get("model_type") if isinstance(config, dict) else None
+    kind = encoders.read_json(path, "SAM2").get("model_type")
     if kind != KIND:
         remedy = "; a folder of the image model alone cannot follow objects" if kind == "sam2" else ""
         raise errors.BackendError(f"{path}: expected a model of type {KIND!r}, found {kind!r}{remedy}")
-    if not _weights(folder):
-        raise errors.BackendError(
-            f"{folder / 'model.safetensors'}: the weights are missing; get the model's files again"
-        )
-
-
-def _weights(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.safetensors"))
 
 
 def _load(kind: Any, folder: Path) -> Any:
@@ -132,12 +118,7 @@ def _load(kind: Any, folder: Path) -> Any:
         raise errors.BackendError(
             f"{folder}: the model cannot be loaded ({reason[:300]}); is a file damaged or cut off? Get it again"
         ) from error
-    lacking = sorted(found["missing_keys"]) + sorted(str(key) for key in found["mismatched_keys"])
-    if lacking:
-        raise errors.BackendError(
-            f"{folder}: {len(lacking)} weights are missing or of another shape, the first one is {lacking[0]}; "
-            "do config.json and the weights belong together?"
-        )
+    encoders.check_loaded(folder, found)
     return model.eval().requires_grad_(False)
 
 

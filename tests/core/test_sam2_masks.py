@@ -318,14 +318,14 @@ def widen(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (cut_weights, "broken: the model cannot be loaded .* damaged or cut off"),
-        (drop_weight, r"broken: 1 weights are missing .* memory_attention\.layer_norm\.weight"),
+        (cut_weights, r"broken/model\.safetensors: expected safetensors, found a damaged or cut file"),
+        (drop_weight, r"broken: 1 of the model's weights are missing \(memory_attention\.layer_norm\.weight"),
         (widen, "broken: the model cannot be loaded"),
         (set_kind("clip"), r"config\.json: expected a model of type 'sam2_video', found 'clip'"),
         (set_kind("sam2"), "found 'sam2'; a folder of the image model alone cannot follow objects"),
-        (lambda folder: (folder / "config.json").write_text("{"), r"config\.json: cannot be read"),
-        (lambda folder: (folder / "config.json").unlink(), r"config\.json: the file is missing"),
-        (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: the weights are missing"),
+        (lambda folder: (folder / "config.json").write_text("{"), r"config\.json: expected JSON, found damage"),
+        (lambda folder: (folder / "config.json").unlink(), r"config\.json: expected in the folder of SAM2, found"),
+        (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: expected the weights, found"),
     ],
 )
 def test_folders_that_hold_no_whole_sam2_are_one_clear_error(folder, tmp_path, change, message):
