@@ -1,13 +1,12 @@
 """Prompts in words that no scene stores: the worker embeds them with the encoder of the preferences."""
 
 import sys
-import time
 
 import pytest
 
 from r5dgs_core.scene import scene_file
 from tests import encoder_folders, scenes
-from tests.addon import motions
+from tests.addon import motions, patience
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -41,10 +40,7 @@ def loaded(blender, folders, monkeypatch):
 
 def wait_for_the_answer():
     """Look as often as Blender's timer does until there is nothing more to look for."""
-    deadline = time.monotonic() + 60
-    while motions.addon("phrases").look() is not None:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    patience.wait_until(lambda: motions.addon("phrases").look() is None)
 
 
 def ask(bpy, text):

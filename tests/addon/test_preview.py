@@ -7,7 +7,6 @@ import re
 import signal
 import stat
 import sys
-import time
 import types
 
 import numpy as np
@@ -17,6 +16,7 @@ from r5dgs_core import errors
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback, quality, scene_file
 from tests import scenes
+from tests.addon import patience
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -318,8 +318,7 @@ def test_a_worker_that_died_is_started_again_by_the_next_preview(blender, loaded
     preview(blender)
     first = worker.current()
     os.kill(first.pid, signal.SIGKILL)
-    while first.alive:
-        time.sleep(0.01)
+    patience.wait_until(lambda: not first.alive)
     preview(blender)
     assert worker.current().pid != first.pid
 
@@ -407,8 +406,7 @@ def test_who_waits_for_the_compiler_is_told_so(blender, loaded, worker, windowed
     assert worker.notice() == ""
     job = worker.start([("rendering", "warm", {})])
     with open(tmp_path / "gate", "w"):  # from here on the worker waits for the end of this block
-        while not worker.notice():
-            time.sleep(0.01)
+        patience.wait_until(worker.notice)
         assert "rasterizer" in worker.notice() and job.doing == worker.notice()
         assert worker.notice() in caplog.text
         window = Window(importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview, job)

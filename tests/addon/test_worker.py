@@ -6,7 +6,6 @@ import signal
 import stat
 import sys
 import threading
-import time
 import types
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
 from tests import scenes
+from tests.addon import patience
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
@@ -48,8 +48,7 @@ def held(worker):
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     job = worker.start(HELLO)
-    while job.doing != "greeting":
-        time.sleep(0.005)
+    patience.wait_until(lambda: job.doing == "greeting")
     yield running, job
     if running.alive:
         os.kill(running.pid, signal.SIGCONT)
@@ -64,8 +63,7 @@ def test_writing_to_a_worker_that_has_ended_is_an_error_and_no_signal_for_blende
     before = signal.signal(signal.SIGPIPE, lambda *_: heard.append(True))
     try:
         running = process.Worker("true")
-        while running.alive:
-            time.sleep(0.005)
+        patience.wait_until(lambda: not running.alive)
         with pytest.raises(errors.BackendError, match=r"ended unexpectedly.*'Worker Python'"):
             running.greet()
         assert not heard and signal.SIGPIPE not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -91,8 +89,7 @@ def test_what_runs_already_is_not_dropped_for_what_comes_later(worker):
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     first = worker.submit("view", HELLO)
-    while first.doing != "greeting":
-        time.sleep(0.005)
+    patience.wait_until(lambda: first.doing == "greeting")
     second = worker.submit("view", HELLO)
     os.kill(running.pid, signal.SIGCONT)
     assert first.answer()[0]["pid"] == second.answer()[0]["pid"] == running.pid
@@ -131,8 +128,7 @@ def test_a_worker_that_is_killed_in_the_middle_of_a_picture_is_survived(worker, 
     steps = [("loading", "load", {"paths": [str(path)]}), ("rendering", "render", render)]
     running = worker.current()
     job = worker.start(steps)
-    while job.doing != "rendering" and not job.done:
-        time.sleep(0.001)
+    patience.wait_until(lambda: job.doing == "rendering" or job.done)
     os.kill(running.pid, signal.SIGKILL)
     with pytest.raises(errors.BackendError, match="ended unexpectedly.*starts it again"):
         job.answer()
@@ -258,8 +254,7 @@ def test_who_asks_does_not_wait_for_the_search_and_can_give_it_up(worker, only_p
     told = tmp_path / "pid"
     only_python(f"echo $$ > {told}.new; /bin/mv {told}.new {told}; exec /bin/sleep 600\n")
     job = worker.submit("view", HELLO)
-    while not told.exists():
-        time.sleep(0.005)
+    patience.wait_until(told.exists)
     assert not job.done and job.doing == worker.SEARCHING == "looking for a Python with torch"
     job.cancel()
     assert job.done and not worker.busy()
