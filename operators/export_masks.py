@@ -6,7 +6,7 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..r5dgs_addon import actions, export_frames, export_masks, running
 
 
-class R5DGS_OT_export_masks(running.Running, actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_export_masks(running.Running, actions.NeedsCamera, bpy.types.Operator):
     """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
 
     bl_idname = "r5dgs.export_masks"
@@ -20,15 +20,6 @@ class R5DGS_OT_export_masks(running.Running, actions.NeedsScene, bpy.types.Opera
     format: EnumProperty(name="Format", description="What is written", items=export_masks.FORMATS)
     frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES, default="RANGE")
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
-
-    @classmethod
-    def poll(cls, context):
-        if not super().poll(context):
-            return False
-        if context.scene.camera is None:
-            cls.poll_message_set("Add a camera to the scene first")
-            return False
-        return True
 
     def steps(self, context):
         return export_masks.steps(

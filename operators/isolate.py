@@ -3,10 +3,10 @@
 import bpy
 from bpy.props import IntProperty, StringProperty
 
-from ..r5dgs_addon import amounts, isolation, prompt, selection, table
+from ..r5dgs_addon import actions, amounts, isolation, prompt, selection, table
 
 
-class R5DGS_OT_isolate(bpy.types.Operator):
+class R5DGS_OT_isolate(actions.Selects, bpy.types.Operator):
     """Hide the other objects of all loaded scenes, in viewports and renders"""
 
     bl_idname = "r5dgs.isolate"
@@ -20,13 +20,6 @@ class R5DGS_OT_isolate(bpy.types.Operator):
     object_id: IntProperty(
         name="Object Id", description="Object to show instead", default=table.NOBODY, options={"SKIP_SAVE"}
     )
-
-    @classmethod
-    def poll(cls, context):
-        obstacle = selection.obstacle(context)
-        if obstacle:
-            cls.poll_message_set(obstacle)
-        return not obstacle
 
     def execute(self, context):
         if self.object_id != table.NOBODY:

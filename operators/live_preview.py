@@ -5,7 +5,7 @@ import bpy
 from ..r5dgs_addon import actions, live_preview
 
 
-class R5DGS_OT_live_preview(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_live_preview(actions.NeedsCamera, bpy.types.Operator):
     """Keep the image 'R5DGS Preview' up to date with the frame, the camera and the objects; press again to stop"""
 
     bl_idname = "r5dgs.live_preview"
@@ -18,12 +18,7 @@ class R5DGS_OT_live_preview(actions.NeedsScene, bpy.types.Operator):
         if bpy.app.background:
             cls.poll_message_set("Live preview needs a window; render single previews instead")
             return False
-        if not super().poll(context):
-            return False
-        if context.scene.camera is None:
-            cls.poll_message_set("Add a camera to the scene first")
-            return False
-        return True
+        return super().poll(context)
 
     def execute(self, context):
         if live_preview.running():

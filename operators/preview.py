@@ -5,7 +5,7 @@ import bpy
 from ..r5dgs_addon import actions, figures, picture, waiting
 
 
-class R5DGS_OT_preview(waiting.Waiting, actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_preview(waiting.Waiting, actions.NeedsCamera, bpy.types.Operator):
     """Render the loaded scenes as the active camera sees them, in the worker, into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"
@@ -14,12 +14,7 @@ class R5DGS_OT_preview(waiting.Waiting, actions.NeedsScene, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if not (waiting.free(cls, picture.PREVIEW) and super().poll(context)):
-            return False
-        if context.scene.camera is None:
-            cls.poll_message_set("Add a camera to the scene first")
-            return False
-        return True
+        return waiting.free(cls, picture.PREVIEW) and super().poll(context)
 
     def _begin(self, context):
         return picture.start(context)

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import prompt, selection
+from ..r5dgs_addon import actions, prompt, selection
 
 MODES = (
     ("SET", "Set", "Select these objects only", "SELECT_SET", 0),
@@ -12,7 +12,7 @@ MODES = (
 )
 
 
-class R5DGS_OT_select_by_prompt(bpy.types.Operator):
+class R5DGS_OT_select_by_prompt(actions.Selects, bpy.types.Operator):
     """Select the objects that these words name"""
 
     bl_idname = "r5dgs.select_by_prompt"
@@ -29,13 +29,6 @@ class R5DGS_OT_select_by_prompt(bpy.types.Operator):
         subtype="FACTOR",
         options={"SKIP_SAVE"},
     )
-
-    @classmethod
-    def poll(cls, context):
-        obstacle = selection.obstacle(context)
-        if obstacle:
-            cls.poll_message_set(obstacle)
-        return not obstacle
 
     def execute(self, context):
         settings, session = context.scene.r5dgs_words, context.window_manager.r5dgs_words

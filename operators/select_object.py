@@ -3,11 +3,11 @@
 import bpy
 from bpy.props import EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import selection, table
+from ..r5dgs_addon import actions, selection, table
 from . import select_by_prompt
 
 
-class R5DGS_OT_select_object(bpy.types.Operator):
+class R5DGS_OT_select_object(actions.Selects, bpy.types.Operator):
     """Select this object; Shift adds it, Ctrl takes it out"""
 
     bl_idname = "r5dgs.select_object"
@@ -23,13 +23,6 @@ class R5DGS_OT_select_object(bpy.types.Operator):
     mode: EnumProperty(
         name="Mode", description="What to do with the selection", items=select_by_prompt.MODES, options={"SKIP_SAVE"}
     )
-
-    @classmethod
-    def poll(cls, context):
-        obstacle = selection.obstacle(context)
-        if obstacle:
-            cls.poll_message_set(obstacle)
-        return not obstacle
 
     def invoke(self, context, event):
         if event.shift or event.ctrl:

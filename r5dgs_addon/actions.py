@@ -16,6 +16,30 @@ class NeedsScene:
         return True
 
 
+class NeedsCamera(NeedsScene):
+    """An operator that looks at loaded scenes through the active camera."""
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        if context.scene.camera is None:
+            cls.poll_message_set("Add a camera to the scene first")
+            return False
+        return True
+
+
+class Selects:
+    """An operator that selects or hides objects of loaded scenes."""
+
+    @classmethod
+    def poll(cls, context):
+        obstacle = selection.obstacle(context)
+        if obstacle:
+            cls.poll_message_set(obstacle)
+        return not obstacle
+
+
 class OfObject(NeedsScene):
     """An operator on one object of the table: the active one, unless another is named."""
 
