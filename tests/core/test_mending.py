@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pytest
 
 from r5dgs_core.data.masks import UNKNOWN
 from r5dgs_core.semantics import association, bags, mending
@@ -18,11 +21,17 @@ def truth() -> np.ndarray:
     return mask
 
 
-def mended(masks: list[np.ndarray]) -> list[np.ndarray]:
-    """Associate and mend masks of one view over time."""
+def associated(masks: list[np.ndarray]) -> tuple[list[bags.ImageBags], association.Association]:
+    """Bags of masks of one view over time, and their association."""
     indices, weights = PIXELS.reshape(-1, 1), np.ones((SIZE * SIZE, 1))
     given = [bags.from_pixels(mask, indices, weights, SIZE * SIZE, view=0, time=t) for t, mask in enumerate(masks)]
-    found = association.associate(given)
+    return given, association.associate(given)
+
+
+def mended(masks: list[np.ndarray], **changes: object) -> list[np.ndarray]:
+    """Associate and mend masks of one view over time, with changes of what the association says of itself."""
+    given, found = associated(masks)
+    found = dataclasses.replace(found, **changes)
     out = []
     for k, (seen, shares) in enumerate(mending.shares(given, found)):
         drawn = np.zeros((SIZE * SIZE, shares.shape[1]), np.float32)
@@ -61,6 +70,27 @@ def test_an_object_that_nothing_shows_takes_no_pixel():
     out = mended(masks)[0]
     assert (out[truth() == 3] == UNKNOWN).all()
     np.testing.assert_array_equal(out[truth() != 3], truth()[truth() != 3])
+
+
+def test_what_is_unknown_stays_so_even_where_votes_show_an_object():
+    masks = [truth() for _ in range(TIMES)]
+    masks[0][masks[0] == 3] = UNKNOWN
+    given, found = associated(masks)
+    drawn = np.eye(4, dtype=np.float32)[truth()]
+    np.testing.assert_array_equal(mending.mend(masks[0], given[0].ids, drawn, found, 0), masks[0])
+
+
+def test_what_lies_in_several_segments_alike_takes_pixels_of_none():
+    masks = [truth() for _ in range(TIMES)]
+    masks[3][14:20, 4:6], masks[3][14:20, 6:8], masks[3][14:20, 8:10] = 0, 1, 2
+    np.testing.assert_array_equal(mended(masks)[3], masks[3])
+
+
+@pytest.mark.parametrize("doubt", [{"fallback": True}, {"usual_iou": 0.99 * mending.TRUSTED}])
+def test_votes_that_are_not_trusted_move_no_outline(doubt):
+    masks = [truth() for _ in range(TIMES)]
+    masks[3][masks[3] == 3] = 0
+    np.testing.assert_array_equal(mended(masks, **doubt)[3], masks[3])
 
 
 def test_relabelling_follows_the_ids_and_knows_no_others():
