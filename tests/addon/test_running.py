@@ -41,12 +41,18 @@ def running(blender, extension, monkeypatch):
     return module
 
 
-def begin(running, steps):
-    """An operator that runs steps in a window, and the window."""
-    window, reports = Window(), []
+def make(running, steps):
+    """An operator that runs steps, a window, and what it reports."""
+    reports = []
     members = {"steps": lambda self, context: steps, "suggest": lambda self, context: True}
     operator = type("Operator", (running.Running,), members)()
     operator.report = lambda kind, text: reports.append((*kind, text))
+    return operator, Window(), reports
+
+
+def begin(running, steps):
+    """`make`, and it has begun beside the window."""
+    operator, window, reports = make(running, steps)
     assert operator.invoke(window, None) == {"RUNNING_MODAL"} and window.timers == 1
     return operator, window, reports
 
@@ -79,6 +85,38 @@ def test_the_end_is_reported_with_what_was_not_as_expected(running):
     assert blink(operator, window) == {"FINISHED"}
     assert reports == [("INFO", "3 files"), ("WARNING", "one is odd")] and tidy(window)
     assert "file 2, 2 of 3" in window.said[-2] and window.done == ["begin", 0, 1 / 3, 2 / 3, "end"]
+
+
+@pytest.mark.parametrize("why", ["a script asks", "there is no window", "Blender runs in the background"])
+def test_where_nobody_looks_all_is_done_at_once(running, monkeypatch, why):
+    def steps():
+        yield running.Step(0, 1, "frame")
+        return running.Outcome("1 file")
+
+    operator, window, reports = make(running, steps())
+    window.window = None if why == "there is no window" else window.window
+    monkeypatch.setattr(running.bpy.app, "background", why == "Blender runs in the background")
+    ask = operator.execute if why == "a script asks" else lambda context: operator.invoke(context, None)
+    assert ask(window) == {"FINISHED"} and reports == [("INFO", "1 file")]
+    assert window.timers == 0 and window.done == window.said == []
+
+
+def test_the_time_that_is_left_is_told_by_the_pace_so_far(running, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def steps():
+        for done in range(1, 5):
+            now[0] += 2.0
+            yield running.Step(done, 4, "frame")
+        return running.Outcome("4 files")
+
+    operator, window, _ = begin(running, steps())
+    for told in ("1 of 4, 6 s left", "2 of 4, 4 s left", "3 of 4, 2 s left"):
+        blink(operator, window)
+        assert told in window.said[-1]
+    blink(operator, window)
+    assert blink(operator, window) == {"FINISHED"}
 
 
 def test_the_window_shows_what_takes_long_before_that_is_done(running):
@@ -159,3 +197,11 @@ def test_the_mouse_shows_how_far_loading_is_and_is_itself_again_after_an_error(r
         progress(0.4)
         raise ZeroDivisionError
     assert window.done == ["begin", 40.0, "end"]
+
+
+def test_without_a_window_there_is_no_mouse_to_show_it(running):
+    window = Window()
+    window.window = None
+    with running.cursor(window) as progress:
+        progress(0.4)
+    assert window.done == []
