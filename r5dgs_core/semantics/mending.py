@@ -53,8 +53,7 @@ def mend(
     if not trusts(found):
         return out
     names = np.concatenate([[0], found.objects])
-    shown = names[drawn.argmax(axis=-1)]
-    shown[drawn.sum(axis=-1) <= 0] = 0
+    shown = names[drawn.argmax(axis=-1)]  # background where nothing votes
     result = out.copy()
     for name in lacks(found, image):
         where = shown == name
