@@ -21,7 +21,7 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     The first call of a fresh installation takes ten to fifteen seconds, later processes well below one.
 
     Args:
-        gradients: Whether those of the backward passes are wanted, too; viewers do without.
+        gradients: Whether those that training needs are wanted, too; viewers do without.
         progress: Called with the name of each stage before it begins.
 
     Returns:
@@ -36,7 +36,10 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
         *(("colors", _colors), ("sky", _sky)),
     ]
     if gradients:
-        stages += [("gradients of splats", _splat_gradients), ("gradients of colors", _color_gradients)]
+        stages += [
+            *(("weights of segments", _segment_weights), ("gradients of splats", _splat_gradients)),
+            ("gradients of colors", _color_gradients),
+        ]
     for name, stage in stages:
         if progress is not None:
             progress(name)
@@ -71,6 +74,13 @@ def _backdrop() -> None:
 
 def _splat_gradients() -> None:
     _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
+
+
+def _segment_weights() -> None:
+    from . import segment_weights  # needs scipy, which is slow to import
+
+    segments = torch.zeros(_VIEW.height, _VIEW.width, dtype=torch.int64)
+    segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1, backend="cpu")
 
 
 def _colors() -> None:
