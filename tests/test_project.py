@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import torch
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -90,7 +91,6 @@ def test_the_commands_of_the_readme_exist():
 
 
 def test_the_python_of_the_readme_runs():
-    torch = pytest.importorskip("torch")
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
     assert blocks
     names: dict = {}

@@ -219,7 +219,7 @@ def test_without_the_right_to_read_it_says_so(blender, scene_path, what):
 
 
 def test_a_scene_file_that_was_moved_away_is_missed_by_name_and_nothing_breaks(loaded, scene_path, tmp_path, capfd):
-    pytest.importorskip("torch", reason="the worker draws with it")
+    pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
     away = tmp_path / "moved" / "elsewhere.r5dgs"
     away.parent.mkdir()
     scene_path.rename(away)
@@ -267,7 +267,7 @@ def without_torch(monkeypatch, tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="the script is one of POSIX")
 def test_a_python_without_torch_is_named_with_the_remedy_and_the_next_choice_works(loaded, without_torch, tmp_path):
-    pytest.importorskip("torch", reason="the worker draws with it")
+    pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
     loaded.context.scene.render.engine = "R5DGS"
     said = "worker: .*python lacks torch; install the core there.*pip install r5dgs.*'Worker Python'"
     for act in (
@@ -302,7 +302,7 @@ def dying(loaded):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="signals are those of POSIX")
 def test_a_worker_that_is_killed_in_mid_render_is_told_and_the_next_picture_comes(loaded, dying):
-    pytest.importorskip("torch", reason="the worker draws with it")
+    pytest.importorskip("torch", reason="torch is not installed in this Python, which runs the worker here")
     assert f12(loaded)
     for act in (lambda: f12(loaded), loaded.ops.r5dgs.preview):
         with (

@@ -8,6 +8,7 @@ import threading
 import types
 
 import numpy as np
+import OpenImageIO
 import pytest
 
 from r5dgs_core.data import images
@@ -86,7 +87,6 @@ def render_passes(bpy, folder):
 
 def read_exr(path, parts=2):
     """Channels of all images of an EXR by pass and channel, with 3 parts of a name by layer, too. [H, W] each"""
-    OpenImageIO = pytest.importorskip("OpenImageIO")
     source, found, part = OpenImageIO.ImageInput.open(str(path)), {}, 0
     while source.seek_subimage(part, 0):
         pixels = source.read_image("float").reshape(source.spec().height, source.spec().width, -1)
@@ -98,7 +98,6 @@ def read_exr(path, parts=2):
 
 def metadata_of(path):
     """The header of an EXR."""
-    OpenImageIO = pytest.importorskip("OpenImageIO")
     return {one.name: one.value for one in OpenImageIO.ImageInput.open(str(path)).spec().extra_attribs}
 
 

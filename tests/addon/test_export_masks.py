@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from r5dgs_core.data import images
@@ -11,7 +12,6 @@ from r5dgs_core.scene import cameras, playback, scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
-oiio = pytest.importorskip("OpenImageIO")
 
 from mathutils import Matrix  # noqa: E402  (bpy brings it)
 
