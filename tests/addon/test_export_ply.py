@@ -115,25 +115,53 @@ def test_what_was_moved_turned_scaled_and_mirrored_looks_as_in_blender(blender, 
     assert psnr(render(splats, scene, camera), shown(scene, loaded, camera)) < 35  # the file is that of frame 43
 
 
-def test_a_moved_turned_scaled_and_tinted_object_looks_as_in_the_preview(blender, scene, loaded, tmp_path, monkeypatch):
+@pytest.fixture
+def previewed(blender, scene, loaded, monkeypatch):
+    """An object of the edited scene, and a function that gives a camera and the worker's preview. [72, 96, 3]"""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     blender.context.scene.frame_set(43)
     mug, _, _ = edit(blender, loaded)
-    mug.r5dgs_look.tint = (0.4, 1.3, 0.8)
     camera, view = in_blender(scene.cameras[0]), blender.context.scene
-    view.camera.data.sensor_fit = "HORIZONTAL"
-    view.camera.data.lens = camera.intrinsics[0, 0] * view.camera.data.sensor_width / camera.width
-    view.camera.matrix_world = Matrix(cameras.cam_world_to_opengl(camera.T_cam_world).tolist())
-    view.render.resolution_x, view.render.resolution_y, view.render.resolution_percentage = 96, 72, 100
-    blender.context.view_layer.update()
-    assert blender.ops.r5dgs.preview() == {"FINISHED"}
-    image = blender.data.images["R5DGS Preview"]
-    pixels = np.empty(4 * 96 * 72, np.float32)
-    image.pixels.foreach_get(pixels)
-    shown_there = pixels.reshape(72, 96, 4)[::-1, :, :3]
+
+    def preview():
+        view.camera.data.sensor_fit = "HORIZONTAL"
+        view.camera.data.lens = camera.intrinsics[0, 0] * view.camera.data.sensor_width / camera.width
+        view.camera.matrix_world = Matrix(cameras.cam_world_to_opengl(camera.T_cam_world).tolist())
+        view.render.resolution_x, view.render.resolution_y, view.render.resolution_percentage = 96, 72, 100
+        blender.context.view_layer.update()
+        assert blender.ops.r5dgs.preview() == {"FINISHED"}
+        pixels = np.empty(4 * 96 * 72, np.float32)
+        blender.data.images["R5DGS Preview"].pixels.foreach_get(pixels)
+        return camera, pixels.reshape(72, 96, 4)[::-1, :, :3]
+
+    return mug, preview
+
+
+def test_a_moved_turned_scaled_and_tinted_object_looks_as_in_the_preview(blender, scene, previewed, tmp_path):
+    mug, preview = previewed
+    mug.r5dgs_look.tint = (0.4, 1.3, 0.8)
+    camera, shown_there = preview()
     assert psnr(render(export(blender, tmp_path / "a.ply"), scene, camera), shown_there) > 40
     mug.r5dgs_look.tint = (1, 1, 1)
     assert psnr(render(export(blender, tmp_path / "b.ply"), scene, camera), shown_there) < 40
+
+
+def test_what_third_parties_read_looks_as_in_the_preview(blender, scene, previewed, tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'test'")
+    camera, shown_there = previewed[1]()
+    assert blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply")) == {"FINISHED"}
+    columns = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
+
+    def column(*names):
+        return np.stack([np.asarray(columns[name], np.float32).ravel() for name in names], axis=-1)
+
+    rest = column(*(f"f_rest_{k}" for k in range(45))).reshape(-1, 3, 15).swapaxes(1, 2)
+    sh = np.concatenate([column("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], axis=1)
+    sigmas, turns = column(*(f"scale_{k}" for k in range(3))), column(*(f"rot_{k}" for k in range(4)))
+    theirs = ply.Splats(column("x", "y", "z"), turns, sigmas, column("opacity")[:, 0], sh)
+    assert psnr(render(theirs, scene, camera), shown_there) > 40
+    flat = dataclasses.replace(theirs, sh=sh[:, :1])
+    assert psnr(render(flat, scene, camera), shown_there) < 40  # the harmonics can be seen
 
 
 def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path):
@@ -252,7 +280,7 @@ def test_without_the_scene_file_the_points_in_blender_do(blender, loaded, tmp_pa
 
 
 def test_third_parties_read_the_columns(blender, loaded, tmp_path):
-    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'mesh'")
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed; it comes with the extra 'test'")
     ours = export(blender, tmp_path / "a.ply")
     theirs = trimesh.load(tmp_path / "a.ply")
     np.testing.assert_array_equal(np.asarray(theirs.vertices, np.float32), ours.means)
