@@ -130,6 +130,8 @@ class Scene:
         near_plane: Gaussians whose centre lies nearer than this depth are not drawn, as in training; world units.
         harmonics_turn: Whether harmonics turn with Gaussians that turn on their own, too; those of other projects stay
             in the world's frame.
+        origin: Point of the data set's world from which all positions of the scene are measured: world = origin +
+            position. Zero unless the world's origin lies so far away that float32 would lose detail. [3] float64
     """
 
     name: str
@@ -171,6 +173,7 @@ class Scene:
     needs: tuple[dict[str, Any], ...] = ()
     near_plane: float = NEAR_PLANE
     harmonics_turn: bool = True
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @functools.cached_property
     def extent(self) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import struct
 import zipfile
 import zlib
@@ -18,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from . import files, meanings, playback, scene_json, validation
+from . import features, files, meanings, playback, scene_json, validation
 from .scene import Scene
 
 FORMAT = "r5dgs scene"
-FORMAT_VERSION = 1
 JSON_MEMBER = "scene.json"
 
 # Fixed point: stored int16 i stands for i / scale.
@@ -84,6 +84,8 @@ for _name in _HALF:
     _STORED_DTYPES[_name].add("<f2")
 # What zipfile, zlib and numpy raise on damaged bytes; the encrypted flag is a RuntimeError, odd names a ValueError.
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError, KeyError)
+
+_log = logging.getLogger(__name__)
 
 
 def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
@@ -208,7 +210,7 @@ def _write_zip(scene: Scene, stream: Any, exact: bool) -> None:
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
         arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None and name not in still]
-        head = {"format": FORMAT, "format_version": FORMAT_VERSION, "arrays": arrays}
+        head = {"format": FORMAT, "format_version": features.version(scene), "arrays": arrays, **features.dump(scene)}
         _add(archive, JSON_MEMBER, scene_json.dump(scene, head))
         for name in arrays:
             array, dtype = getattr(scene, name), _MEMORY_DTYPES[name]
@@ -272,6 +274,8 @@ def _decode(name: str, array: np.ndarray) -> np.ndarray:
 def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
     data = _read_json(archive, place)
     json_place = f"{place}: {JSON_MEMBER}"
+    if skipped := features.skipped(data):
+        _log.warning("%s: skipped what this release cannot read: %s", json_place, ", ".join(skipped))
     listed = scene_json.words(data, "arrays", json_place)
     arrays = {name: _read_array(archive, name, place, name in listed) for name in _MEMORY_DTYPES}
     count, means = scene_json.get(data, "gaussians", int, json_place), arrays["means"]
@@ -280,7 +284,7 @@ def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
         raise errors.SceneFileError(
             f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
         )
-    fields = scene_json.fields(data, json_place)
+    fields = scene_json.fields(data, json_place) | features.fields(data, json_place)
     if not set(listed) & set(_TRACKS):
         arrays["track_times"] = np.array([fields["t_max"]])
         arrays["track_poses"] = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
@@ -303,11 +307,7 @@ def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:
         raise errors.SceneFileError(f"{where}: expected readable JSON, found damage ({error})") from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise errors.SceneFileError(f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file')
-    version = data.get("format_version")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        newer = isinstance(version, int) and version > FORMAT_VERSION
-        remedy = "update R5DGS" if newer else "bake the scene again"
-        raise errors.SceneFileError(f"{where}: expected format_version {FORMAT_VERSION}, found {version!r}; {remedy}")
+    features.check(data, where)
     return data
 
 

@@ -53,6 +53,7 @@ def check(scene: Scene, place: str) -> None:
         "shading": ((count, 3), np.float32),
         "shading_rest": ((count,), np.float32),
         "light_direction": ((3,), None),
+        "origin": ((3,), np.float64),
     }
     for name, (shape, dtype) in expected.items():
         array = getattr(scene, name)

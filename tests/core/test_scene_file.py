@@ -215,7 +215,9 @@ def setter(*keys_and_value):
     ("change", "message"),
     [
         (setter("format", "other"), "another kind"),
-        (setter("format_version", 2), "expected format_version 1, found 2; update R5DGS"),
+        (setter("format_version", 3), "expected format_version 1 or 2, found 3; update R5DGS"),
+        (setter("format_version", 1.0), "format_version"),
+        (setter("format_version", True), "format_version"),
         (setter("format_version", "1"), "format_version"),
         (setter("gaussians", 7), "means.npy"),
         (setter("arrays", None), "arrays"),

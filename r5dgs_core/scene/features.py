@@ -1,0 +1,109 @@
+"""Features of a scene file that its format version 1 cannot hold.
+
+``scene.json`` of version 2 lists them:
+
+    "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
+
+A reader refuses a file with a required feature that it lacks, and skips an optional one. Names reserved for later
+releases: events, parts, hulls, trajectory, quantised.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from .. import __version__, errors
+from . import scene_json
+from .scene import Scene
+
+VERSIONS = (1, 2)  # of the format, that this release reads
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_RELEASE = re.compile(r"[0-9]{1,4}(\.[0-9]{1,4}){1,3}")
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One entry of ``features``.
+
+    Attributes:
+        name: Lower case, with underscores.
+        required: Whether a reader without the feature would misread the scene.
+        since: First release that reads it.
+    """
+
+    name: str
+    required: bool
+    since: str
+
+
+ORIGIN = Feature("origin", required=True, since="0.2.0")
+_KNOWN_NAMES = {ORIGIN.name}
+
+
+def version(scene: Scene) -> int:
+    """The lowest format version that can hold a scene."""
+    return 2 if scene.origin.any() else 1
+
+
+def dump(scene: Scene) -> dict[str, Any]:
+    """The list of features of a scene and what they store in ``scene.json``; empty for one that version 1 can hold."""
+    if version(scene) == 1:
+        return {}
+    return {"features": [asdict(ORIGIN)], "origin": scene.origin.tolist()}
+
+
+def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
+    """The fields of `Scene` that belong to the features of a checked file. Raises as `check` does."""
+    return {"origin": scene_json.numbers(data, "origin", (3,), place)} if ORIGIN.name in _names(data) else {}
+
+
+def skipped(data: dict[str, Any]) -> list[str]:
+    """Names of the optional features of a checked file that this release does not read."""
+    return [name for name in _names(data) if name not in _KNOWN_NAMES]
+
+
+def check(data: dict[str, Any], place: str) -> None:
+    """Check the format version and the features of a file.
+
+    Args:
+        data: Content of ``scene.json``.
+        place: File and member, for messages.
+
+    Raises:
+        SceneFileError: The version, the list or a required feature is unknown; the message names the release to
+            update to.
+    """
+    found = data.get("format_version")
+    if found not in VERSIONS or not isinstance(found, int) or isinstance(found, bool):
+        newer = isinstance(found, int) and found > VERSIONS[-1]
+        remedy = "update R5DGS" if newer else "bake the scene again"
+        wanted = " or ".join(map(str, VERSIONS))
+        raise errors.SceneFileError(f"{place}: expected format_version {wanted}, found {found!r:.60}; {remedy}")
+    if found == 1:
+        return
+    listed = scene_json.each(data, "features", _read, place)
+    names = [feature.name for feature in listed]
+    if len(set(names)) != len(names):
+        raise errors.SceneFileError(f"{place}: features: expected each name once, found {names!s:.60}")
+    lacking = [feature for feature in listed if feature.required and feature.name not in _KNOWN_NAMES]
+    if lacking:
+        words = ", ".join(f"{feature.name!r} (since R5DGS {feature.since})" for feature in lacking[:5])
+        newest = max((feature.since for feature in lacking), key=lambda since: tuple(map(int, since.split("."))))
+        raise errors.SceneFileError(
+            f"{place}: the scene needs what R5DGS {__version__} lacks: {words}; update R5DGS to {newest} or later"
+        )
+
+
+def _names(data: dict[str, Any]) -> list[str]:
+    return [row["name"] for row in data["features"]] if data["format_version"] > 1 else []
+
+
+def _read(row: dict[str, Any], place: str) -> Feature:
+    name, since = (scene_json.get(row, key, str, place) for key in ("name", "since"))
+    if not _NAME.fullmatch(name):
+        raise errors.SceneFileError(f"{place}: name: expected letters a-z, digits and underscores, found {name!r:.60}")
+    if not _RELEASE.fullmatch(since):
+        raise errors.SceneFileError(f"{place}: since: expected a release such as '0.2.0', found {since!r:.60}")
+    return Feature(name, scene_json.get(row, "required", bool, place), since)
