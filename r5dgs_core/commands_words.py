@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors
+from . import commands, errors, strict_json
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -268,10 +268,7 @@ def _aliases(entry: dict[str, Any], item: SceneObject, place: str, which: str) -
 
 
 def _read_captions(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise errors.ConfigError(f"--captions {path}: expected JSON that can be read: {error}") from error
+    found = strict_json.read(path, errors.ConfigError)
     if not isinstance(found, dict):
         raise errors.ConfigError(f"--captions {path}: expected a JSON object by id or name, found a list or a value")
     return found

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import time
 from pathlib import Path
 from typing import Any
 
-from . import errors
+from . import errors, strict_json
 
 NAME = "tabletop"
 
@@ -94,6 +93,6 @@ def run_demo(
 def _is_demo(run_file: Path) -> bool:
     """Whether a run was trained on the bundled data set, of this or an earlier version."""
     try:
-        return Path(json.loads(run_file.read_text(encoding="utf-8"))["dataset"]).name == NAME
-    except (OSError, ValueError, KeyError, TypeError):
+        return Path(strict_json.read(run_file, errors.CheckpointError)["dataset"]).name == NAME
+    except (errors.CheckpointError, KeyError, TypeError):
         return False

@@ -15,10 +15,12 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Which rooms of the core a room may import, itself and `errors` aside: motion <- scene <- (data, raster, model) <-
+# Which rooms of the core a room may import, itself and `GROUND` aside: motion <- scene <- (data, raster, model) <-
 # train; report stands on baked scenes, so it needs no trainer; the command line may use everything.
+GROUND = {"errors", "strict_json"}  # may be imported by all
 ALLOWED = {
     "errors": set(),
+    "strict_json": set(),
     "motion": set(),
     "scene": {"motion"},
     "data": {"motion", "scene"},
@@ -52,7 +54,7 @@ ALLOWED = {
         "scene",
     },
 }
-LIGHT = {"errors", "motion", "scene"}
+LIGHT = GROUND | {"motion", "scene"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
@@ -113,7 +115,7 @@ def core_problems(source: str, package: str, own: str) -> list[str]:
             problems.append(f"line {item.line}: the core imports {item.target}")
         if top == "r5dgs_core" and not item.relative:
             problems.append(f"line {item.line}: {item.target} is not relative, so it breaks inside the extension")
-        if other and other not in ALLOWED[own] | {own, "errors"}:
+        if other and other not in ALLOWED[own] | {own} | GROUND:
             problems.append(f"line {item.line}: {own} imports {item.target}")
         if own in LIGHT and not item.relative and top not in sys.stdlib_module_names | {"numpy"}:
             problems.append(f"line {item.line}: the light tier imports {item.target}")
@@ -242,7 +244,7 @@ sys.meta_path.insert(0, Blocker(blocked))
 
 IMPORT_LIGHT_TIER = """
 sys.path.insert(0, root)
-import r5dgs_core.errors
+import r5dgs_core.errors, r5dgs_core.strict_json
 seen = []
 for name in ("motion", "scene"):
     package = importlib.import_module(f"r5dgs_core.{name}")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .. import strict_json
 from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError
 from ..scene import files, playback
@@ -164,12 +165,9 @@ def read_record(case: Case) -> dict[str, Any]:
         CheckpointError: The file is damaged.
     """
     path = case.beside(".json")
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return {"sittings": []}
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}; remove it to measure this run again") from error
+    record = strict_json.read(path, CheckpointError, "remove it to measure this run again")
     if not isinstance(record, dict) or not isinstance(record.get("sittings"), list):
         raise CheckpointError(f"{path}: expected an object with 'sittings'; remove it to measure this run again")
     return record

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import errors
-from . import masks, transforms
+from .. import errors, strict_json
+from . import masks
 
 OBJECTS = "objects.json"
 
@@ -43,7 +43,7 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
     aliases: dict[int, tuple[str, ...]] = {}
     if not path.exists():
         return names, aliases
-    content = transforms.read_json(path)
+    content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
         raise errors.DatasetError(f'{path}: expected an object such as {{"1": "mug"}}, found {type(content).__name__}')
     for key, value in content.items():
@@ -76,7 +76,7 @@ def read_ground_truth(root: Path) -> GroundTruth | None:
     path = root / "ground_truth.json"
     if not path.exists():
         return None
-    content = transforms.read_json(path)
+    content = strict_json.read(path, errors.DatasetError)
     try:
         times = np.array(content["times"], np.float64)
         ids = tuple(int(item["id"]) for item in content["objects"])

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors
+from .. import errors, strict_json
 from ..scene import cameras
 from . import colmap_model, images, transforms
 from .colmap_model import Registered
@@ -109,7 +109,7 @@ def read(root: Path) -> Found:
 
 def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Time of each image, and the other keys of ``times.json``."""
-    content = transforms.read_json(path)
+    content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
         raise errors.DatasetError(f"{path}: expected image names and times, found {type(content).__name__}")
     more = {}

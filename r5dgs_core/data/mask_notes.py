@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import errors
+from .. import errors, strict_json
 from ..scene import files
-from . import masks, transforms
+from . import masks
 
 FILE = "masks.json"
 FORMAT_VERSION = 1
@@ -74,7 +74,7 @@ def read(folder: Path) -> MaskNotes:
     path = Path(folder) / FILE
     if not path.exists():
         return MaskNotes()
-    content = transforms.read_json(path)
+    content = strict_json.read(path, errors.DatasetError)
     version = content.get("format_version") if isinstance(content, dict) else None
     if version != FORMAT_VERSION:
         raise errors.DatasetError(f"{path}: expected 'format_version' {FORMAT_VERSION}, found {version!r}")

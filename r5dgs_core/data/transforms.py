@@ -7,7 +7,6 @@ axes (y up, looking along -z). Where no time is given a frame has index / (n - 1
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors
+from .. import errors, strict_json
 
 RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -44,27 +43,13 @@ class Entry:
     frame: float | None
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file; the error names the line."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise errors.DatasetError(f"{path}: the file is missing") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise errors.DatasetError(f"{path}: cannot be read ({error})") from error
-    except json.JSONDecodeError as error:
-        raise errors.DatasetError(
-            f"{path}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}; is it truncated?"
-        ) from error
-
-
 def read(path: Path) -> tuple[list[Entry], dict[str, Any]]:
     """Read one camera file.
 
     Returns:
         The frames in the file's order, and the file's top-level keys other than the frames.
     """
-    content = read_json(path)
+    content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
         raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}")
     if isinstance(content.get("frames"), list):

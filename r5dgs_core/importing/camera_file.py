@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import strict_json
 from ..errors import CheckpointError
 from ..scene.cameras import Camera
 
@@ -25,10 +25,7 @@ def read(path: Path) -> tuple[Camera, ...]:
     """
     if not path.exists():
         return ()
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: cannot be read ({error})") from error
+    entries = strict_json.read(path, CheckpointError, "move the file away to import without cameras")
     if not isinstance(entries, list):
         raise CheckpointError(f"{path}: expected a list of cameras, found {type(entries).__name__}")
     found: dict[tuple, Camera] = {}

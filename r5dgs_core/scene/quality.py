@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .. import errors, strict_json
 from .scene import Scene
 
 MODE = "rigid"  # how Blender plays, see `playback.MODES`
@@ -71,10 +71,10 @@ def _evaluation(scene: Scene, path: Path | None) -> dict[str, Any]:
         try:
             if place.stat().st_mtime < path.stat().st_mtime:
                 continue
-            found = json.loads(place.read_text(encoding="utf-8"))
+            found = strict_json.read(place, errors.SceneFileError)
             if found["scene"] == scene.name and found["train"]["gaussians"] == len(scene.means):
                 return found["splits"]
-        except (OSError, ValueError, KeyError, TypeError):  # not there, or no evaluation
+        except (OSError, errors.SceneFileError, KeyError, TypeError):  # not there, or no evaluation
             continue
     return {}
 

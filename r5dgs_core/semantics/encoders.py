@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import json
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .. import errors
+from .. import errors, strict_json
 from ..scene.meanings import EncoderCard
 
 TEXT = "text"  # names the optional package instead of a folder
@@ -128,10 +127,7 @@ def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
         raise errors.BackendError(
             f"{path}: expected in the folder of {of}, found {_what(path)}; download or copy the model again"
         )
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise errors.BackendError(f"{path}: expected JSON, found damage ({error}); copy the model again") from error
+    found = strict_json.read(path, errors.BackendError, "copy the model again")
     if not isinstance(found, dict):
         raise errors.BackendError(f"{path}: expected a JSON object, found {type(found).__name__}; copy the model again")
     return found

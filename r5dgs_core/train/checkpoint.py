@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import __version__
+from .. import __version__, strict_json
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model.gaussians import PARAMETERS
@@ -176,16 +176,14 @@ def open_run(folder: Path) -> Run:
         CheckpointError: There is none, or it is damaged or of another version.
     """
     path = Path(folder) / RUN_FILE
+    if not path.is_file():
+        raise CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'")
+    text = strict_json.read(path, CheckpointError, "train again with --overwrite")
     try:
-        text = json.loads(path.read_text(encoding="utf-8"))
         found, made_by = text["format_version"], text["versions"]
         place, digest, settings = Path(text["dataset"]), text["digest"], text["config"]
         ran_on = dict(text.get("platform", {}))
-    except (FileNotFoundError, NotADirectoryError):
-        raise CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'") from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{path}: damaged ({type(error).__name__}: {error}); train again with --overwrite"
         ) from None
