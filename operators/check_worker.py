@@ -1,17 +1,18 @@
-"""Test Worker: start the worker's Python, say what it has and how fast it is."""
+"""Test Worker: start the worker's Python, and report its versions, device and speed."""
 
 import time
 
 import bpy
 
-from ..r5dgs_addon import preferences, waiting, worker
+from ..r5dgs_addon import preferences, waiting, worker, worker_check
+from ..r5dgs_core import errors
 
 KEY = "check"
 
 
 class R5DGS_OT_check_worker(waiting.Waiting, bpy.types.Operator):
-    """Start the worker anew, with the Python chosen above or found, and say its versions, device and speed (the \
-first time it compiles, 10 s)"""
+    """Start the worker anew, with the Python chosen in the preferences or found, and say its versions, device and \
+speed (the first time it compiles, 10 s)"""
 
     bl_idname = "r5dgs.check_worker"
     bl_label = "Test Worker"
@@ -28,20 +29,40 @@ first time it compiles, 10 s)"""
         self._began = time.monotonic()
         worker.stop()
         preferences.forget()
-        return worker.submit(KEY, [("testing", "check", {})])
+        job = worker.submit(KEY, [("testing", "check", {})])
+        worker_check.begin(job)
+        return job
 
-    def _finish(self, context, answer):
+    def modal(self, context, event):
+        if event.type == "TIMER":
+            worker_check.redraw()
+        return waiting.Waiting.modal(self, context, event)
+
+    def cancel(self, context):
+        waiting.Waiting.cancel(self, context)
+        worker_check.end("Stopped", "CANCEL")
+
+    def _answered(self, context):
+        try:
+            text = self._summary(self._job.answer())
+        except errors.R5dgsError as error:
+            worker_check.end(str(error), "ERROR")
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        worker_check.end(text, "CHECKMARK")
+        self.report({"INFO"}, text)
+        return {"FINISHED"}
+
+    def _summary(self, answer: worker.Answer) -> str:
         found, _ = answer
         versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
         seconds = time.monotonic() - self._began
         compiled = f", rasterizer compiled in {seconds:.0f} s, once" if found["compiled"] else ""
         width, height = found["size"]
-        self.report(
-            {"INFO"},
+        return (
             f"Worker ready: {self._job.python} ({versions}), {found['device']}{compiled}; "
-            f"{found['gaussians']:,} Gaussians at {width} x {height} in {found['milliseconds']:.0f} ms",
+            f"{found['gaussians']:,} Gaussians at {width} x {height} in {found['milliseconds']:.0f} ms"
         )
-        return {"FINISHED"}
 
 
 CLASSES = (R5DGS_OT_check_worker,)

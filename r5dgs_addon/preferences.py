@@ -15,7 +15,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import __package__ as base_package
-from . import pythons
+from . import pythons, worker_check
 
 ENVIRONMENT = "R5DGS_PYTHON"
 ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
@@ -43,7 +43,8 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
     )
     worker_timeout: IntProperty(
         name="Timeout",
-        description="Seconds to wait for the worker; the first picture compiles the rasterizer, which takes a while",
+        description="Seconds to wait for the worker's start and for each answer; the first picture compiles the "
+        "rasterizer, which takes a while",
         default=120,
         min=1,
         max=3600,
@@ -73,7 +74,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         if os.environ.get(ENCODER_ENVIRONMENT):
             wins = f"{ENCODER_ENVIRONMENT} is set and wins: {os.environ[ENCODER_ENVIRONMENT]}"
             layout.label(text=wins, icon="INFO")
-        layout.operator("r5dgs.check_worker", icon="PLAY")
+        worker_check.draw(layout, context)
 
 
 def get() -> "R5DGS_AP_preferences | None":

@@ -5,9 +5,12 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from .process_group import ProcessGroup
 
 NEEDED = ("numpy", "torch", "numba")
 OLDEST = (3, 11)
@@ -74,32 +77,30 @@ def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], boo
 
 def lacking(python: str, stopped: Callable[[], bool] = lambda: False) -> str | None:
     """Why a Python cannot run the worker, in a few words; None where it can."""
-    try:
-        process = subprocess.Popen(
-            [python, "-c", CHECK],
-            env=environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
-    except OSError as error:
-        return error.strerror or str(error)
-    end = time.monotonic() + TIMEOUT_S
-    with process:
-        while True:
-            try:
-                _, stderr = process.communicate(timeout=LOOK_S)
-                break
-            except subprocess.TimeoutExpired:
-                late = time.monotonic() > end
-                if late or stopped():
-                    process.kill()
-                    return f"no answer within {TIMEOUT_S:g} s" if late else "the search was stopped"
-    if process.returncode == 0:
-        return None
-    said = stderr.decode(errors="replace").strip().splitlines()
-    return said[-1] if said else f"exit code {process.returncode}"
+    with tempfile.TemporaryFile() as said:  # the children of a wrapper script would hold a pipe open
+        try:
+            group = ProcessGroup(
+                [python, "-c", CHECK],
+                env=environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+            )
+        except OSError as error:
+            return error.strerror or str(error)
+        deadline = time.monotonic() + TIMEOUT_S
+        while group.alive:
+            late = time.monotonic() > deadline
+            if late or stopped():
+                group.end()
+                return f"no answer within {TIMEOUT_S:g} s" if late else "the search was stopped"
+            time.sleep(LOOK_S)
+        group.end()
+        if group.process.returncode == 0:
+            return None
+        said.seek(0)
+        lines = said.read().decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"exit code {group.process.returncode}"
 
 
 def _places(beside: list[Path], home: Path) -> Iterator[Path | None]:

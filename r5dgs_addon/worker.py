@@ -110,7 +110,7 @@ class Job:
                     )
                 self._step = "starting the worker"
                 running = _running(self.python)
-                running.greet()
+                running.greet(choice.timeout_s)
                 for self._step, command, arguments in steps:
                     self._answer = running.request(command, choice.timeout_s, **arguments)
             except BaseException as error:  # raised again where the answer is asked for
@@ -171,10 +171,11 @@ def current(python: str | None = None) -> Worker:
     Raises:
         BackendError: It cannot be started.
     """
+    choice = preferences.choice()
     python = python or preferences.worker_python()
     with _turn:
         running = _running(python)
-        running.greet()
+        running.greet(choice.timeout_s)
         return running
 
 

@@ -3,6 +3,9 @@
 The protocol is that of `r5dgs_core.serve`: a JSON line each way, and after an answer's line the raw bytes that it
 announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that dies,
 hangs or talks nonsense is dropped with a clear error.
+
+The Python may be a wrapper script whose child does the work and keeps the pipes open. So the whole process group is
+ended, and a pipe is closed only by the thread that uses it: closing it elsewhere would wait for that thread's lock.
 """
 
 import collections
@@ -16,17 +19,18 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from ..r5dgs_core import errors
 from . import preferences, pythons
+from .process_group import ProcessGroup
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = preferences.ENVIRONMENT
-START_TIMEOUT_S = 120.0
 STDERR_LINES = 12
+LAST_WORDS_S = 0.5  # after a worker's death, for what its pipes still hold
 REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
 COMPILING = "preparing the rasterizer (first use, about 10 s)"
 
@@ -56,19 +60,20 @@ class Worker:
         environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
         environment["PYTHONUNBUFFERED"] = "1"
         try:
-            self._process = subprocess.Popen(
+            self._group = ProcessGroup(
                 [python, "-m", "r5dgs_core.serve"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 env=environment,
                 cwd=str(ROOT),
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:
             raise errors.BackendError(
                 f"worker: '{python}' cannot be started ({error.strerror or error}); {REMEDY}"
             ) from error
+        self._process = self._group.process
+        self._writing = threading.Lock()
         self._readers = [
             threading.Thread(target=self._read_answers, name="r5dgs worker answers", daemon=True),
             threading.Thread(target=self._read_stderr, name="r5dgs worker log", daemon=True),
@@ -76,16 +81,19 @@ class Worker:
         for reader in self._readers:
             reader.start()
 
-    def greet(self) -> None:
+    def greet(self, timeout_s: float) -> None:
         """Wait until it answers, once.
 
+        Args:
+            timeout_s: Seconds to wait; the worker is stopped when they have passed.
+
         Raises:
-            BackendError: It does not, or its Python lacks what rendering needs.
+            BackendError: It does not answer, or its Python lacks what rendering needs.
         """
         if self.hello:
             return
         try:
-            self.hello, _ = self.request("hello", timeout_s=START_TIMEOUT_S)
+            self.hello, _ = self.request("hello", timeout_s)
             if self.hello.get("missing"):
                 raise errors.BackendError(
                     f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
@@ -97,8 +105,8 @@ class Worker:
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.poll() is None
+        """True while the process runs."""
+        return self._group.alive
 
     @property
     def pid(self) -> int:
@@ -124,7 +132,7 @@ class Worker:
         line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
         try:
             assert self._process.stdin is not None
-            with _broken_pipes_are_errors():
+            with self._writing, _broken_pipes_are_errors():
                 self._process.stdin.write(line.encode())
                 self._process.stdin.flush()
         except (OSError, ValueError):
@@ -148,26 +156,28 @@ class Worker:
         return header.get("result", {}), arrays
 
     def close(self) -> None:
-        """Stop the process and wait until it is gone."""
-        process = self._process
-        if process.poll() is None:
-            process.terminate()  # before its input is closed: closing waits for a request that is being written
+        """End the process and all that it started; whoever waits for an answer gets the error of a worker that died.
+
+        It returns within two seconds, even if a process has left the group and keeps the pipes open: that one sees the
+        end of its input.
+        """
+        self._group.end()
+        if self._writing.acquire(blocking=False):  # else the thread that writes gets an error, and closes in turn
             try:
-                process.wait(timeout=2.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        for reader in self._readers:
-            reader.join(timeout=2.0)
-        for pipe in (process.stdin, process.stdout, process.stderr):
-            if pipe is not None:
                 with contextlib.suppress(OSError), _broken_pipes_are_errors():
-                    pipe.close()
+                    assert self._process.stdin is not None
+                    self._process.stdin.close()
+            finally:
+                self._writing.release()
+        self._answers.put(None)
 
     def _death(self) -> errors.BackendError:
         self.close()
-        code = self._process.returncode
-        killed = -code in (signal.SIGTERM, getattr(signal, "SIGKILL", None))  # its last words are of something else
+        for reader in self._readers:
+            reader.join(timeout=LAST_WORDS_S)
+        code = self._process.returncode or 0
+        # A shell script returns 128 and the signal that ended its child. The last words are of something else then.
+        killed = not {-code, code - 128}.isdisjoint((signal.SIGTERM, getattr(signal, "SIGKILL", None)))
         said = "" if killed else " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
         why = "stopped from outside; perhaps memory ran out" if killed else f"exit code {code}"
         return errors.BackendError(
@@ -180,24 +190,28 @@ class Worker:
         stream = self._process.stdout
         assert stream is not None
         try:
-            while line := stream.readline():
-                header = json.loads(line)
-                if "event" in header:
-                    self._hear(header)
-                    continue
-                arrays = {}
-                for entry in header.get("arrays", ()):
-                    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-                    size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-                    blob = stream.read(size)
-                    if len(blob) != size:
-                        return
-                    arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
-                self._answers.put((header, arrays))
+            self._read_from(stream)
         except (OSError, ValueError, KeyError, TypeError) as error:
             self._stderr.append(f"unreadable answer: {error}")
         finally:
             self._answers.put(None)
+            stream.close()
+
+    def _read_from(self, stream: IO[bytes]) -> None:
+        while line := stream.readline():
+            header = json.loads(line)
+            if "event" in header:
+                self._hear(header)
+                continue
+            arrays = {}
+            for entry in header.get("arrays", ()):
+                dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+                size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+                blob = stream.read(size)
+                if len(blob) != size:
+                    return
+                arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
+            self._answers.put((header, arrays))
 
     def _hear(self, event: dict[str, Any]) -> None:
         notice = COMPILING if event["event"] == "compiling" else ""
@@ -210,7 +224,7 @@ class Worker:
     def _read_stderr(self) -> None:
         stream = self._process.stderr
         assert stream is not None
-        with contextlib.suppress(OSError, ValueError):
+        with stream, contextlib.suppress(OSError, ValueError):
             for line in stream:
                 self._stderr.append(line.decode(errors="replace").rstrip())
 

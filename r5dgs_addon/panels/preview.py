@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import engine, figures, live_preview, worker
+from .. import engine, figures, live_preview, worker, worker_check
 from . import sidebar
 
 
@@ -30,6 +30,7 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
             layout.label(text="The scene has no camera", icon="INFO")
         if context.scene.render.engine != engine.ENGINE:
             layout.operator("r5dgs.use_engine", icon="SCENE")
+        worker_check.draw(layout, context)
 
 
 CLASSES = (R5DGS_PT_preview,)

@@ -15,7 +15,7 @@ import pytest
 from r5dgs_core import errors
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback, quality, scene_file
-from tests import scenes
+from tests import layouts, scenes
 from tests.addon import patience
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -242,8 +242,8 @@ class Window:
         self.status_text_set, self.event_timer_remove = self.said.append, self.removed.append
         self.reports = []
         members = {"_job": job, "_timer": "timer", "report": lambda _, kind, text: self.reports.append((kind, text))}
-        names = ("modal", "cancel", "_leave", "_answered", "_finish", "waits_for")
-        methods = {name: inspect.getattr_static(operator, name) for name in names}
+        names = ("modal", "cancel", "_leave", "_answered", "_finish", "_summary", "waits_for")
+        methods = {name: inspect.getattr_static(operator, name) for name in names if hasattr(operator, name)}
         self.operator = type("Operator", (), {**methods, **members})()
 
     def send(self, kind):
@@ -377,10 +377,49 @@ def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blende
     told = capfd.readouterr().out
     versions = r"\(Python 3\.\S+, R5DGS \S+, torch \S+, numba \S+\)"
     assert re.search(rf"Worker ready: .* {versions}, CPU, .*20,000 Gaussians at 400 x 400 in \d+ ms$", told, re.M), told
+    assert "Worker ready" in " ".join(drawn_check(blender))
     running = worker.current()
     worker.unregister()
     assert not running.alive
     worker.register()
+
+
+def drawn_check(bpy):
+    """Texts that *Test Worker* draws under its button."""
+    said = []
+    module = importlib.import_module("r5dgs.r5dgs_addon.worker_check")
+    module.draw(layouts.Layout(bpy, said), bpy.context)
+    return said
+
+
+def test_progress_and_result_of_the_worker_test_are_drawn_under_its_button(blender, loaded, worker):
+    running = worker.current()
+    os.kill(running.pid, signal.SIGSTOP)
+    module = importlib.import_module("r5dgs.operators.check_worker")
+    check = importlib.import_module("r5dgs.r5dgs_addon.worker_check")
+    job = worker.start([("testing", "check", {})])
+    check.begin(job)
+    patience.wait_until(lambda: job.doing == "testing")
+    assert "Testing: testing, 0 s; Esc stops" in drawn_check(blender)
+    window = Window(module.R5DGS_OT_check_worker, job)
+    assert window.send("ESC") == {"CANCELLED"} and "Stopped" in drawn_check(blender)
+    check.begin(job)
+    assert window.operator._answered(window) == {"CANCELLED"}
+    assert "ended unexpectedly" in " ".join(drawn_check(blender))
+    for kind in ("R5DGS_PT_preview", "R5DGS_AP_preferences"):
+        assert "r5dgs.check_worker" in drawn_class(blender, kind)
+
+
+def drawn_class(bpy, name):
+    """Texts of a panel, or of the preferences."""
+    if name == "R5DGS_PT_preview":
+        return layouts.draw(bpy, getattr(bpy.types, name))
+    said = []
+    preferences = importlib.import_module("r5dgs.r5dgs_addon.preferences")
+    fake = types.SimpleNamespace(layout=layouts.Layout(bpy, said), worker_python="", found_python="")
+    fake.bl_rna = preferences.R5DGS_AP_preferences.bl_rna
+    preferences.R5DGS_AP_preferences.draw(fake, bpy.context)
+    return said
 
 
 COMPILES = """

@@ -1,9 +1,11 @@
 """Who asks the worker, in which turn, and which Python it runs."""
 
 import importlib
+import json
 import os
 import signal
 import stat
+import subprocess
 import sys
 import threading
 import types
@@ -65,7 +67,7 @@ def test_writing_to_a_worker_that_has_ended_is_an_error_and_no_signal_for_blende
         running = process.Worker("true")
         patience.wait_until(lambda: not running.alive)
         with pytest.raises(errors.BackendError, match=r"ended unexpectedly.*'Worker Python'"):
-            running.greet()
+            running.greet(20.0)
         assert not heard and signal.SIGPIPE not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
     finally:
         signal.signal(signal.SIGPIPE, before)
@@ -280,3 +282,104 @@ def test_what_a_search_beside_the_window_finds_runs_the_worker_and_is_kept(
     again = worker.submit("view", HELLO)  # which would wait for ever at the gate, searched it anew
     assert again.answer()[0]["pid"] and again.python == str(found)
     worker.stop()
+
+
+WRAPPERS = {
+    "a child of a shell script": '{python} "$@"\nstatus=$?\nexit $status\n',
+    "one that ignores SIGTERM": 'trap "" TERM\n{python} "$@"\nstatus=$?\nexit $status\n',
+}
+
+
+@pytest.fixture(params=WRAPPERS)
+def wrapper(request, tmp_path):
+    """A Worker Python that runs the real one as a child, as ``conda run`` does."""
+    path = tmp_path / "wrapper"
+    path.write_text("#!/bin/sh\n" + WRAPPERS[request.param].format(python=PYTHON))
+    path.chmod(0o755)
+    return str(path)
+
+
+def runs(pid):
+    """True while a process exists and is no zombie."""
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to look at processes of others")
+def test_giving_up_ends_a_wrapper_script_and_the_python_that_it_runs(worker, wrapper, monkeypatch):
+    monkeypatch.setenv("R5DGS_PYTHON", wrapper)
+    running = worker.current()
+    child = running.hello["pid"]
+    assert child != running.pid and runs(child)
+    os.kill(child, signal.SIGSTOP)  # it neither answers nor ends by itself
+    job = worker.start(HELLO)
+    patience.wait_until(lambda: job.doing == "greeting")
+    job.cancel()
+    assert job.done and not running.alive and not runs(running.pid)
+    patience.wait_until(lambda: not runs(child))
+    with pytest.raises(errors.BackendError, match="ended unexpectedly"):
+        job.answer()
+    assert worker.request("hello")[0]["pid"] != child
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to look at processes of others")
+def test_a_process_that_left_the_group_and_keeps_the_pipes_is_not_waited_for(worker, monkeypatch, tmp_path):
+    path, told = tmp_path / "daemon", tmp_path / "pid"
+    lines = ("import os, time", "if os.fork():", "    time.sleep(600)", "os.setsid()")
+    lines = (
+        *lines,
+        f"open({str(told)!r} + '.new', 'w').write(str(os.getpid()))",
+        f"os.rename({str(told)!r} + '.new', ",
+    )
+    path.write_text(f"#!{PYTHON}\n" + "\n".join(lines) + f"{str(told)!r})\ntime.sleep(600)\n")
+    path.chmod(0o755)
+    monkeypatch.setenv("R5DGS_PYTHON", str(path))
+    job = worker.start(HELLO)
+    patience.wait_until(told.exists)
+    stray = int(told.read_text())
+    try:
+        job.cancel()  # would wait for the pipes' other end, if any pipe were closed here
+        assert job.done and runs(stray)
+        worker.stop()
+    finally:
+        os.kill(stray, signal.SIGKILL)
+
+
+def test_the_timeout_of_the_preferences_limits_the_start(worker, preferences, monkeypatch, tmp_path):
+    path = tmp_path / "silent"
+    path.write_text("#!/bin/sh\nexec sleep 600\n")
+    path.chmod(0o755)
+    monkeypatch.setenv("R5DGS_PYTHON", str(path))
+    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=0.3)
+    monkeypatch.setattr(preferences, "get", lambda: kept)
+    with pytest.raises(errors.BackendError, match=r"no answer to 'hello' within 0\.3 s.*'Timeout'"):
+        worker.request("hello")
+    assert worker._worker is None or not worker._worker.alive
+
+
+PARENT = """
+import importlib.util, os, subprocess, sys, time
+spec = importlib.util.spec_from_file_location("process_group", sys.argv[1])
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+pipe = subprocess.PIPE
+group = module.ProcessGroup([sys.argv[2], "-m", "r5dgs_core.serve"], stdin=pipe, stdout=pipe, cwd=sys.argv[3])
+group.process.stdin.write(b'{"id": 1, "command": "hello"}\\n')
+group.process.stdin.flush()
+print(group.process.stdout.readline().decode(), flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc to look at processes of others")
+def test_the_worker_ends_when_blender_is_killed(wrapper, blender):
+    module = importlib.import_module("r5dgs.r5dgs_addon.process_group")
+    root = Path(module.__file__).parent.parent
+    arguments = [PYTHON, "-c", PARENT, module.__file__, wrapper, str(root)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as parent:
+        child = json.loads(parent.stdout.readline())["result"]["pid"]
+        assert runs(child)
+        parent.kill()
+    patience.wait_until(lambda: not runs(child))

@@ -1,0 +1,51 @@
+"""Progress and result of *Test Worker*, drawn under its buttons in the preferences and the sidebar."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING
+
+import bpy
+
+from . import windows
+
+if TYPE_CHECKING:  # the worker needs the preferences, and those need this module
+    from . import worker
+
+_LETTER, _WIDTH = 8, 400  # pixels of a letter, and of a region if there is none
+
+_job: worker.Job | None = None
+_result: tuple[str, str] = ("", "NONE")  # text and icon
+
+
+def begin(job: worker.Job) -> None:
+    """Show the progress of a test."""
+    global _job, _result
+    _job, _result = job, ("", "NONE")
+    redraw()
+
+
+def end(text: str, icon: str) -> None:
+    """Show the result of a test."""
+    global _job, _result
+    _job, _result = None, (text, icon)
+    redraw()
+
+
+def redraw() -> None:
+    """Draw the areas that show it anew."""
+    windows.redraw("PREFERENCES", "VIEW_3D")
+
+
+def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the button, and the progress or result in lines that fit the region."""
+    layout.operator("r5dgs.check_worker", icon="PLAY")
+    text, icon = _result
+    if _job is not None and not _job.done:
+        text, icon = f"Testing: {_job.doing}, {_job.seconds:.0f} s; Esc stops", "SORTTIME"
+    width = context.region.width if context.region is not None else _WIDTH
+    scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
+    letters = max(int(width / (_LETTER * scale)), 20)
+    column = layout.column(align=True)
+    for number, line in enumerate(textwrap.wrap(text, letters)):
+        column.label(text=line, icon="BLANK1" if number else icon)
