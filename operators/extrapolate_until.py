@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, FloatProperty
 
-from ..r5dgs_addon import actions, amounts, motion_extrapolate, objects
+from ..r5dgs_addon import actions, amounts, motion_extrapolate, motion_physics, objects
 from ..r5dgs_core import errors
 
 
@@ -36,6 +36,9 @@ class R5DGS_OT_extrapolate_until(actions.NeedsScene, bpy.types.Operator):
         if kept:
             names = ", ".join(anchor.name for anchor in kept)
             self.report({"WARNING"}, f"Their later keys were edited by hand and stay: {names}; Re-Extrapolate them")
+        too_fast = motion_physics.too_fast(written)
+        if too_fast:
+            self.report({"WARNING"}, too_fast)
         self.report({"INFO"}, f"{amounts.of(len(written), 'object', 'move')} until {collection.r5dgs.t_end:g}")
         return {"FINISHED"}
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import motion_extrapolate, motion_objects
+from ..r5dgs_addon import motion_extrapolate, motion_objects, motion_physics
 from ..r5dgs_core import errors
 
 
@@ -23,6 +23,9 @@ class R5DGS_OT_re_extrapolate(bpy.types.Operator):
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        too_fast = motion_physics.too_fast(written)
+        if too_fast:
+            self.report({"WARNING"}, too_fast)
         self.report({"INFO"}, f"Extrapolated {', '.join(anchor.name for anchor in written)}")
         return {"FINISHED"}
 

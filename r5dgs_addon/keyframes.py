@@ -3,7 +3,7 @@
 In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and
 the knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys
 are taken from the motion model under the same tolerance; they are of another key type, and at t_max there may be a
-kink.
+kink. A motion too fast for that gets a key at every frame, and its anchor is marked.
 """
 
 import math
@@ -20,7 +20,9 @@ from . import compat, timeline
 
 # Of the scene's size. Blender may differ from playback by 1e-5: its float32 evaluation takes a share too.
 TOLERANCE = 3e-6
+_PER_KNOT = 4  # intervals between possible keys: where even more are needed, the knots themselves are fewer
 NEAREST = 0.011  # frames between keys of a curve: Blender takes those that are nearer than 0.01 for one
+_INTERVALS = 1 << 19  # between possible keys of all objects together, so that no file blocks Blender for minutes
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 
 
@@ -44,7 +46,8 @@ def animate(
     """
     if motion_id == 0:
         return
-    motion = curves(scene, motion_id, times.t_end, tolerance, reach)
+    motion = curves(scene, motion_id, times, tolerance, reach)
+    anchor.r5dgs_motion.too_fast = not motion.followed
     location, rotation = motion.location, motion.rotation
     moves, turns = varies(location.values), varies(rotation.values)
     if not (moves or turns):
@@ -58,13 +61,13 @@ def animate(
         write(fcurves, "rotation_quaternion", rotation, times)
 
 
-def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: float) -> Curves:
-    """Keys of a motion group from the first knot to ``t_end``, over scene time.
+def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float, reach: float) -> Curves:
+    """Keys of a motion group from the first knot to the end, over scene time.
 
     Args:
         scene: The scene.
         motion_id: The motion group.
-        t_end: Last time; nothing is extrapolated where it is not past t_max.
+        times: Scene times and their frames; nothing is extrapolated if the end is not past t_max.
         tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
         reach: Of the group, from `reaches`.
 
@@ -73,11 +76,34 @@ def curves(scene: Scene, motion_id: int, t_end: float, tolerance: float, reach: 
     """
     allowed = tolerance * scene.extent
     observed = _observed(scene, motion_id, allowed, reach)
-    nearest = NEAREST / scene.frames_per_unit
-    if t_end <= scene.t_max:
+    if times.t_end <= scene.t_max:
         return observed
-    future = reduction.reduce(_future(scene, motion_id), scene.t_max, t_end, allowed, reach, nearest=nearest)
-    return reduction.join(observed, future)
+    most = share(len(scene.groups))
+    sample = _future(scene, motion_id, most)
+    return reduction.join(observed, few(sample, scene.t_max, times, allowed, reach, most))
+
+
+def share(objects: int) -> int:
+    """Largest number of intervals between the keys of one of so many objects, for `few`."""
+    return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+
+
+def few(
+    sample: reduction.Sampler, start: float, times: timeline.Times, allowed: float, reach: float, most: int
+) -> Curves:
+    """Keys from a scene time to the end.
+
+    Args:
+        sample: Poses and slopes at scene times.
+        start: First time.
+        times: Scene times and their frames.
+        allowed: Error of reduced keys at the members, world units.
+        reach: Largest distance of a member from the pivot, world units.
+        most: Largest number of intervals between keys, from `share`.
+    """
+    frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
+    nearest = NEAREST / times.frames_per_unit
+    return reduction.reduce(sample, start, times.t_end, allowed, reach, nearest=nearest, frames=frames, most=most)
 
 
 def reaches(scene: Scene) -> np.ndarray:
@@ -96,8 +122,9 @@ def reaches(scene: Scene) -> np.ndarray:
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
     """One key per knot, which is playback itself, or fewer keys where they hold the tolerance."""
     times = np.asarray(scene.track_times, np.float64)
-    quats, displacements = (values[motion_id] for values in playback.knots(scene))
-    quat_slopes, displacement_slopes = (values[motion_id] for values in playback.knot_slopes(scene))
+    own = slice(motion_id, motion_id + 1)
+    quats, displacements = (values[0] for values in playback.knots(scene, own))
+    quat_slopes, displacement_slopes = (values[0] for values in playback.knot_slopes(scene, own))
     exact = Curves(
         Keys(times, displacements, displacement_slopes, displacement_slopes),
         Keys(times, quats, quat_slopes, quat_slopes),
@@ -112,11 +139,14 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
         unit = raw / norm
         return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
 
-    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius)
+    most = min(max(_PER_KNOT * len(times), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius, most=most)
+    if not fewer.followed:
+        return exact
     return Curves(
         *(
-            few if len(few.times) < len(times) else all_knots
-            for few, all_knots in ((fewer.location, exact.location), (fewer.rotation, exact.rotation))
+            some if len(some.times) < len(times) else all_knots
+            for some, all_knots in ((fewer.location, exact.location), (fewer.rotation, exact.rotation))
         )
     )
 
@@ -143,12 +173,12 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
     return False
 
 
-def _future(scene: Scene, motion_id: int) -> reduction.Sampler:
+def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
     """Motion past t_max: the group's own model, or what it follows as `playback.group_poses` does."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
-        return reduction.model_sampler(group.model, scene.t_max)
-    leader = reduction.model_sampler(scene.groups[group.follows].model, scene.t_max)
+        return reduction.model_sampler(group.model, scene.t_max, most)
+    leader = reduction.model_sampler(scene.groups[group.follows].model, scene.t_max, most)
     follow = np.asarray(group.follow_matrix, np.float64)
 
     def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

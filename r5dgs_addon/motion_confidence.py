@@ -7,9 +7,11 @@ unsure against the object's own size. It says what the learned motion leaves ope
 import bpy
 import numpy as np
 
+from ..r5dgs_core import errors
 from ..r5dgs_core.motion import confidence, models
 from . import compat, motion_curves, motion_physics, timeline
 
+_MOST_STEPS = 1 << 16  # of integration to the end of a path: its uncertainty takes hundreds of such integrations
 STEPS = 32  # rings past t_max
 SIDES = 12
 THINNEST = 0.004  # of the object's reach: what is certain is still to be seen
@@ -89,6 +91,8 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
     start, _ = motion_curves.pose_at(anchor, motion_curves.place(anchor), times.frame(times.t_max))
     follow = motion_physics.follow_matrix(anchor.r5dgs_motion)
     model = motion_physics.model(motion_physics.mover(anchor))
+    if models.steps_needed(model, tau[-1:])[0] > _MOST_STEPS:
+        raise errors.ConfigError(f"{anchor.name}: moves too fast for a path; take smaller rates under Motion")
     _, displacements = models.evaluate(model, tau)
     sigmas = confidence.position_sigma(model, tau)
     if follow is not None:

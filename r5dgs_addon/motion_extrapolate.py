@@ -31,12 +31,14 @@ class Plan:
         place: Where its curves lie.
         times: Its times, with the new end.
         tails: Keys by path, over frames.
+        too_fast: Whether the motion is too fast for keys, which then are exact only at frames.
     """
 
     anchor: bpy.types.Object
     place: motion_curves.Place
     times: timeline.Times
     tails: dict[str, Keys]
+    too_fast: bool
 
 
 def scene_of(anchor: bpy.types.Object) -> bpy.types.Collection | None:
@@ -71,25 +73,30 @@ def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) 
         ConfigError: One of them cannot be; nothing was written.
     """
     everyone = [*anchors, *followers(anchors)]
-    for plan in [_plan(anchor, t_end) for anchor in everyone]:
+    for plan in _plans(everyone, t_end):
         _apply(plan)
     return everyone
 
 
-def _plan(anchor: bpy.types.Object, t_end: float | None) -> Plan:
+def _plans(anchors: list[bpy.types.Object], t_end: float | None) -> list[Plan]:
+    most = keyframes.share(len(anchors))
+    return [_plan(anchor, t_end, most) for anchor in anchors]
+
+
+def _plan(anchor: bpy.types.Object, t_end: float | None, most: int) -> Plan:
     times, place = times_of(anchor, t_end), motion_curves.place(anchor)
     location, quat = motion_curves.pose_at(anchor, place, times.frame(times.t_max))
-    tails = {}
+    tails, too_fast = {}, False
     if times.t_end > times.t_max:
         allowed, reach = motion_physics.key_error(anchor)
-        sample = _sampler(anchor, location, quat, times)
-        nearest = keyframes.NEAREST / times.frames_per_unit
-        future = reduction.reduce(sample, times.t_max, times.t_end, allowed, reach, nearest=nearest)
+        sample = _sampler(anchor, location, quat, times, most)
+        future = keyframes.few(sample, times.t_max, times, allowed, reach, most)
+        too_fast = not future.followed
         tails = {
             "location": motion_curves.frames(future.location, times),
             "rotation_quaternion": motion_curves.frames(future.rotation, times),
         }
-    return Plan(anchor, place, times, tails)
+    return Plan(anchor, place, times, tails, too_fast)
 
 
 def _apply(plan: Plan) -> None:
@@ -99,6 +106,7 @@ def _apply(plan: Plan) -> None:
         place = motion_curves.place(anchor)
     motion_curves.replace_after(anchor, place, plan.times.frame(plan.times.t_max), plan.tails)
     motion_physics.sign(anchor, plan.times)
+    anchor.r5dgs_motion.too_fast = plan.too_fast
     motion_confidence.refresh(anchor, plan.times)
 
 
@@ -118,7 +126,7 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
 
 
 def _sampler(
-    anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times
+    anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times, most: int
 ) -> reduction.Sampler:
     """Poses past t_max that continue one at t_max: quaternions as long as that is, as keys may be.
 
@@ -135,7 +143,7 @@ def _sampler(
         raise errors.ConfigError(
             f"{mover.name}: an orbit this fast or far off cannot be integrated; take smaller rates, or Throw and Spin"
         )
-    poses = reduction.model_sampler(model, times.t_max)
+    poses = reduction.model_sampler(model, times.t_max, most)
 
     def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         quats, displacements, quat_slopes, slopes = poses(at)
@@ -175,7 +183,7 @@ def extrapolate_until(
     timeline.check_end(collection.name, replace(times, t_end=t_end))
     anchors = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
     kept = [anchor for anchor in anchors if motion_physics.hand_edited(anchor, times)]
-    plans = [_plan(anchor, t_end) for anchor in anchors if anchor not in kept]
+    plans = _plans([anchor for anchor in anchors if anchor not in kept], t_end)
     for plan in plans:
         _apply(plan)
     collection.r5dgs.t_end = max(t_end, times.t_max)

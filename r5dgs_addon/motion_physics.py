@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import bpy
@@ -19,7 +20,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.motion import confidence, models, rotations, top
 from ..r5dgs_core.motion.models import MotionModel
 from ..r5dgs_core.scene.scene import Scene
-from . import motion_curves, timeline
+from . import amounts, motion_curves, timeline
 
 KINDS = (
     ("static", "Still", "Stays where it is"),
@@ -96,6 +97,11 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     written: StringProperty(name="Written Keys", description="Digest of the keys written last", options={"HIDDEN"})
     frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
     written_motion: StringProperty(name="Written Motion", description="Digest of its motion", options={"HIDDEN"})
+    too_fast: BoolProperty(
+        name="Too Fast for Keys",
+        description="The motion turns or swings too fast for keys, which are exact only at frames",
+        options={"HIDDEN"},
+    )
     at_once: BoolProperty(
         name="Write at Once", description="Re-extrapolate whenever a number is changed here", options=set()
     )
@@ -227,6 +233,17 @@ def hand_edited(anchor: bpy.types.Object, times: timeline.Times) -> bool:
     """
     place = motion_curves.place(anchor)
     return motion_curves.digest(place, times.frame(times.t_max)) != anchor.r5dgs_motion.written
+
+
+def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
+    """Warning that names the anchors whose motion keys cannot follow, or "" if there are none."""
+    names = [anchor.name for anchor in anchors if anchor.r5dgs_motion.too_fast]
+    if not names:
+        return ""
+    return (
+        f"Too fast for keys, which are exact only at frames: {amounts.names(names)}; take smaller rates under Motion, "
+        "or train with more frames per unit of time"
+    )
 
 
 def has_motion(anchor: bpy.types.Object) -> bool:

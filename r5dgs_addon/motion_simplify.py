@@ -8,6 +8,7 @@ from ..r5dgs_core.motion import bezier, rotations
 from ..r5dgs_core.motion import keyframes as reduction
 from . import compat, keyframes, motion_curves, motion_extrapolate, motion_physics, timeline
 
+_FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames
 _LIKE = 0.01  # of the allowed error over the shorter side: slopes that differ by less are no kink
 
 
@@ -91,7 +92,7 @@ def _reduced(
     joined = None
     for a, b in zip(cuts[:-1], cuts[1:], strict=True):
         sample = _sampler(anchor, parts, a, b)
-        some = reduction.reduce(sample, float(a), float(b), allowed, reach, nearest=keyframes.NEAREST)
+        some = reduction.reduce(sample, float(a), float(b), allowed, reach, nearest=keyframes.NEAREST, frames=_FRAMES)
         joined = some if joined is None else reduction.join(joined, some)
     assert joined is not None
     return joined

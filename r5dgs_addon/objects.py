@@ -112,17 +112,20 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         _describe(collection, scene, path, root, times)
         material = clouds.material(table.fit(f"R5DGS {scene.name}"))
         parts = ranges(scene)
+        largest: dict[int, Range] = {}
+        for part in parts:
+            largest[part.object_id] = max(largest.get(part.object_id, part), part, key=lambda own: own.count)
         children = {}
         for object_id in sorted({part.object_id for part in parts}):
             children[object_id] = bpy.data.collections.new(table.fit(object_name(scene, object_id)))
             collection.children.link(children[object_id])
         anchors = {}
         for part in homes(scene, parts):
-            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, parts, extent)
+            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, largest, extent)
         for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
             clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, options.sh_degree)
             data.materials.append(material)
-            _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, parts, data)
+            _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, largest, data)
         displays.show(collection, options.display)
         reaches = keyframes.reaches(scene)
         for (_, motion_id), anchor in anchors.items():
@@ -212,14 +215,14 @@ def _anchor_key(part: Range) -> tuple[int, int]:
     return (part.object_id if part.motion_id == 0 else 0, part.motion_id)
 
 
-def _part_name(scene: Scene, part: Range, parts: list[Range]) -> str:
+def _part_name(scene: Scene, part: Range, largest: dict[int, Range]) -> str:
     """Name of a range: its object's for the largest one, which of the object's Gaussians these are for the others."""
     name = object_name(scene, part.object_id)
     group: MotionGroup = scene.groups[part.motion_id]
     if group.role == "shadow":
         owner = object_name(scene, group.object_id)
         return f"{owner} shadow" if part.object_id <= 0 else f"{name} with {owner} shadow"
-    if part == max((other for other in parts if other.object_id == part.object_id), key=lambda other: other.count):
+    if part == largest[part.object_id]:
         return name
     return f"{name} still" if part.motion_id == 0 else f"{name} with {object_name(scene, group.object_id)}"
 
@@ -229,10 +232,10 @@ def _anchor(
     root: bpy.types.Object,
     scene: Scene,
     part: Range,
-    parts: list[Range],
+    largest: dict[int, Range],
     extent: float,
 ) -> bpy.types.Object:
-    anchor = bpy.data.objects.new(table.fit(f"{_part_name(scene, part, parts)} anchor"), None)
+    anchor = bpy.data.objects.new(table.fit(f"{_part_name(scene, part, largest)} anchor"), None)
     pivot = _pivot(scene, part)
     shadow = scene.groups[part.motion_id].role == "shadow"  # what goes along is drawn smaller than what leads
     anchor.empty_display_type = "PLAIN_AXES" if shadow else "ARROWS"
@@ -251,10 +254,10 @@ def _cloud(
     anchor: bpy.types.Object,
     scene: Scene,
     part: Range,
-    parts: list[Range],
+    largest: dict[int, Range],
     data: bpy.types.PointCloud,
 ) -> bpy.types.Object:
-    data.name = name = table.fit(_part_name(scene, part, parts))
+    data.name = name = table.fit(_part_name(scene, part, largest))
     cloud = bpy.data.objects.new(name, data)
     collection.objects.link(cloud)
     color = clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))

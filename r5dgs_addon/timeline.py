@@ -9,6 +9,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene.scene import Scene
 
 MARKER = "t_max"
+LAST_FRAME = 1_048_574  # of Blender
 LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
 
 
@@ -59,14 +60,14 @@ def default_end(scene: Scene) -> float:
 
 
 def check_end(name: str, times: Times) -> None:
-    """Refuse to extrapolate too far; what `default_end` gives is never too far.
+    """Refuse to extrapolate too far, or past Blender's last frame.
 
     Args:
         name: What the message calls the scene.
         times: Its times, with the end that is wanted.
 
     Raises:
-        ConfigError: The end is no number, or too far.
+        ConfigError: The end is no number, or too far, or a frame is past Blender's last one.
     """
     longest = max(times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit), 1.0)
     if not times.t_end <= longest:
@@ -74,6 +75,15 @@ def check_end(name: str, times: Times) -> None:
             f"{name}: expected an end up to {longest:.4g}, {LONGEST:g} times as long as was observed, found "
             f"{times.t_end:.4g}; extrapolate less far"
         )
+    for what, t, remedy in (
+        ("observed times", max(times.t_start, times.t_max, key=abs), "train with fewer frames per unit of time"),
+        ("extrapolated times", times.t_end, "extrapolate less far"),
+    ):
+        if abs(times.frame(t)) > LAST_FRAME:
+            raise errors.ConfigError(
+                f"{name}: {what}: expected frames up to {LAST_FRAME:,}, Blender's last, found {times.frame(t):.4g}; "
+                f"{remedy}"
+            )
 
 
 def fit(scene: bpy.types.Scene, times: Times) -> None:

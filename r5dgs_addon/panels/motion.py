@@ -50,6 +50,8 @@ def _physics(layout, anchor) -> None:
     for name in motion_physics.FIELDS[state.kind]:
         layout.prop(state, name)
     layout.prop(state, "at_once")
+    if state.too_fast:
+        layout.label(text="Too fast for keys: exact only at frames", icon="ERROR")
     if not motion_physics.is_written(anchor):
         layout.label(text="Re-Extrapolate writes this to the keys", icon="ERROR")
     elif motion_physics.edited(state):

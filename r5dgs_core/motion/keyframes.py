@@ -18,9 +18,12 @@ from . import models, rotations
 
 _ROUNDING = 1e-9  # of the largest value
 MAX_STEP_RAD = math.radians(120.0)
+MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame: near half a turn, frames no longer show which way it goes
+FEWEST_INTERVALS = 64  # that are tried first, however short the motion
+MOST_INTERVALS = 1 << 15
 _FINER = 4  # points of the checking grid per possible key time
-_FIRST_INTERVALS = 64
-_MOST_INTERVALS = 1 << 15
+_PER_FRAME = 4  # possible key times
+_STEPS_PER_INTERVAL = 16  # of integration, in one pass over a motion
 _ONE_BY_ONE = 256  # keys; what needs more is cut into stripes that are walked side by side
 _PER_STRIPE = 32  # keys: each stripe adds one at most
 
@@ -47,17 +50,34 @@ class Keys:
 
 @dataclass(frozen=True)
 class Curves:
-    """Keys of a rigid motion: location [K, 3] and rotation, unit wxyz with continuous signs [K', 4]."""
+    """Keys of a rigid motion.
+
+    Attributes:
+        location: [K, 3]
+        rotation: Unit wxyz with continuous signs. [K', 4]
+        followed: False if the motion is too fast for keys: they are exact only at their own times.
+    """
 
     location: Keys
     rotation: Keys
+    followed: bool = True
 
 
-def model_sampler(model: models.MotionModel, t_max: float) -> Sampler:
-    """Poses and slopes of a motion model at scene times >= t_max, for `reduce`."""
+@dataclass(frozen=True)
+class FrameTimes:
+    """Times at which an editor shows frames: ``zero + k * duration`` for whole k."""
+
+    zero: float
+    duration: float
+
+
+def model_sampler(model: models.MotionModel, t_max: float, most: int = MOST_INTERVALS) -> Sampler:
+    """Poses and slopes of a motion model at scene times >= t_max, for `reduce` with the same ``most``."""
 
     def sample(times: np.ndarray) -> Samples:
-        quats, displacements, spins, velocities = models.evaluate_with_rates(model, np.maximum(times - t_max, 0.0))
+        quats, displacements, spins, velocities = models.evaluate_with_rates(
+            model, np.maximum(times - t_max, 0.0), _STEPS_PER_INTERVAL * most
+        )
         return quats, displacements, rotations.quat_rates(quats, spins), velocities
 
     return sample
@@ -71,8 +91,13 @@ def reduce(
     radius: float,
     forced_times: Sequence[float] = (),
     nearest: float = 0.0,
+    frames: FrameTimes | None = None,
+    most: int = MOST_INTERVALS,
 ) -> Curves:
     """Choose keys so that every point of the body stays within ``tolerance`` of the motion.
+
+    The number of samples is bounded by a constant times ``most``; with ``frames``, also by a constant times the number
+    of frames (and at least that of `FEWEST_INTERVALS`).
 
     Args:
         sample: Function of times [S] that gives quaternions [S, 4], displacements [S, 3] and their slopes per unit of
@@ -84,23 +109,31 @@ def reduce(
         radius: Largest distance of a point from the pivot, world units.
         forced_times: Times inside (t0, t1) that get a key in any case.
         nearest: Least time between possible keys, for editors that drop keys which are nearer.
+        frames: Frames of the editor. A curve that four keys per frame do not follow, and a rotation by more than
+            `MAX_FRAME_TURN_RAD` per frame, gets a key at every frame instead.
+        most: Largest number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, the keys of a
+            curve that cannot be followed lie at every second frame, every third and so on.
 
     Returns:
         Location and rotation keys; one key for a curve that is constant within its share of the tolerance. The error
         |dd| + 2 radius sin(dtheta / 2) holds on a grid four times finer than the possible key times, whose own density
         doubles until single steps hold the tolerance; no rotation step is above 120 degrees. A motion too fast for
-        ``nearest`` or for 32,768 steps gets what they allow, exact at its keys.
+        ``nearest``, ``frames`` or ``most`` gets what they allow, exact at its keys, and is marked as not followed.
     """
     if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
         raise ValueError(f"t0, t1: expected t0 < t1, got {t0} and {t1}")
-    if not (tolerance > 0 and radius >= 0 and nearest >= 0):
+    if not (tolerance > 0 and radius >= 0 and nearest >= 0 and most >= FEWEST_INTERVALS):
         raise ValueError(
-            f"tolerance, radius, nearest: expected > 0, >= 0 and >= 0, got {tolerance}, {radius} and {nearest}"
+            f"tolerance, radius, nearest, most: expected > 0, >= 0, >= 0 and >= {FEWEST_INTERVALS}, got {tolerance}, "
+            f"{radius}, {nearest} and {most}"
         )
     cuts = sorted({float(t) for t in forced_times if t0 < t < t1})
     bounds = [t0, *cuts, t1]
     shortest = min(b - a for a, b in itertools.pairwise(bounds))
-    intervals = min(_FIRST_INTERVALS, max(1, int(shortest / nearest))) if nearest > 0 else _FIRST_INTERVALS
+    intervals = min(FEWEST_INTERVALS, max(1, int(shortest / nearest))) if nearest > 0 else FEWEST_INTERVALS
+    limit = most
+    if frames is not None:
+        limit = int(min(limit, max(FEWEST_INTERVALS, _PER_FRAME * (t1 - t0) / frames.duration)))
     while True:
         grid = np.concatenate(
             [np.linspace(a, b, intervals * _FINER + 1)[:-1] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -108,12 +141,37 @@ def reduce(
         )
         location, rotation = _Curve.pair(sample(grid), grid, tolerance, radius)
         possible = np.arange(0, len(grid), _FINER)
-        steps_hold = location.holds_steps(possible) and rotation.holds_steps(possible)
-        if steps_hold or intervals >= _MOST_INTERVALS or shortest < 2 * intervals * nearest:
+        too_fast = frames is not None and rotation.turn(min(frames.duration, t1 - t0)) > MAX_FRAME_TURN_RAD
+        followed = [location.holds_steps(possible), not too_fast and rotation.holds_steps(possible)]
+        if followed[0] and (followed[1] or too_fast):
+            break
+        if 2 * intervals > limit or shortest < 2 * intervals * nearest:
             break
         intervals *= 2
     forced = possible[::intervals]
-    return Curves(location.greedy(possible, forced), rotation.greedy(possible, forced))
+    every_frame = None if all(followed) or frames is None else _at_frames(sample, t0, t1, frames, nearest, most)
+    keys = [
+        curve.greedy(possible, forced) if holds or every_frame is None else framed
+        for curve, holds, framed in zip((location, rotation), followed, every_frame or (None, None), strict=True)
+    ]
+    return Curves(keys[0], keys[1], all(followed))
+
+
+def _at_frames(
+    sample: Sampler, t0: float, t1: float, frames: FrameTimes, nearest: float, most: int
+) -> tuple[Keys, Keys]:
+    """Location and rotation keys at t0, t1 and all frames between them, or at every n-th if these are over ``most``."""
+    first, last = math.ceil((t0 - frames.zero) / frames.duration), math.floor((t1 - frames.zero) / frames.duration)
+    stride = 1 + max(last - first, 0) // most
+    inside = frames.zero + frames.duration * np.arange(first, last + 1, stride, dtype=np.float64)
+    apart = max(nearest, 1e-6 * frames.duration)
+    times = np.concatenate([[t0], inside[(inside > t0 + apart) & (inside < t1 - apart)], [t1]])
+    quats, displacements, _, _ = sample(times)
+    curves = []
+    for values in (displacements, rotations.make_continuous(np.asarray(quats, np.float64))):
+        between = slopes(times, values)
+        curves.append(Keys(times, values, between, between))
+    return curves[0], curves[1]
 
 
 def join(first: Curves, second: Curves) -> Curves:
@@ -147,7 +205,8 @@ def join(first: Curves, second: Curves) -> Curves:
     flip = -1.0 if float(first.rotation.values[-1] @ second.rotation.values[0]) < 0 else 1.0
     joint = float(second.location.times[0])
     location = _without(chain(first.location, second.location, 1.0), joint)
-    return Curves(location, _without(chain(first.rotation, second.rotation, flip), joint))
+    rotation = _without(chain(first.rotation, second.rotation, flip), joint)
+    return Curves(location, rotation, first.followed and second.followed)
 
 
 def _without(keys: Keys, time: float) -> Keys:
@@ -251,6 +310,10 @@ class _Curve:
             return np.linalg.norm(values - truth, axis=-1)
         angle = rotations.angle_between(rotations.normalize(values), truth)
         return 2 * self.radius * np.sin(0.5 * angle)
+
+    def turn(self, duration: float) -> float:
+        """Largest angle that the body turns by within a duration, from its rates; rad."""
+        return 2.0 * duration * float(np.linalg.norm(self.slopes, axis=-1).max())
 
     def holds_steps(self, possible: np.ndarray) -> bool:
         """Whether each single step between possible key times is good enough."""

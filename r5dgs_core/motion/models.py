@@ -283,9 +283,15 @@ def _warn_of_wild_motion() -> None:
 
 
 def evaluate_with_rates(
-    model: MotionModel, tau: float | np.ndarray
+    model: MotionModel, tau: float | np.ndarray, most_steps: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Pose as in `evaluate`, with its exact time derivative.
+
+    Args:
+        model: The motion.
+        tau: Time since t_max, >= 0, any shape. [...]
+        most_steps: Largest number of integration steps for all times together, or None for as many as they need. Times
+            that need more share their steps, and are rigid but inaccurate if even these are too few.
 
     Returns:
         Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame, rad per unit [..., 3], and
@@ -295,7 +301,7 @@ def evaluate_with_rates(
     if (tau < 0).any():
         raise ValueError(f"tau: expected times since t_max >= 0, got {tau.min()}")
     with np.errstate(over="ignore", invalid="ignore"):
-        quats, displacements, spins, velocities = curve(model, tau)
+        quats, displacements, spins, velocities = curve(model, tau, most_steps)
         s = -np.expm1(-tau / model.fade_time)[..., None]
         rate = (1 - s) / model.fade_time
         blended = rotations.multiply(quats, rotations.rotvecs_to_quats(s * model.offset_rotvec))
@@ -308,12 +314,15 @@ def evaluate_with_rates(
     return held[0], held[1], held[2], held[3]
 
 
-def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def curve(
+    model: MotionModel, tau: float | np.ndarray, most_steps: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The fitted curve (R_f, d_f) without offsets, from the identity at tau = 0, with its exact derivative.
 
     Args:
         model: The motion.
         tau: Time since t_max, of either sign, any shape. [...]
+        most_steps: As in `evaluate_with_rates`, for times >= 0.
 
     Returns:
         As `evaluate_with_rates`.
@@ -342,7 +351,7 @@ def curve(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, np.n
         quats, spins = top.turns(model.inertia, w, tau.reshape(-1))
         quats, spins = quats.reshape(*tau.shape, 4), spins.reshape(*tau.shape, 3)
         return quats, v * once + a * twice, spins, v * slope + a * once
-    quats, d = _world_twist(model, tau)
+    quats, d = _world_twist(model, tau, most_steps)
     spins = w + eps * span
     return quats, d, spins, v + a * span + rotations.cross(spins, d)
 
@@ -383,7 +392,7 @@ def twist_poses(v: np.ndarray, w: np.ndarray, span: np.ndarray) -> se3.Pose:
     return rotations.rotvecs_to_quats(turn), se3.v_matrix_times(turn, v + 0 * turn) * span
 
 
-def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
+def _world_twist(model: MotionModel, tau: np.ndarray, most_steps: int | None) -> se3.Pose:
     """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need. Those that
     no number of steps would give are NaN.
     """
@@ -394,11 +403,37 @@ def _world_twist(model: MotionModel, tau: np.ndarray) -> se3.Pose:
     quats, displacements = rotations.identity(len(flat)), np.zeros((len(flat), 3))
     hopeless = needed >= se3.MOST_STEPS
     quats[hopeless] = np.nan
+    if most_steps is not None and steps[~hopeless].sum() > most_steps:
+        quats[~hopeless], displacements[~hopeless] = _shared_steps(
+            model, flat[~hopeless], needed[~hopeless], most_steps
+        )
+        return quats.reshape(*tau.shape, 4), displacements.reshape(*tau.shape, 3)
     for n in np.unique(steps[~hopeless]):
         rows = np.flatnonzero((steps == n) & ~hopeless)
         for block in np.array_split(rows, max(1, len(rows) * int(n) >> 18)):
             quats[block], displacements[block] = se3.integrate(w, v, eps, a, flat[block], int(n))
     return quats.reshape(*tau.shape, 4), displacements.reshape(*tau.shape, 3)
+
+
+def _shared_steps(model: MotionModel, taus: np.ndarray, needed: np.ndarray, most: int) -> se3.Pose:
+    """Magnus-4 poses at times >= 0, each integrated from the one before: [S] -> [S, 4], [S, 3].
+
+    All intervals between the times take the same number of steps: as short as the steps to the hardest time alone
+    would be, or as many as ``most`` allows.
+    """
+    v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
+    times, rows = np.unique(taus, return_inverse=True)
+    starts = np.concatenate([[0.0], times[:-1]])
+    gaps = times - starts
+    shortest = float((taus / needed)[needed.argmax()])
+    steps = int(min(max(1.0, np.ceil(gaps.max() / shortest)), max(1, most // len(times))))
+    w_start, v_start = w + starts[:, None] * eps, v + starts[:, None] * a
+    parts = [
+        se3.integrate(w_start[block], v_start[block], eps, a, gaps[block], steps)
+        for block in np.array_split(np.arange(len(times)), 1 + (len(times) * steps >> 18))
+    ]
+    quats, displacements = se3.scan(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return rotations.normalize(quats)[rows], displacements[rows]
 
 
 def steps_needed(model: MotionModel, tau: np.ndarray) -> np.ndarray:

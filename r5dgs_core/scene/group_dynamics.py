@@ -106,16 +106,21 @@ class GroupMotion:
         return rotations.normalize(q), d
 
 
-def knots(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Poses at the observed times with signs chosen so that quaternions are continuous and end at (1, 0, 0, 0).
+
+    Args:
+        scene: The scene.
+        groups: Motion groups to return, G of them; all by default.
 
     Returns:
         Quaternions [G, S, 4] and displacements [G, S, 3], float64.
     """
-    quats = np.moveaxis(np.asarray(scene.track_poses[..., :4], np.float64), 1, 0)
+    poses = np.asarray(scene.track_poses[groups], np.float64)
+    quats = np.moveaxis(poses[..., :4], 1, 0)
     quats = rotations.make_continuous(quats[::-1])[::-1]
     quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
-    return np.moveaxis(quats, 0, 1), np.asarray(scene.track_poses[..., 4:], np.float64)
+    return np.moveaxis(quats, 0, 1), poses[..., 4:]
 
 
 def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

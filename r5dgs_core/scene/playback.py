@@ -275,9 +275,9 @@ def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | N
     return Player(scene, mode).frame(t, origin)
 
 
-def knot_slopes(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def knot_slopes(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
-    quats, displacements = knots(scene)
+    quats, displacements = knots(scene, groups)
     return slopes(scene.track_times, quats), slopes(scene.track_times, displacements)
 
 

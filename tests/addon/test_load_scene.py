@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.motion import models
+from r5dgs_core.motion import models, se3
 from r5dgs_core.scene import playback, scene_file
 from tests import scenes
 from tests.addon import motions
@@ -365,3 +365,47 @@ def test_an_anchor_stays_with_its_own_object_whoever_moves_with_it(blender, tmp_
     assert by_name["background with red apple"].parent == by_name["red apple anchor"] == by_name["red apple"].parent
     assert by_name["toy car still"].parent == by_name["toy car still anchor"]
     assert by_name["toy car"].parent == by_name["toy car anchor"]
+
+
+def wild_scene(path, model, bodies=1, **changes):
+    """A file of bodies that all go on by one motion past t_max."""
+    scene = scenes.make_scene(n=20 * bodies + 40, objects=bodies, shadows=False, shading=False, identities=False)
+    groups = (scene.groups[0], *(dataclasses.replace(group, model=model) for group in scene.groups[1:]))
+    table = [dataclasses.replace(item, name=f"{item.name} {item.id}", aliases=()) for item in scene.objects]
+    return scene_file.write(dataclasses.replace(scene, groups=groups, objects=tuple(table), **changes), path)
+
+
+TILTING = models.MotionModel(
+    "world_twist", velocity=[1, 0, 0], angular_velocity=[1e4, 0, 2], angular_acceleration=[0, 1.5, 0], radius=0.3
+)
+
+
+@pytest.mark.parametrize("bodies, frames_per_unit", [(1, 60.0), (1, 1e6), (1, 1e-6), (100, 60.0)])
+def test_a_small_file_never_blocks_blender(blender, tmp_path, monkeypatch, capfd, bodies, frames_per_unit):
+    path = wild_scene(tmp_path / "wild.r5dgs", TILTING, bodies, frames_per_unit=frames_per_unit)
+    steps, exp = [0], se3.exp
+
+    def counted(w, v):
+        steps[0] += w.size // 3
+        return exp(w, v)
+
+    monkeypatch.setattr(se3, "exp", counted)
+    loaded = motions.load(blender, path)
+    assert steps[0] < 1 << 24
+    anchors = [obj for obj in loaded.all_objects if obj.r5dgs.role == "ANCHOR" and obj.r5dgs.motion_id]
+    keys = max(len(curve.keyframe_points) for anchor in anchors for curve in motions.curves(anchor).values())
+    assert keys <= (1 << 15) + len(scenes.TIMES)
+    assert all(anchor.r5dgs_motion.too_fast for anchor in anchors) == (frames_per_unit < 1e6)
+    said = capfd.readouterr().out
+    assert ("Too fast for keys" in said) == (frames_per_unit < 1e6)
+    assert ("and 95 more" in said) == (bodies == 100)
+
+
+def test_frames_past_the_last_one_of_blender_are_refused_by_name(blender, tmp_path):
+    path = wild_scene(tmp_path / "wild.r5dgs", models.STATIC, frames_per_unit=1e9)
+    with pytest.raises(RuntimeError, match=r"observed times: expected frames up to 1,048,574.*found 7.5e\+08"):
+        blender.ops.r5dgs.load_scene(filepath=str(path))
+    path = wild_scene(tmp_path / "wild.r5dgs", models.STATIC, frames_per_unit=1.2e6)
+    with pytest.raises(RuntimeError, match="extrapolated times: .*extrapolate less far"):
+        blender.ops.r5dgs.load_scene(filepath=str(path))
+    assert not blender.data.objects.get("synthetic root")

@@ -84,6 +84,17 @@ def test_where_one_path_cannot_be_read_no_tube_is_made(blender, loaded):
     assert len(shown) > 1 and not any(anchor.r5dgs_motion.tube for anchor in anchors)
 
 
+def test_a_motion_that_takes_too_many_steps_is_refused_before_they_are_taken(blender, loaded, monkeypatch):
+    mug = blender.data.objects["mug anchor"]
+    motions.choose(blender, mug)
+    mug.r5dgs_motion.kind = "world_twist"
+    mug.r5dgs_motion.angular_velocity = (1e7, 0.0, 1e7)
+    monkeypatch.setattr(confidence, "position_sigma", lambda *_: pytest.fail("integrated"))
+    with pytest.raises(RuntimeError, match="mug anchor: moves too fast for a path"):
+        blender.ops.r5dgs.show_confidence()
+    assert mug.r5dgs_motion.tube is None
+
+
 def test_a_shadow_gets_one_where_it_is_chosen(blender, loaded):
     shadow = blender.data.objects["mug shadow anchor"]
     motions.choose(blender, shadow)

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import keyframes, models, rotations
+from r5dgs_core.motion import keyframes, models, rotations, se3
 from r5dgs_core.motion.models import MotionModel
 from tests.problems import MOTIONS, RADIUS, SIZE
 
@@ -200,3 +200,88 @@ def test_unusable_arguments_are_refused():
         keyframes.reduce(sampler, 1.0, 1.0, 1e-3, 1.0)
     with pytest.raises(ValueError, match="tolerance"):
         keyframes.reduce(sampler, 0.0, 1.0, 0.0, 1.0)
+
+
+FRAME = 1 / 60
+WILD = {
+    "twist that tilts": MotionModel(
+        "world_twist", velocity=[1, 0, 0], angular_velocity=[1e4, 0, 2], angular_acceleration=[0, 1.5, 0], radius=RADIUS
+    ),
+    "far orbit": MotionModel(
+        "world_twist", velocity=[1e25, 0, 0], angular_velocity=[1, 0, 2], angular_acceleration=[0, 9, 0], radius=1e-6
+    ),
+    "spin of all numbers": MotionModel("ballistic_spin", angular_velocity=[0, 1e300, 0], center_offset=[1, 0, 0]),
+    "top": MotionModel("free_top", angular_velocity=[1e5, 3e4, 0], inertia=np.diag([0.4, 0.8, 1.0])),
+    "swing": MotionModel("translation", velocity=[1e3, 0, 0], frequency=1e6),
+    "jump": MotionModel("translation", offset_displacement=[1, 0, 0], fade_time=1e-300),
+}
+
+
+def work(monkeypatch, model, span, frame, most=keyframes.MOST_INTERVALS):
+    """Keys of a motion over a span, the times that were sampled for them, and the steps of integration."""
+    counts = {"times": 0, "steps": 0}
+    sampler, exp = keyframes.model_sampler(model, 0.0, most), se3.exp
+
+    def counted(times):
+        counts["times"] += len(times)
+        return sampler(times)
+
+    def counted_exp(w, v):
+        counts["steps"] += math.prod(w.shape[:-1])
+        return exp(w, v)
+
+    monkeypatch.setattr(se3, "exp", counted_exp)
+    frames = keyframes.FrameTimes(0.0, frame)
+    curves = keyframes.reduce(counted, 0.0, span, 1e-6, RADIUS, nearest=0.01 * frame, frames=frames, most=most)
+    monkeypatch.setattr(se3, "exp", exp)
+    return curves, counts
+
+
+@pytest.mark.parametrize("frames", [1, 100, 10_000])
+@pytest.mark.parametrize("name", WILD)
+def test_the_work_for_keys_is_bounded_by_the_number_of_frames(monkeypatch, name, frames):
+    _, counts = work(monkeypatch, WILD[name], frames * FRAME, FRAME, most=1024)
+    assert counts["times"] <= 40 * max(64, min(frames, 1024))
+    assert counts["steps"] <= 8 * 16 * 1024
+
+
+@pytest.mark.parametrize("frame", [1e-6, 1e-3, 1e3, 1e6])
+def test_the_work_for_keys_is_bounded_whatever_the_pace_of_frames(monkeypatch, frame):
+    for model in WILD.values():
+        curves, counts = work(monkeypatch, model, 3.0, frame, most=512)
+        assert counts["times"] <= 40 * 512
+        assert max(len(curves.location.times), len(curves.rotation.times)) <= 514
+
+
+def test_what_keys_cannot_follow_is_exact_at_every_frame_and_is_marked(monkeypatch):
+    for name in ("twist that tilts", "top", "swing"):
+        curves, _ = work(monkeypatch, WILD[name], 20.5 * FRAME, FRAME)
+        assert not curves.followed
+        quats, displacements = models.evaluate(WILD[name], FRAME * np.arange(21))
+        at = FRAME * np.arange(21)
+        shift = np.abs(keyframes.evaluate(curves.location, at) - displacements).max()
+        turn = rotations.angle_between(keyframes.evaluate(curves.rotation, at, unit=True), quats).max()
+        assert shift <= 1e-6 and turn <= 1e-6
+        assert max(curves.location.times[-1], curves.rotation.times[-1]) == 20.5 * FRAME
+
+
+def test_more_frames_than_keys_are_keyed_at_whole_frames_evenly(monkeypatch):
+    curves, _ = work(monkeypatch, WILD["swing"], 1000 * FRAME, FRAME, most=300)
+    steps = np.diff(curves.location.times)[:-1] / FRAME
+    np.testing.assert_allclose(steps, steps.round(), atol=1e-6)
+    assert len(curves.location.times) <= 302 and steps.max() == pytest.approx(4)
+
+
+def test_a_motion_that_keys_follow_does_not_depend_on_the_frames(monkeypatch):
+    curves, _ = work(monkeypatch, HARD, 2.0, FRAME)
+    assert curves.followed
+    assert largest_error(curves, HARD, np.linspace(0, 2, 901)) <= 1.01e-6
+
+
+def test_shared_steps_give_the_poses_of_separate_ones():
+    taus = np.concatenate([np.linspace(0, 1, 40), [0.3, 0.77]])
+    fast = dataclasses.replace(HARD, angular_velocity=[300.0, 0, 2], offset_rotvec=[0, 0, 0])
+    few = models.evaluate_with_rates(fast, taus, 1 << 14)
+    assert models.steps_needed(fast, taus).sum() > 1 << 14
+    for shared, own in zip(few, models.evaluate_with_rates(fast, taus), strict=True):
+        np.testing.assert_allclose(shared, own, atol=1e-7 * np.abs(own).max())
