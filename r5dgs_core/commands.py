@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import errors
+from . import errors, input_paths
+from .scene import modes as scene_modes
+from .train import config as configs
 
 if TYPE_CHECKING:
     from .data.dataset import Dataset
@@ -27,26 +28,74 @@ def run_train(
     preset: str | None = None,
     resume: bool,
     overwrite: bool,
+    threads: int | None = None,
     progress_kind: str,
 ) -> None:
     """Train a run folder from a data set (see `train.run.train`)."""
     from .progress import make
+
+    settings = training_settings(out, config_path, overrides, preset=preset, resume=resume)
+    input_paths.check_dataset(data)
     from .train import run
 
-    settings = run.settings(out, config_path, overrides, preset=preset, resume=resume)
+    use_threads(threads)
     with make(progress_kind) as progress:
         run.train(data, out, settings, resume=resume, overwrite=overwrite, progress=progress)
 
 
-def run_bake(run_folder: Path, out: Path, data: Path | None, overrides: Sequence[str] = ()) -> None:
+def training_settings(
+    folder: Path, config_path: Path | None, overrides: Sequence[str], *, preset: str | None, resume: bool
+) -> configs.Config:
+    """Return the configuration of a new run; a resumed run keeps its own.
+
+    Raises:
+        ConfigError: A key or value cannot be used, or the run that is resumed has its own configuration.
+    """
+    if resume and (config_path or overrides or preset) and (Path(folder) / input_paths.RUN_FILE).exists():
+        raise errors.UsageError(
+            "--resume goes on with the run's own configuration; leave out --preset, --config, --set, --iterations, "
+            "--seed and --max-gaussians"
+        )
+    return configs.load(config_path, tuple(overrides), preset)
+
+
+def use_threads(count: int | None) -> None:
+    """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or the usable cores."""
+    if count is not None:
+        from .raster import compile as compilation
+
+        compilation.set_threads(count)
+
+
+def run_bake(
+    run_folder: Path,
+    out: Path,
+    data: Path | None,
+    overrides: Sequence[str] = (),
+    *,
+    threads: int | None = None,
+    progress_kind: str = "none",
+) -> None:
     """Turn a run into a scene file (see `train.bake.run_bake`) and say what the scene needs."""
+    input_paths.check_scene_output(out)
+    configs.require_needs(overrides)
+    input_paths.check_run(run_folder)
+    if data is not None:
+        input_paths.check_dataset(data)
     from rich.console import Console
 
+    from .progress import make
     from .report import table
     from .train import bake
 
-    check_scene_name(out)
-    scene = bake.run_bake(run_folder, out, data, overrides)
+    use_threads(threads)
+    with make(progress_kind) as progress:
+        progress({"event": "bake", "text": "motion models and scene file"})
+        scene = bake.run_bake(run_folder, out, data, overrides)
+        if progress_kind == "json":
+            progress({"event": "written", "scene": str(out)})
+    if progress_kind == "json":
+        return
     _tell_scene(scene, out)
     Console().print(table.needs(scene.needs))
 
@@ -60,11 +109,14 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
         progress_kind: How progress is shown (`progress.make`).
         **options: The fields of `importing.importer.Options`.
     """
+    input_paths.check_scene_output(out)
+    input_paths.check_foreign_run(run_folder)
+    if options.get("data") is not None:
+        input_paths.check_dataset(options["data"])
     from .importing import importer
     from .progress import make
     from .scene import scene_file
 
-    check_scene_name(out)
     chosen = importer.Options(**{name: value for name, value in options.items() if value is not None})
     with make(progress_kind) as progress:
         scene = importer.import_run(
@@ -79,14 +131,6 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
         _tell_scene(scene, out)
 
 
-def check_scene_name(out: Path) -> None:
-    """Refuse a place for a scene file that Blender would not find. Raises `SceneFileError`."""
-    if out.is_dir():
-        raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
-    if out.suffix.lower() != ".r5dgs":
-        raise errors.SceneFileError(f"{out}: expected a name that ends in .r5dgs, which is what Blender looks for")
-
-
 def _tell_scene(scene: Scene, out: Path) -> None:
     count = sum(o.id > 0 for o in scene.objects)
     objects = "1 object" if count == 1 else f"{count} objects"
@@ -94,7 +138,13 @@ def _tell_scene(scene: Scene, out: Path) -> None:
 
 
 def run_evaluate(
-    target: Path, data: Path | None, *, modes: list[str], json_path: Path | None, progress_kind: str = "none"
+    target: Path,
+    data: Path | None,
+    *,
+    modes: list[str],
+    json_path: Path | None,
+    threads: int | None = None,
+    progress_kind: str = "none",
 ) -> dict[str, Any]:
     """Measure a run or scene file on its data set's held-out views; writes ``evaluation.json`` beside it.
 
@@ -103,23 +153,27 @@ def run_evaluate(
         data: The data set; by default the one a run was trained on.
         modes: Playback modes.
         json_path: Where the result goes instead.
+        threads: Threads of the kernels; see `use_threads`.
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
         The evaluation, in the shape of ``evaluation.json``.
     """
+    for mode in modes:
+        check_mode(mode)
+    check_target(target, data)
+    input_paths.check_output("--json", json_path)
+    if data is None and not target.is_dir():
+        raise errors.UsageError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
     from rich.console import Console
 
     from .progress import make
     from .report import evaluate, table
     from .train import checkpoint
 
-    for mode in modes:
-        check_mode(mode)
-    _check_json(json_path)
+    use_threads(threads)
     scene, dataset = open_target(target, data)
-    if dataset is None:
-        raise errors.DatasetError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
+    assert dataset is not None
     default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
     for mode in modes:
         check_mode(mode, scene, target)
@@ -140,22 +194,24 @@ def run_evaluate(
     return result
 
 
-def run_stability(json_path: Path | None = None, *, progress_kind: str = "none") -> bool:
+def run_stability(json_path: Path | None = None, *, threads: int | None = None, progress_kind: str = "none") -> bool:
     """Run the stiff, extreme and degenerate cases on this installation and print what came of them.
 
     Args:
         json_path: Where the rows go as JSON, or None.
+        threads: Threads of the kernels; see `use_threads`.
         progress_kind: How progress is shown (`progress.make`); "json" prints no table.
 
     Returns:
         Whether all cases passed.
     """
+    input_paths.check_output("--json", json_path)
     from rich.console import Console
 
     from .progress import make
     from .report import stability
 
-    _check_json(json_path)
+    use_threads(threads)
     with make(progress_kind) as progress:
         total = len(stability.CASES)
         rows = stability.run(
@@ -190,22 +246,25 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
     return scene, dataset
 
 
+def check_target(target: Path, data: Path | None) -> None:
+    """Raise R5dgsError if a target is neither a run folder nor a file, or if ``data`` is no data set."""
+    input_paths.check_target(target)
+    if data is not None:
+        input_paths.check_dataset(data)
+
+
 def check_mode(mode: str, scene: Scene | None = None, place: object = "") -> None:
-    """Refuse a playback mode that there is not, or that a scene, which is said by its place, has no data for."""
+    """Raise `ConfigError` if a playback mode is unknown, or if the scene at ``place`` has no data for it."""
+    try:
+        scene_modes.split(mode)
+    except ValueError:
+        raise errors.UsageError(f"--mode {mode}: expected one of {', '.join(scene_modes.every())}") from None
+    if scene is None:
+        return
     from .scene import playback
 
-    try:
-        playback.split(mode)
-    except ValueError:
-        raise errors.ConfigError(f"--mode {mode}: expected one of {', '.join(playback.every())}") from None
-    if scene is not None and not playback.available(scene, mode):
+    if not playback.available(scene, mode):
         raise errors.ConfigError(f"--mode {mode}: {place} has data for {', '.join(playback.modes(scene))} only")
-
-
-def _check_json(path: Path | None) -> None:
-    if path is not None and (path.is_dir() or not path.parent.is_dir()):
-        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
-        raise errors.ConfigError(f"--json {path}: expected {expected}")
 
 
 def run_report(
@@ -217,6 +276,7 @@ def run_report(
     splits: Sequence[str] | None = None,
     rounds: int | None = None,
     clock: str = "wall",
+    threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
     """Measure error against run time of a run or scene file (see `report.error_time`) and write it to a folder.
@@ -229,23 +289,18 @@ def run_report(
         splits: Splits whose images are compared, "test" where None.
         rounds: Rounds of timing, the report's own number where None.
         clock: "wall", or "cpu" for processor time.
+        threads: Threads of the kernels; see `use_threads`.
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
         The report, in the shape of ``report.json``.
     """
-    from .data import dataset as datasets
+    check_target(target, data)
+    input_paths.check_output_folder("--out", out)
     from .progress import make
     from .report import error_time, report_rows, report_table
 
-    for kind, given, known in (("tasks", tasks, report_rows.TASKS), ("splits", splits, datasets.SPLITS)):
-        for name in given or ():
-            if name not in known:
-                raise errors.ConfigError(f"--{kind} {name}: expected some of {', '.join(known)}")
-    if rounds is not None and rounds < 1:
-        raise errors.ConfigError(f"--repeats {rounds}: expected 1 or more")
-    if out.exists() and not out.is_dir():
-        raise errors.ConfigError(f"--out {out}: expected a folder, or nothing yet; found a file")
+    use_threads(threads)
     scene, dataset = open_target(target, data)
     if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
         given = " ".join(tasks)
@@ -265,26 +320,6 @@ def run_report(
         report_table.show(result)
         print("\n".join(f"written: {path}" for path in paths))
     return result
-
-
-def run_info(path: Path, *, as_json: bool) -> None:
-    """Say what is in a scene file."""
-    from .scene import scene_file
-
-    found = scene_file.info(scene_file.read(path))
-    if as_json:
-        print(json.dumps(found, indent=2))
-        return
-    for key, value in found.items():
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            print(f"{key}:")
-            for row in value:
-                print(
-                    "  "
-                    + "  ".join(f"{name}={_short(item)}" for name, item in row.items() if item not in ("", [], None))
-                )
-        else:
-            print(f"{key}: {_short(value)}")
 
 
 def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
@@ -316,7 +351,3 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
         done = f"compiled {compiled} kernels in {seconds:.1f} s" if compiled else f"ready: loaded in {seconds:.1f} s"
         print(f"{done}; kept in {folder}" if folder else f"{done}; not kept, as no folder can be written")
     return result
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

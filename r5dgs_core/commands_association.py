@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import errors
+from . import commands, errors, input_paths
 
 if TYPE_CHECKING:
     from .semantics.mask_repair import Repair
@@ -19,6 +19,7 @@ def run_associate(
     *,
     masks: Path | None = None,
     out: Path | None = None,
+    threads: int | None = None,
     progress_kind: str = "none",
 ) -> Path:
     """Write masks with the ids that geometry and motion give to the segments of the incoming ones.
@@ -28,7 +29,8 @@ def run_associate(
         data: The data set; by default that of the run.
         masks: Folder of the incoming masks; by default those that the run was trained with, or ``DATA/object_mask``
             where it was trained without.
-        out: Folder to write; ``RUN/object_mask`` where None.
+        out: Folder to write; ``RUN/object_mask`` if None.
+        threads: Threads of the kernels; see `commands.use_threads`.
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
@@ -37,15 +39,16 @@ def run_associate(
     Raises:
         ConfigError, DatasetError, CheckpointError, SceneFileError: As their messages say.
     """
-    from . import commands
+    commands.check_target(target, data)
+    if target.is_file() and (data is None or out is None):
+        raise errors.UsageError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
+    if out is not None:
+        input_paths.check_output_folder("--out", out)
     from .data import dataset as datasets
     from .progress import make
     from .semantics import mask_repair
 
-    if target.is_file() and (data is None or out is None):
-        raise errors.ConfigError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
-    if not target.exists():
-        raise errors.ConfigError(f"associate {target}: expected a run folder or a .r5dgs file, found nothing")
+    commands.use_threads(threads)
     with make(progress_kind) as progress:
         progress({"event": "prepare", "text": "the scene"})
         scene, dataset = commands.open_target(target, data)

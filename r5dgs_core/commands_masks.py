@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from . import errors
+from . import errors, input_paths
 
 if TYPE_CHECKING:
     from .semantics.mask_making import Made
@@ -56,14 +56,15 @@ def run_masks(
         ConfigError, DatasetError, BackendError: As their messages say.
         Interrupted: Ctrl-C; what is done is kept.
     """
+    tuned = {"points": points, "score": score, "stability": stability, "max_area": max_area}
+    tuned = {name: value for name, value in tuned.items() if value is not None}
+    _check(backend, model, source, device, unknown, {"key_frames": key_frames, **tuned})
+    input_paths.check_dataset(data)
     from .data import dataset as datasets
     from .data import mask_notes
     from .progress import make
     from .semantics import mask_making
 
-    tuned = {"points": points, "score": score, "stability": stability, "max_area": max_area}
-    tuned = {name: value for name, value in tuned.items() if value is not None}
-    _check(backend, model, source, device, unknown, {"key_frames": key_frames, **tuned})
     dataset = datasets.read(data, datasets.NO_MASKS)
     folder = dataset.root / datasets.MASKS if out is None else Path(out)
     views = dataset.train
@@ -118,10 +119,10 @@ def _check(
 ) -> None:
     """Refuse options that do not belong together, and values that cannot be meant."""
     if backend not in BACKENDS:
-        raise errors.ConfigError(f"--backend {backend}: expected one of {', '.join(BACKENDS)}")
+        raise errors.UsageError(f"--backend {backend}: expected one of {', '.join(BACKENDS)}")
     if backend == "sam2":
         if model is None:
-            raise errors.ConfigError("--backend sam2: name the folder of the model with --model DIR (docs/masks.md)")
+            raise errors.UsageError("--backend sam2: name the folder of the model with --model DIR (docs/masks.md)")
         misplaced = {"--from": source, "--unknown": unknown}
     else:
         misplaced = {"--model": model, "--device": device}
@@ -130,13 +131,13 @@ def _check(
             misplaced["--unknown"] = unknown
     for option, value in misplaced.items():
         if value is not None:
-            raise errors.ConfigError(f"{option}: is not for --backend {backend}")
+            raise errors.UsageError(f"{option}: is not for --backend {backend}")
     for name, value in tuned.items():
         option = "--" + name.replace("_", "-")
         if value is not None and name in ("key_frames", "points") and not 1 <= value <= 1024:
-            raise errors.ConfigError(f"{option} {value}: expected a number from 1 to 1024")
+            raise errors.UsageError(f"{option} {value}: expected a number from 1 to 1024")
         if value is not None and name not in ("key_frames", "points") and not 0 <= value <= 1:
-            raise errors.ConfigError(f"{option} {value}: expected a share from 0 to 1")
+            raise errors.UsageError(f"{option} {value}: expected a share from 0 to 1")
 
 
 def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, commands_words, errors
+from . import commands, commands_words, errors, input_paths
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -26,6 +26,7 @@ def run_objects(
     t: float | None = None,
     mode: str = "rigid",
     size: int | None = None,
+    threads: int | None = None,
     as_json: bool = False,
 ) -> dict[str, Any]:
     """Print the table of a scene's objects, and draw a picture that names them.
@@ -38,16 +39,19 @@ def run_objects(
         t: Scene time of the picture; of first, middle and last observed time the one with most to see where None.
         mode: Way to move past t_max.
         size: Pixels of the picture along its longer side.
+        threads: Threads of the kernels; see `commands.use_threads`.
         as_json: Print JSON instead of the table.
 
     Returns:
         What ``--json`` prints (`report.object_table.to_json`).
     """
+    check_picture("--legend", legend, camera, t, size)
+    commands.check_mode(mode)
+    commands.check_target(target, data)
     from .report import object_table
     from .semantics import standpoints
 
-    check_picture("--legend", legend, camera, t, size)
-    commands.check_mode(mode)
+    commands.use_threads(threads)
     scene, dataset = commands.open_target(target, data)
     commands.check_mode(mode, scene, target)
     standpoint = (
@@ -76,7 +80,14 @@ def run_objects(
 
 
 def run_query(
-    path: Path, text: str, options: dict[str, Any], *, render: Path | None = None, context: bool = False, **picture: Any
+    path: Path,
+    text: str,
+    options: dict[str, Any],
+    *,
+    render: Path | None = None,
+    context: bool = False,
+    threads: int | None = None,
+    **picture: Any,
 ) -> list[Match]:
     """Say which objects of a scene file a text names or means, and draw them.
 
@@ -86,18 +97,20 @@ def run_query(
         options: What else `commands_words.run_query` takes.
         render: PNG file of the picture, or None.
         context: Show the rest of the scene in it, dimmed.
+        threads: Threads of the kernels; see `commands.use_threads`.
         **picture: ``camera``, ``t``, ``mode`` and ``size`` of `render_objects`.
 
     Returns:
         The matches, best first; where there are none, no picture is made.
     """
     if render is None and context:
-        raise errors.ConfigError("--context: is for the picture; name it, too: --render FILE.png")
+        raise errors.UsageError("--context: is for the picture; name it, too: --render FILE.png")
     check_picture("--render", render, picture.get("camera"), picture.get("t"), picture.get("size"))
     commands.check_mode(picture.get("mode", "rigid"))
     scene, found = commands_words.run_query(path, text, **options)
     if render is None or not found:
         return found
+    commands.use_threads(threads)
     standpoint = render_objects(scene, [match.object_id for match in found], render, context=context, **picture)
     if not options.get("as_json"):
         print(f"written: {render} (camera {standpoint.camera.name}, t = {standpoint.t:g})")
@@ -156,15 +169,13 @@ def check_picture(
         given = {"--camera": camera, "--time": t, "--size": size}
         lone = next((name for name, value in given.items() if value is not None), None)
         if lone is not None:
-            raise errors.ConfigError(f"{lone}: is for the picture; name it, too: {option} FILE.png")
+            raise errors.UsageError(f"{lone}: is for the picture; name it, too: {option} FILE.png")
         return
     if path.suffix.lower() != ".png":
-        raise errors.ConfigError(f"{option} {path}: expected a name that ends in .png")
-    if path.is_dir() or not path.parent.is_dir():
-        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
-        raise errors.ConfigError(f"{option} {path}: expected {expected}")
+        raise errors.UsageError(f"{option} {path}: expected a name that ends in .png")
+    input_paths.check_output(option, path)
     if size is not None and not SIZES[0] <= size <= SIZES[1]:
-        raise errors.ConfigError(f"--size {size}: expected {SIZES[0]} to {SIZES[1]} pixels")
+        raise errors.UsageError(f"--size {size}: expected {SIZES[0]} to {SIZES[1]} pixels")
 
 
 def _standpoint(

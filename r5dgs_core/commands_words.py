@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors, strict_json
+from . import commands, errors, input_paths, strict_json
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -26,6 +26,7 @@ def run_lookup(
     out: Path | None = None,
     captions: Path | None = None,
     words: Path | None = None,
+    threads: int | None = None,
     progress_kind: str = "none",
 ) -> Scene:
     """Make the lookup table of a scene file and write it into the file.
@@ -36,17 +37,20 @@ def run_lookup(
         out: Where to write instead of ``path``.
         captions: JSON by object id or name: a caption, or an object of ``name aliases caption``.
         words: Text file of words to store, one a line.
+        threads: Threads of the kernels; see `commands.use_threads`.
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
         The scene with its table.
     """
+    if out is not None:
+        input_paths.check_scene_output(out)
+    input_paths.check_scene(path)
     from .progress import make
     from .scene import scene_file
     from .semantics import encoders, lookup_table
 
-    if out is not None:
-        commands.check_scene_name(out)
+    commands.use_threads(threads)
     scene = scene_file.read(path)
     if captions is not None:
         scene = described(scene, _read_captions(captions), str(captions))
@@ -95,14 +99,15 @@ def run_query(
     Returns:
         The scene, and the matches, best first.
     """
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise errors.UsageError(f"--threshold {threshold}: expected a number from 0 to 1")
+    input_paths.check_scene(path)
     from .scene import lookup, scene_file
     from .semantics import query
 
     least = lookup.THRESHOLD if threshold is None else threshold
-    if not 0 <= least <= 1:
-        raise errors.ConfigError(f"--threshold {least}: expected a number from 0 to 1")
     if not lookup.wishes(text):
-        raise errors.ConfigError(f"query {text!r}: expected words for the objects to find, such as 'red mug'")
+        raise errors.UsageError(f"query {text!r}: expected words for the objects to find, such as 'red mug'")
     scene = scene_file.read(path)
     unknown = query.unknown(scene, text)
     opened = _encoder_for(scene, encoder, unknown, path)
@@ -148,10 +153,11 @@ def run_name(
     Returns:
         The scene as it was written.
     """
+    if name is None and not aliases and caption is None:
+        raise errors.UsageError("name: expected a new name, --alias WORD or --caption TEXT")
+    input_paths.check_scene(path)
     from .scene import scene_file
 
-    if name is None and not aliases and caption is None:
-        raise errors.ConfigError("name: expected a new name, --alias WORD or --caption TEXT")
     scene = scene_file.read(path)
     item = _object(scene, which, str(path))
     change: dict[str, Any] = {"aliases": [*item.aliases, *aliases]}

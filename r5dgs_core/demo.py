@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import errors, strict_json
+from . import commands, errors, strict_json
 
 NAME = "tabletop"
 
@@ -33,6 +33,7 @@ def run_demo(
     preset: str | None = None,
     resume: bool,
     overwrite: bool = False,
+    threads: int | None = None,
     progress_kind: str,
 ) -> dict[str, Any]:
     """Train, bake and measure the bundled data set.
@@ -43,6 +44,9 @@ def run_demo(
     Returns:
         The evaluation.
     """
+    began = time.monotonic()
+    data = bundled_data()
+    settings = commands.training_settings(out, config_path, overrides, preset=preset, resume=resume)
     from rich.console import Console
 
     from .data import dataset as datasets
@@ -51,9 +55,7 @@ def run_demo(
     from .scene import scene_file
     from .train import bake, checkpoint, run, stopping
 
-    began = time.monotonic()
-    data = bundled_data()
-    settings = run.settings(out, config_path, overrides, preset=preset, resume=resume)
+    commands.use_threads(threads)
     go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
         trained = run.train(

@@ -9,6 +9,10 @@ class ConfigError(R5dgsError):
     """A configuration key or value cannot be used."""
 
 
+class UsageError(ConfigError):
+    """Arguments are wrong, whatever the files hold: an unknown value, or options that contradict each other."""
+
+
 class DatasetError(R5dgsError):
     """A data set is incomplete or inconsistent."""
 

@@ -17,10 +17,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Which rooms of the core a room may import, itself and `GROUND` aside: motion <- scene <- (data, raster, model) <-
 # train; report stands on baked scenes, so it needs no trainer; the command line may use everything.
-GROUND = {"errors", "strict_json"}  # may be imported by all
+GROUND = {"errors", "input_paths", "strict_json"}  # may be imported by all
 ALLOWED = {
     "errors": set(),
     "strict_json": set(),
+    "input_paths": set(),
+    "exit_status": set(),
     "motion": set(),
     "scene": {"motion"},
     "data": {"motion", "scene"},
@@ -33,25 +35,32 @@ ALLOWED = {
     "serve_requests": {"scene", "raster"},
     "serve": {"motion", "scene", "model", "raster", "semantics", "serve_requests"},
     "progress": set(),
-    "demo": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
+    "demo": {"commands", "motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
     "bench": {"motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
     "commands": {
         *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
         "importing",
     },
+    "commands_bench": {"scene", "train", "bench", "commands"},
+    "commands_info": {"scene"},
     "commands_association": {"scene", "data", "semantics", "commands", "progress"},
     "commands_masks": {"scene", "data", "semantics", "progress"},
     "commands_objects": {"scene", "data", "semantics", "report", "commands", "commands_words"},
     "commands_words": {"scene", "semantics", "progress", "commands"},
+    "command_options": {"scene"},
+    "command_line": {"command_options", "scene", "bench"},
     "cli": {
+        "command_line",
+        "command_options",
         "commands",
+        "commands_bench",
+        "commands_info",
         "commands_association",
         "commands_masks",
         "commands_words",
         "commands_objects",
         "demo",
-        "bench",
-        "scene",
+        "exit_status",
     },
 }
 LIGHT = GROUND | {"motion", "scene"}

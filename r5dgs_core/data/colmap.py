@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, strict_json
+from .. import errors, input_paths, strict_json
 from ..scene import cameras
 from . import colmap_model, images, transforms
 from .colmap_model import Registered
@@ -63,14 +63,6 @@ class _Frame:
     t: float = 0.0
 
 
-def folder(root: Path) -> Path | None:
-    """The folder of the reconstruction in a data set, None where there is none."""
-    for candidate in (root / "sparse" / "0", root / "sparse"):
-        if any((candidate / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
-            return candidate
-    return None
-
-
 def read(root: Path) -> Found:
     """Read cameras, times and points of a data set.
 
@@ -81,7 +73,7 @@ def read(root: Path) -> Found:
     Raises:
         DatasetError: Something is missing or damaged; distorted lenses are not supported.
     """
-    sparse = folder(root)
+    sparse = input_paths.reconstruction(root)
     if sparse is None:
         raise errors.DatasetError(f"{root / 'sparse' / '0'}: expected a COLMAP reconstruction, found none")
     if not (root / IMAGES).is_dir():

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors
+from .. import errors, input_paths
 from ..scene import cameras
 from . import colmap, images, mask_notes, masks, transforms
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
@@ -150,16 +150,8 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         DatasetError: A file is missing or cannot be used; the message names it and says what to do.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise errors.DatasetError(
-            f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}"
-        )
-    path = root / "transforms_train.json"
-    reconstruction = None if path.exists() or colmap.folder(root) is None else colmap.read(root)
-    if not path.exists() and reconstruction is None:
-        lone = (root / "transforms.json").exists()
-        remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
-        raise errors.DatasetError(f"{path}: the file is missing; {remedy}")
+    input_paths.check_dataset(root)
+    reconstruction = None if (root / input_paths.CAMERAS_FILE).exists() else colmap.read(root)
     entries: dict[str, list[transforms.Entry]] = {}
     header: dict[str, Any] = {}
     hasher = hashlib.sha256()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .. import input_paths
 from ..errors import CheckpointError
 
 KINDS = ("3dgs", "gaussian_grouping", "deformable_3dgs", "trace", "freegave")
@@ -77,9 +78,7 @@ def open_run(folder: Path, iteration: int | None = None) -> RunFolder:
         CheckpointError: It is none of the known layouts, or lacks the iteration.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise CheckpointError(f"{folder}: expected a run folder, found {found}")
+    input_paths.check_foreign_run(folder)
     if not (folder / "point_cloud").is_dir():
         remedy = ""
         for parent in folder.absolute().parents[:3]:

@@ -14,9 +14,9 @@ import numpy as np
 from ..motion import keyframes, models, poses, propagation, rotations, se3
 from ..motion.models import STATIC, MotionModel
 from . import visibility
+from .modes import SOURCES
 from .scene import MotionGroup, Scene
 
-SOURCES = ("fitted", "representative", "median", "least_squares", "kabsch")
 HORIZON = 1 / 3  # of the observed span: how far past t_max members of "kabsch" are followed
 _FUTURES = 6  # times within it
 _ROUNDS = 6  # of reweighting

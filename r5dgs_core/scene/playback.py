@@ -27,6 +27,7 @@ from ..motion import columns, rotations
 from ..motion.keyframes import slopes
 from . import group_dynamics, posing
 from .group_dynamics import knots
+from .modes import MODES, VARIANTS, every, split
 from .posing import move_points, rest_factors, runs, turn_quats
 from .residuals import Literal, OwnMotion, Residuals, unexplained
 from .scene import Scene
@@ -35,14 +36,6 @@ __all__ = (
     "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
     "modes", "move_points", "pose", "rest_factors", "runs", "sh_rotations", "slopes", "split", "turn_quats",
 )  # fmt: skip
-
-MODES = ("rigid", "hybrid", "standard", "rigid_paper")
-VARIANTS: dict[str, tuple[str, ...]] = {
-    "rigid": group_dynamics.SOURCES,
-    "hybrid": group_dynamics.SOURCES,
-    "standard": (),
-    "rigid_paper": ("pinned", "anchored"),
-}
 
 
 @dataclass(frozen=True)
@@ -83,27 +76,6 @@ class Frame:
     origin: np.ndarray
     turned_rows: np.ndarray | None = None
     turned_quats: np.ndarray | None = None
-
-
-def split(mode: str) -> tuple[str, str]:
-    """Base and variant of a mode; the variant is the first one where none is given, "" where there are none.
-
-    Raises:
-        ValueError: There is no such mode.
-    """
-    base, slash, variant = mode.partition("/") if isinstance(mode, str) else ("", "", "")
-    if base not in MODES:
-        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
-    variants = VARIANTS[base]
-    if slash and variant not in variants:
-        known = ", ".join(f"{base}/{name}" for name in variants) or base
-        raise ValueError(f"mode: expected one of {known}, got {mode!r}")
-    return base, variant or next(iter(variants), "")
-
-
-def every() -> tuple[str, ...]:
-    """All modes, each once, the first variant of a base by the base's name."""
-    return tuple(mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:])))
 
 
 def modes(scene: Scene) -> tuple[str, ...]:

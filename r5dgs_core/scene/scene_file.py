@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors
+from .. import errors, input_paths
 from . import features, files, meanings, playback, scene_json, validation
 from .scene import Scene
 
@@ -155,11 +155,7 @@ def read_meanings(path: str | Path) -> meanings.Meanings | None:
 
 def _open(path: Path) -> zipfile.ZipFile:
     try:
-        if not path.is_file():
-            found = "a folder; 'r5dgs train' makes a scene from a folder of images" if path.is_dir() else None
-            raise errors.SceneFileError(
-                f"{path}: expected a .r5dgs file, found {found or 'nothing; look for its new place, or bake it again'}"
-            )
+        input_paths.check_scene(path)
         return zipfile.ZipFile(path)
     except PermissionError as error:
         raise errors.SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..data import dataset as datasets
 from ..data.dataset import Dataset
-from ..errors import CheckpointError, ConfigError
+from ..errors import CheckpointError
 from ..model import spherical_harmonics
 from ..motion import fitting, gravity, rotations, top
 from ..motion.models import MotionModel
@@ -36,6 +36,7 @@ from . import (
     representation,
     track_checks,
 )
+from . import config as configs
 from . import shading as shading_vectors
 from .normalization import Normalization
 from .sections import NeedsSection
@@ -425,9 +426,7 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
     from ..scene import scene_file
 
     run = checkpoint.open_run(folder)
-    for text in overrides:
-        if not text.strip().startswith("needs."):
-            raise ConfigError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
+    configs.require_needs(overrides)
     run = dataclasses.replace(run, config=run.config.override(overrides))
     dataset = datasets.read(run.data(dataset_root), run.config.data.masks)
     if dataset.digest != run.digest:

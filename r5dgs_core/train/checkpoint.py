@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import __version__, strict_json
+from .. import __version__, input_paths, strict_json
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model.gaussians import PARAMETERS
@@ -28,7 +28,12 @@ from . import config as configs
 from .config import Config
 
 FORMAT_VERSION = 1
-RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = "run.json", "checkpoint.pt", "log.jsonl", "evaluation.json"
+RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = (
+    input_paths.RUN_FILE,
+    "checkpoint.pt",
+    "log.jsonl",
+    "evaluation.json",
+)
 CURVES_FILE = "learning_curves.png"
 RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: what a body gains cannot always be said
 
@@ -176,8 +181,7 @@ def open_run(folder: Path) -> Run:
         CheckpointError: There is none, or it is damaged or of another version.
     """
     path = Path(folder) / RUN_FILE
-    if not path.is_file():
-        raise CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'")
+    input_paths.check_run(Path(folder))
     text = strict_json.read(path, CheckpointError, "train again with --overwrite")
     try:
         found, made_by = text["format_version"], text["versions"]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from ..errors import ConfigError
+from ..errors import ConfigError, UsageError
 from .presets import PRESETS
 from .sections import (
     BACKGROUNDS,
@@ -71,7 +71,7 @@ class Config:
 
     def override(self, overrides: Sequence[str]) -> Config:
         """A copy with ``section.key=value`` overrides applied, as of ``--set``."""
-        return self.replace(**dict(_parse_override(text) for text in overrides))
+        return self.replace(**_parsed(overrides))
 
 
 def from_dict(values: dict[str, Any]) -> Config:
@@ -80,6 +80,13 @@ def from_dict(values: dict[str, Any]) -> Config:
     Raises:
         ConfigError: A section or key is unknown (the nearest name is suggested), or a value is of the wrong type.
     """
+    config = _built(values)
+    _validate(config)
+    return config
+
+
+def _built(values: dict[str, Any]) -> Config:
+    """A configuration whose single keys are checked, but not how they go together."""
     sections = {f.name: f for f in dataclasses.fields(Config)}
     hints = get_type_hints(Config)
     built: dict[str, Any] = {}
@@ -95,9 +102,15 @@ def from_dict(values: dict[str, Any]) -> Config:
             if key not in known:
                 raise ConfigError(f"{section}.{key}: unknown key{_suggest(key, known)}")
         built[section] = kind(**{key: _check(f"{section}.{key}", value, types[key]) for key, value in keys.items()})
-    config = Config(**built)
-    _validate(config)
-    return config
+    return Config(**built)
+
+
+def require_needs(overrides: Sequence[str]) -> None:
+    """Raise `UsageError` if ``--set`` of a finished run names something else than a need."""
+    for text in overrides:
+        if not text.strip().startswith("needs."):
+            raise UsageError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
+    _parsed(overrides)
 
 
 def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = None) -> Config:
@@ -112,7 +125,7 @@ def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = 
         ConfigError: The file is missing or not TOML, the preset is unknown, or a key or value cannot be used.
     """
     if preset is not None and preset not in PRESETS:
-        raise ConfigError(f"--preset {preset}: unknown preset{_suggest(preset, PRESETS)}")
+        raise UsageError(f"--preset {preset}: unknown preset{_suggest(preset, PRESETS)}")
     values: dict[str, Any] = {}
     if path is not None:
         try:
@@ -125,7 +138,20 @@ def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = 
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
     if preset is not None:
         values = _merge_under(values, PRESETS[preset])
-    return from_dict(_merge(values, dict(_parse_override(text) for text in overrides)))
+    return from_dict(_merge(values, _parsed(overrides)))
+
+
+def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
+    """Values by ``section.key``. Raises `UsageError` if no configuration can hold one of them."""
+    found: dict[str, Any] = {}
+    for text in overrides:
+        name, value = _parse_override(text)
+        try:
+            _built(_merge({}, {name: value}))
+        except ConfigError as error:
+            raise UsageError(f"--set {error}") from None
+        found[name] = value
+    return found
 
 
 def _merge_under(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -142,7 +168,7 @@ def _merge_under(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, A
 def _parse_override(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
     if not separator or name.count(".") != 1:
-        raise ConfigError(f"--set {text}: expected SECTION.KEY=VALUE, for example losses.ssim=0.1")
+        raise UsageError(f"--set {text}: expected SECTION.KEY=VALUE, for example losses.ssim=0.1")
     try:
         return name.strip(), tomllib.loads(f"x = {value}")["x"]
     except tomllib.TOMLDecodeError:
@@ -171,11 +197,14 @@ def _check(name: str, value: Any, kind: type) -> Any:
         raise ConfigError(f"{name}: expected {kind.__name__}, got {value!r}")
     if kind in (int, float) and not 0 <= value < math.inf:
         raise ConfigError(f"{name}: expected a finite number that is not negative, got {value!r}")
+    good, expected = _RULES.get(name, (None, ""))
+    if good is not None and not good(value):
+        raise ConfigError(f"{name}: expected {expected}, got {value!r}")
     return value
 
 
 def _validate(config: Config) -> None:
-    """Raise ConfigError naming the first key whose value no run can use."""
+    """Raise `ConfigError` naming the first keys whose values exclude each other."""
     if config.train.representation == "field" and config.needs.rotation == "off":
         raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
     everything = config.train.representation == "field" and config.field.movers in ("all", "measured")
@@ -184,11 +213,6 @@ def _validate(config: Config) -> None:
             "init.placement: random places nothing on objects, so it needs train.representation='field', "
             "field.movers='all' or 'measured', and field.tracks_share=0"
         )
-    for name, good, expected in _RULES:
-        section, key = name.split(".")
-        value = getattr(getattr(config, section), key)
-        if not good(value):
-            raise ConfigError(f"{name}: expected {expected}, got {value!r}")
     for need, name in _CONTRADICTED.items():
         section, key = name.split(".")
         if getattr(config.needs, need) == "on" and not getattr(getattr(config, section), key):
@@ -214,63 +238,63 @@ _SHARE: tuple[Callable[[Any], bool], str] = (lambda value: 0 <= value <= 1, "0 t
 _POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more than 0")
 _INSIDE: tuple[Callable[[Any], bool], str] = (lambda value: 0 < value < 1, "between 0 and 1")
 # What a value must be beyond its type; all numbers are finite and not negative (`_check`).
-_RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    ("train.iterations", *_AT_LEAST_1),
-    ("train.seed", lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
-    ("train.representation", lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
-    ("field.variant", lambda value: value in VARIANTS, " or ".join(VARIANTS)),
-    ("field.size", lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),
-    ("field.movers", lambda value: value in MOVERS, " or ".join(MOVERS)),
-    ("field.gate", *_SHARE),
-    ("field.trd_share", *_SHARE),
-    ("field.trd_every", *_SHARE),
-    ("field.tracks_share", lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
-    ("field.chunk", *_AT_LEAST_1),
-    ("losses.rigid_start", *_SHARE),
-    ("identity.training", lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),
-    ("identity.every", *_AT_LEAST_1),
-    ("identity.regularise_every", *_AT_LEAST_1),
-    ("identity.neighbours", *_AT_LEAST_1),
-    ("identity.include_self", lambda value: value in INCLUDE_SELF, " or ".join(INCLUDE_SELF)),
-    ("identity.samples", *_AT_LEAST_1),
-    ("rates.decay_networks", lambda value: 0 < value <= 1, "more than 0, at most 1"),
-    ("train.background", lambda value: value in BACKGROUNDS, " or ".join(BACKGROUNDS)),
-    ("train.sh_degree", lambda value: value <= 3, "0 to 3"),
-    ("train.threads", *_AT_LEAST_1),
-    ("train.checkpoint_every", *_AT_LEAST_1),
-    ("train.log_every", *_AT_LEAST_1),
-    ("train.probe_views", *_AT_LEAST_1),
-    ("init.object_points", *_AT_LEAST_1),
-    ("init.background_points", *_AT_LEAST_1),
-    ("init.sweep_depths", lambda value: value >= 2, "at least 2"),
-    ("init.opacity", *_INSIDE),
-    ("init.min_mask_pixels", lambda value: value < 1, "less than 1"),
-    ("rates.decay", lambda value: 0 < value <= 1, "more than 0, at most 1"),
-    ("rates.decay_floor_appearance", *_SHARE),
-    ("rates.decay_from", *_SHARE),
-    ("losses.ssim", *_SHARE),
-    ("curriculum.start", lambda value: value in CURRICULA, " or ".join(CURRICULA)),
-    ("curriculum.newest", *_SHARE),
-    ("init.placement", lambda value: value in PLACEMENTS, " or ".join(PLACEMENTS)),
-    ("densify.strategy", lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
-    ("discovery.gate", *_SHARE),
-    ("discovery.fewest", *_AT_LEAST_1),
-    ("residual.start", *_SHARE),
-    ("residual.trial_steps", *_AT_LEAST_1),
-    ("residual.nodes", *_AT_LEAST_1),
-    ("densify.stop", *_SHARE),
-    ("densify.every", *_AT_LEAST_1),
-    ("densify.share", *_SHARE),
-    ("densify.prune_opacity", lambda value: value < 1, "less than 1"),
-    ("densify.prune_width", *_POSITIVE),
-    ("densify_default.stop", *_SHARE),
-    ("densify_default.every", *_AT_LEAST_1),
-    ("densify_default.prune_opacity", lambda value: value < 1, "less than 1"),
-    ("densify_default.prune_radius", *_POSITIVE),
-    ("densify_default.prune_extent", *_POSITIVE),
-    ("densify_default.reset_opacity", *_INSIDE),
-    ("densify_mcmc.stop", *_SHARE),
-    ("densify_mcmc.every", *_AT_LEAST_1),
-    ("densify_mcmc.dead_opacity", *_INSIDE),
-    *((f"needs.{name}", lambda value: value in NEEDS, " or ".join(NEEDS)) for name in get_type_hints(NeedsSection)),
-)
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "train.iterations": _AT_LEAST_1,
+    "train.seed": (lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
+    "train.representation": (lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),
+    "field.variant": (lambda value: value in VARIANTS, " or ".join(VARIANTS)),
+    "field.size": (lambda value: value in FIELD_SIZES, " or ".join(FIELD_SIZES)),
+    "field.movers": (lambda value: value in MOVERS, " or ".join(MOVERS)),
+    "field.gate": _SHARE,
+    "field.trd_share": _SHARE,
+    "field.trd_every": _SHARE,
+    "field.tracks_share": (lambda value: 0 <= value < 1, "0 to less than 1, as the rest of the run is the field's"),
+    "field.chunk": _AT_LEAST_1,
+    "losses.rigid_start": _SHARE,
+    "identity.training": (lambda value: value in IDENTITY_TRAINING, " or ".join(IDENTITY_TRAINING)),
+    "identity.every": _AT_LEAST_1,
+    "identity.regularise_every": _AT_LEAST_1,
+    "identity.neighbours": _AT_LEAST_1,
+    "identity.include_self": (lambda value: value in INCLUDE_SELF, " or ".join(INCLUDE_SELF)),
+    "identity.samples": _AT_LEAST_1,
+    "rates.decay_networks": (lambda value: 0 < value <= 1, "more than 0, at most 1"),
+    "train.background": (lambda value: value in BACKGROUNDS, " or ".join(BACKGROUNDS)),
+    "train.sh_degree": (lambda value: value <= 3, "0 to 3"),
+    "train.threads": _AT_LEAST_1,
+    "train.checkpoint_every": _AT_LEAST_1,
+    "train.log_every": _AT_LEAST_1,
+    "train.probe_views": _AT_LEAST_1,
+    "init.object_points": _AT_LEAST_1,
+    "init.background_points": _AT_LEAST_1,
+    "init.sweep_depths": (lambda value: value >= 2, "at least 2"),
+    "init.opacity": _INSIDE,
+    "init.min_mask_pixels": (lambda value: value < 1, "less than 1"),
+    "rates.decay": (lambda value: 0 < value <= 1, "more than 0, at most 1"),
+    "rates.decay_floor_appearance": _SHARE,
+    "rates.decay_from": _SHARE,
+    "losses.ssim": _SHARE,
+    "curriculum.start": (lambda value: value in CURRICULA, " or ".join(CURRICULA)),
+    "curriculum.newest": _SHARE,
+    "init.placement": (lambda value: value in PLACEMENTS, " or ".join(PLACEMENTS)),
+    "densify.strategy": (lambda value: value in STRATEGIES, " or ".join(STRATEGIES)),
+    "discovery.gate": _SHARE,
+    "discovery.fewest": _AT_LEAST_1,
+    "residual.start": _SHARE,
+    "residual.trial_steps": _AT_LEAST_1,
+    "residual.nodes": _AT_LEAST_1,
+    "densify.stop": _SHARE,
+    "densify.every": _AT_LEAST_1,
+    "densify.share": _SHARE,
+    "densify.prune_opacity": (lambda value: value < 1, "less than 1"),
+    "densify.prune_width": _POSITIVE,
+    "densify_default.stop": _SHARE,
+    "densify_default.every": _AT_LEAST_1,
+    "densify_default.prune_opacity": (lambda value: value < 1, "less than 1"),
+    "densify_default.prune_radius": _POSITIVE,
+    "densify_default.prune_extent": _POSITIVE,
+    "densify_default.reset_opacity": _INSIDE,
+    "densify_mcmc.stop": _SHARE,
+    "densify_mcmc.every": _AT_LEAST_1,
+    "densify_mcmc.dead_opacity": _INSIDE,
+    **{f"needs.{key}": (lambda value: value in NEEDS, " or ".join(NEEDS)) for key in get_type_hints(NeedsSection)},
+}

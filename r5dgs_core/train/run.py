@@ -7,7 +7,7 @@ import json
 import logging
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,11 +15,10 @@ import numpy as np
 import torch
 
 from ..data import dataset as datasets
-from ..errors import CheckpointError, ConfigError, Interrupted, TrainingError
+from ..errors import CheckpointError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
 from . import checkpoint, curves, identity, label_hygiene, mask_stack, needs, probing, representation, stopping
-from . import config as configs
 from .config import Config
 from .posing import Splats
 from .trainer import Trainer
@@ -28,21 +27,6 @@ from .views import TrainView
 log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
-
-
-def settings(
-    folder: Path, config_path: Path | None, overrides: Sequence[str], *, preset: str | None = None, resume: bool
-) -> Config:
-    """Configuration for `train`: preset, file and overrides, which a run that is resumed does not take.
-
-    Raises:
-        ConfigError: Something cannot be used, or is given for a run that has its own configuration.
-    """
-    if resume and (config_path or overrides or preset) and (Path(folder) / checkpoint.RUN_FILE).exists():
-        raise ConfigError(
-            "--resume goes on with the run's own configuration; leave out --preset, --config, --set and --max-gaussians"
-        )
-    return configs.load(config_path, tuple(overrides), preset)
 
 
 def train(

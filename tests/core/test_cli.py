@@ -1,7 +1,10 @@
-"""The command line: the way from images to a table, and one line on stderr for what the user can mend."""
+"""The command line: from images to a table, exit statuses, and one line on stderr per error."""
 
+import argparse
 import contextlib
 import json
+import os
+import re
 import shlex
 import shutil
 import signal
@@ -11,13 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core import __version__, cli, commands, demo, progress
+from r5dgs_core import __version__, cli, command_line, commands, demo, errors, progress
 from r5dgs_core.bench import variants
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.exit_status import ExitStatus
+from r5dgs_core.raster import compile as compilation
 from r5dgs_core.report import evaluate
-from r5dgs_core.scene import files, scene_file
+from r5dgs_core.scene import files, modes, scene_file
 from r5dgs_core.train import checkpoint, presets
 from tests import datasets as tiny_datasets
+from tests.command_line import complaint
 
 OPTIONS = [
     text
@@ -26,12 +32,10 @@ OPTIONS = [
 ]
 
 
-def complaint(capsys, *arguments):
-    """The one line that a failing command prints."""
-    assert cli.main([str(a) for a in arguments]) == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("r5dgs: ")
-    return lines[0]
+def sub_parsers():
+    """The parser of each sub-command, by name."""
+    (found,) = [a.choices for a in command_line.parser()._actions if isinstance(a, argparse._SubParsersAction)]
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +92,7 @@ def test_missing_things_are_one_line(tmp_path, tiny, made, capsys):
     assert "not a run folder" in complaint(capsys, "bake", nowhere, "--out", tmp_path / "x.r5dgs")
     assert str(nowhere) in complaint(capsys, "info", nowhere)
     assert str(nowhere) in complaint(capsys, "evaluate", nowhere, "--data", tiny.root)
-    assert "--data DIR" in complaint(capsys, "evaluate", made[1])
+    assert "--data DIR" in complaint(capsys, "evaluate", made[1], status=ExitStatus.USAGE)
     assert not (tmp_path / "run").exists() and not (tmp_path / "x.r5dgs").exists()
 
 
@@ -107,12 +111,13 @@ def test_a_folder_that_is_not_ours_is_left_alone(tmp_path, tiny, capsys):
     ],
 )
 def test_a_wrong_override_is_named_before_anything_is_made(tmp_path, tiny, capsys, override, words):
-    assert words in complaint(capsys, "train", tiny.root, "--out", tmp_path / "run", "--set", override)
+    given = ("train", tiny.root, "--out", tmp_path / "run", "--set", override)
+    assert words in complaint(capsys, *given, status=ExitStatus.USAGE)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_resumed_run_keeps_its_own_configuration(made, tiny, capsys):
-    line = complaint(capsys, "train", tiny.root, "--out", made[0], "--resume", "--set", "train.seed=1")
+    line = complaint(capsys, "train", tiny.root, "--out", made[0], "--resume", "--seed", "1", status=ExitStatus.USAGE)
     assert "--resume" in line
     assert cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
 
@@ -123,22 +128,23 @@ def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     kept = checkpoint.load(run)
     assert len(kept.tensors["gaussians.means"]) <= 120 and kept.iteration == 20  # --set wins over the preset
     assert checkpoint.open_run(run).config.densify.max_gaussians == 120
-    line = complaint(capsys, "train", tiny.root, "--out", tmp_path / "no", "--max-gaussians", "many")
-    assert "densify.max_gaussians: expected int, got 'many'" in line
-    assert "--preset slow: unknown preset" in complaint(
-        capsys, "train", tiny.root, "--out", tmp_path / "no", "--preset", "slow"
-    )
+    fresh = ("train", tiny.root, "--out", tmp_path / "no")
+    line = complaint(capsys, *fresh, "--max-gaussians", "many", status=ExitStatus.USAGE)
+    assert "--max-gaussians: expected an integer of at least 0, got 'many'" in line
+    assert "--preset slow: unknown preset" in complaint(capsys, *fresh, "--preset", "slow", status=ExitStatus.USAGE)
 
 
 def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
     bare = tmp_path / "bare.r5dgs"
     assert cli.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
     assert scene_file.read(bare).identities is None and scene_file.read(made[1]).identities is not None
-    assert "bake takes needs" in complaint(capsys, "bake", made[0], "--out", bare, "--set", "train.seed=1")
+    wrong = ("bake", made[0], "--out", bare, "--set", "train.seed=1")
+    assert "bake takes needs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
 
 
 def test_an_unknown_mode_is_an_error_that_names_the_known_ones(made, capsys):
-    assert "rigid" in complaint(capsys, "evaluate", made[0], "--mode", "wobbly")
+    line = complaint(capsys, "evaluate", made[0], "--mode", "wobbly", status=ExitStatus.USAGE)
+    assert "expected one of rigid, rigid/representative" in line
 
 
 def test_a_target_folder_that_does_not_exist_is_an_error_for_bake(made, tmp_path, capsys):
@@ -153,17 +159,6 @@ def test_wrong_usage_is_status_2(capsys):
     assert "usage: r5dgs" in capsys.readouterr().err
 
 
-def test_help_and_version_need_no_torch():
-    code = (
-        "import sys; from r5dgs_core import cli\n"
-        "try: cli.main(['--version'])\n"
-        "except SystemExit: pass\n"
-        "print('torch' in sys.modules or 'numba' in sys.modules)"
-    )
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert shown.splitlines() == [f"r5dgs {__version__}", "False"]
-
-
 def test_help_of_bench_names_every_variant(capsys):
     with pytest.raises(SystemExit):
         cli.main(["bench", "--help"])
@@ -173,9 +168,8 @@ def test_help_of_bench_names_every_variant(capsys):
 
 
 def test_the_module_of_the_command_line_names_every_command():
-    (commands,) = [action.choices for action in cli.parser()._actions if isinstance(action.choices, dict)]
     named = " ".join(cli.__doc__.split("\n\n")[0].split()).partition(": ")[2].rstrip(".").split(", ")
-    assert sorted(named) == sorted(commands)
+    assert sorted(named) == sorted(sub_parsers()) == sorted(cli._RUN)
 
 
 def test_the_bundled_data_is_found_and_small():
@@ -227,7 +221,7 @@ def test_the_table_is_shown_even_where_the_file_cannot_be_written(made, tmp_path
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files, "write", full_disk)
-    assert cli.main(["evaluate", str(made[0])]) == 1
+    assert cli.main(["evaluate", str(made[0])]) == ExitStatus.ERROR
     shown = capsys.readouterr()
     assert "PSNR" in shown.out and "No space left" in shown.err and str(made[0] / "evaluation.json") in shown.err
 
@@ -267,7 +261,8 @@ def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made,
         kinds = list(dict.fromkeys(event["event"] for event in events))
         assert kinds == ["start", "prepare", "step", "identity", "trained", "bake", "evaluate", "sheet", "written"]
         assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
-    assert "leave out --preset, --config, --set and" in complaint(capsys, *small_demo, "--out", out, "--resume")
+    line = complaint(capsys, *small_demo, "--out", out, "--resume", status=ExitStatus.USAGE)
+    assert "leave out --preset, --config, --set, --iterations" in line
     monkeypatch.setattr(demo, "NAME", "another data set")
     line = complaint(capsys, *small_demo, "--out", made[0])
     assert "add --resume to go on, or --overwrite" in line
@@ -291,8 +286,9 @@ def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, cap
 
 
 def test_a_scene_goes_into_a_file_that_blender_finds(made, tmp_path, capsys):
-    for out, words in ((tmp_path, "is a folder"), (tmp_path / "scene.zip", ".r5dgs")):
-        assert words in complaint(capsys, "bake", made[0], "--out", out)
+    assert "is a folder" in complaint(capsys, "bake", made[0], "--out", tmp_path)
+    wrong = ("bake", made[0], "--out", tmp_path / "scene.zip")
+    assert ".r5dgs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
 
 
 def test_a_data_set_that_has_moved_is_asked_for(made, tmp_path, capsys):
@@ -311,7 +307,7 @@ def test_a_reader_that_goes_away_is_no_traceback(made):
 
 def test_the_help_of_train_names_every_preset(capsys):
     with pytest.raises(SystemExit):
-        cli.parser().parse_args(["train", "--help"])
+        command_line.parser().parse_args(["train", "--help"])
     text = capsys.readouterr().out
     assert all(f"{name} " in text or f"{name}\n" in text for name in presets.PRESETS)
 
@@ -326,5 +322,138 @@ def test_the_help_of_train_names_every_preset(capsys):
     ],
 )
 def test_a_report_refuses_what_it_would_not_heed(given, said, capsys):
-    assert cli.main(["report", *given]) == 1
-    assert said in capsys.readouterr().err
+    assert said in complaint(capsys, "report", *given, status=ExitStatus.USAGE)
+
+
+@pytest.mark.parametrize("name", sub_parsers())
+def test_every_help_has_a_description_an_example_and_a_page_that_exists(name, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([name, "--help"])
+    shown = capsys.readouterr().out
+    assert stop.value.code == 0 and len(sub_parsers()[name].description) > 30
+    assert f"example:\n  r5dgs {name}" in shown
+    page = shown.rpartition("read more: ")[2].strip()
+    assert (Path(cli.__file__).parents[1] / page).is_file()
+    if re.search(r"--modes? MODE", shown):
+        flat = "".join(shown.split())
+        assert all(mode in flat for mode in modes.every())
+
+
+@pytest.mark.parametrize("name", sub_parsers())
+def test_the_example_of_every_help_can_be_parsed(name):
+    lines = sub_parsers()[name].epilog.partition("example:\n")[2].partition("\n\n")[0].splitlines()
+    for line in lines:
+        program, *arguments = shlex.split(line)
+        assert program == "r5dgs" and command_line.parser().parse_args(arguments).command == name
+
+
+NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, for every command that can be given some
+    ["train", "nowhere", "--out", "run"],
+    ["train", "nowhere", "--out", "run", "--iterations", "0"],
+    ["train", "nowhere", "--out", "run", "--set", "losses.sim=1"],
+    ["train", ".", "--out", "run", "--threads", "2"],
+    ["demo", "--preset", "slow"],
+    ["demo", "--config", "nowhere.toml"],
+    ["masks", "nowhere"],
+    ["masks", "nowhere", "--backend", "sam3"],
+    ["associate", "nowhere"],
+    ["bake", "nowhere", "--out", "x.r5dgs"],
+    ["bake", ".", "--out", "x.r5dgs"],
+    ["bake", ".", "--out", "x.zip"],
+    ["import", "nowhere", "--out", "x.r5dgs"],
+    ["import", "nowhere", "--out", "x.r5dgs", "--world", "maya"],
+    ["evaluate", "nowhere"],
+    ["evaluate", "nowhere", "--mode", "wobbly"],
+    ["evaluate", "nowhere", "--threads", "0"],
+    ["report", "nowhere", "--out", "report"],
+    ["report", "nowhere", "--out", "report", "--tasks", "poise"],
+    ["report", "nowhere", "--out", "report", "--splits", "tset"],
+    ["report", "nowhere", "--out", "report", "--repeats", "0"],
+    ["report", "--stability", "--json", "nowhere/rows.json"],
+    ["report"],
+    ["bench", "nowhere", "--out", "tables"],
+    ["bench", "nowhere", "--out", "tables", "--variants", "best"],
+    ["info", "nowhere"],
+    ["objects", "nowhere"],
+    ["objects", "nowhere", "--legend", "legend.jpg"],
+    ["lookup", "nowhere", "--encoder", "text"],
+    ["query", "nowhere", "mug"],
+    ["query", "nowhere", "mug", "--threshold", "2"],
+    ["name", "nowhere", "1", "mug"],
+    ["name", "nowhere", "1"],
+    ["warm-up", "now"],
+    ["train", "--help"],
+    ["--help"],
+    ["--version"],
+    ["fly"],
+]
+
+
+def test_wrong_arguments_and_paths_are_reported_before_any_large_import(tmp_path):
+    code = """
+import json, os, sys
+from r5dgs_core import cli
+for arguments in json.loads(sys.argv[1]):
+    try:
+        status = cli.main(arguments)
+    except SystemExit as stop:
+        status = stop.code
+    heavy = sorted({"torch", "numba", "scipy", "matplotlib", "numpy", "rich"} & set(sys.modules))
+    print(json.dumps([arguments, status, heavy, os.listdir()]), file=sys.__stdout__)
+"""
+    settings = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(NOWHERE)], capture_output=True, text=True, cwd=tmp_path, env=settings
+    )
+    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[[")]
+    assert [row[0] for row in rows] == NOWHERE, done.stderr
+    for arguments, status, heavy, made in rows:
+        shown = {"--help", "--version"} & set(arguments)
+        assert status == 0 if shown else status in (ExitStatus.USAGE, ExitStatus.ERROR), (arguments, status)
+        assert heavy == [] and made == [], arguments
+    assert {row[0][0] for row in rows} >= set(sub_parsers())
+    assert "Traceback" not in done.stderr and f"r5dgs {__version__}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (errors.UsageError("x"), 2),
+        (errors.ConfigError("x"), 3),
+        (errors.SceneFileError("x"), 3),
+        (errors.Interrupted("x"), 130),
+        (KeyboardInterrupt(), 130),
+        (ZeroDivisionError("x"), 70),
+    ],
+)
+def test_every_kind_of_error_has_its_status(monkeypatch, capsys, error, status):
+    def fail(args):
+        raise error
+
+    monkeypatch.setitem(cli._RUN, "info", fail)
+    assert cli.main(["info", "x.r5dgs"]) == status
+    shown = capsys.readouterr().err
+    assert ("Traceback" in shown) == (status == 70) and ("usage: r5dgs info" in shown) == (status == 2)
+
+
+def test_a_query_that_finds_nothing_is_status_1(made, capsys):
+    assert cli.main(["query", str(made[1]), "brick"]) == 0
+    assert cli.main(["query", str(made[1]), "elephant"]) == 1
+    assert cli.main(["query", str(made[1]), "elephant", "--json"]) == 1
+    assert "nothing" in capsys.readouterr().out
+
+
+def test_steps_and_seed_reach_the_run_and_threads_leave_its_bits(tiny, tmp_path):
+    states, before = [], compilation.threads()
+    try:
+        for threads in (1, 2):
+            folder = tmp_path / str(threads)
+            given = ["--iterations", "4", "--seed", "7", "--threads", str(threads), "--progress", "none"]
+            assert cli.main(["train", str(tiny.root), "--out", str(folder), *OPTIONS, *given]) == 0
+            assert compilation.threads() == threads
+            states.append(checkpoint.load(folder))
+    finally:
+        compilation.set_threads(before)
+    settled = checkpoint.open_run(folder).config.train
+    assert (settled.iterations, settled.seed, states[0].iteration) == (4, 7, 4)
+    assert all((states[0].tensors[name] == tensor).all() for name, tensor in states[1].tensors.items())

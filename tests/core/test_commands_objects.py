@@ -9,8 +9,10 @@ import pytest
 from r5dgs_core import cli, commands_objects
 from r5dgs_core.data import images
 from r5dgs_core.errors import ConfigError
+from r5dgs_core.exit_status import ExitStatus
 from r5dgs_core.scene import scene_file
 from tests import scenes
+from tests.command_line import complaint
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +24,6 @@ def path(tmp_path_factory):
 def said(capsys, *arguments):
     assert cli.main([str(a) for a in arguments]) == 0
     return capsys.readouterr().out
-
-
-def complaint(capsys, *arguments):
-    """The one line that a failing command prints."""
-    assert cli.main([str(a) for a in arguments]) == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("r5dgs: ")
-    return lines[0]
 
 
 def test_objects_tell_the_same_to_people_and_programs(path, capsys):
@@ -90,30 +84,33 @@ def test_an_object_moves_in_its_pictures_and_goes_on_past_t_max(path, tmp_path):
 
 
 def test_nothing_found_is_no_picture(path, capsys, tmp_path):
-    assert "nothing matches" in said(capsys, "query", path, "elephant", "--render", tmp_path / "none.png")
+    assert cli.main(["query", str(path), "elephant", "--render", str(tmp_path / "none.png")]) == ExitStatus.NEGATIVE
+    assert "nothing matches" in capsys.readouterr().out
     assert not (tmp_path / "none.png").exists()
 
 
 def test_what_no_picture_can_be_made_of_is_refused_before_the_work(path, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(scene_file, "read", lambda *_: pytest.fail("work began"))
     for option, command in (("--legend", ["objects", path]), ("--render", ["query", path, "mug"])):
-        assert "ends in .png" in complaint(capsys, *command, option, tmp_path / "x.jpg")
+        assert "ends in .png" in complaint(capsys, *command, option, tmp_path / "x.jpg", status=ExitStatus.USAGE)
         assert "make it first" in complaint(capsys, *command, option, tmp_path / "no" / "x.png")
         (tmp_path / "folder.png").mkdir(exist_ok=True)
         assert "expected a file" in complaint(capsys, *command, option, tmp_path / "folder.png")
-        assert "16 to 8192" in complaint(capsys, *command, option, tmp_path / "x.png", "--size", 5)
+        small = (*command, option, tmp_path / "x.png", "--size", 5)
+        assert "16 to 8192" in complaint(capsys, *small, status=ExitStatus.USAGE)
         for lone in (["--camera", "1"], ["--time", "1"], ["--size", "64"]):
-            assert f"{option} FILE.png" in complaint(capsys, *command, *lone)
-    assert "--render FILE.png" in complaint(capsys, "query", path, "mug", "--context")
+            assert f"{option} FILE.png" in complaint(capsys, *command, *lone, status=ExitStatus.USAGE)
+    assert "--render FILE.png" in complaint(capsys, "query", path, "mug", "--context", status=ExitStatus.USAGE)
     for command in (["objects", path], ["query", path, "mug"]):
-        assert "--mode wild: expected one of" in complaint(capsys, *command, "--mode", "wild")
+        assert "--mode wild: expected one of" in complaint(capsys, *command, "--mode", "wild", status=ExitStatus.USAGE)
 
 
 def test_a_camera_mode_or_time_that_is_not_there_is_named(path, capsys, tmp_path):
     out = tmp_path / "x.png"
     assert "expected 0 to 1, or a name" in complaint(capsys, "objects", path, "--legend", out, "--camera", "left")
     assert "--time nan" in complaint(capsys, "objects", path, "--legend", out, "--time", "nan")
-    assert "expected one of rigid" in complaint(capsys, "objects", path, "--mode", "stiff")
+    line = complaint(capsys, "objects", path, "--mode", "stiff", status=ExitStatus.USAGE)
+    assert "expected one of rigid" in line
     assert "has data for rigid only" in complaint(capsys, "objects", path, "--mode", "standard")
     assert not out.exists()
 

@@ -305,10 +305,10 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
 def test_a_failed_import_leaves_the_old_scene(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
     out.write_bytes(b"old")
-    assert cli.main(["import", str(deformed), "--out", str(out), "--iteration", "5"]) == 1
+    assert cli.main(["import", str(deformed), "--out", str(out), "--iteration", "5"]) == 3
     assert "N = 5, found the iterations 20000" in capsys.readouterr().err
     assert out.read_bytes() == b"old"
-    assert cli.main(["import", str(deformed), "--out", str(tmp_path / "scene.ply")]) == 1
+    assert cli.main(["import", str(deformed), "--out", str(tmp_path / "scene.ply")]) == 2
     assert "expected a name that ends in .r5dgs" in capsys.readouterr().err
 
 

@@ -21,6 +21,7 @@ from r5dgs_core.errors import TrainingError
 from r5dgs_core.train import bake, checkpoint, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
+from tests.command_line import complaint
 
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=10", "train.probe_every=0")
 # What a process does to itself when it writes its second checkpoint.
@@ -100,15 +101,6 @@ def in_process(code, *given):
     return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
-def complaint(capsys, *given):
-    """The one line that a failing command prints."""
-    capsys.readouterr()
-    assert cli.main([str(text) for text in given]) == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("r5dgs: ")]
-    assert len(lines) == 1
-    return lines[0]
-
-
 @pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("after", 20)])
 def test_a_kill_within_a_write_leaves_a_whole_checkpoint(tiny, reference, tmp_path, moment, kept):
     folder = tmp_path / "run"
@@ -134,7 +126,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
     before = path.read_bytes()
     options = ["train", tiny.root, "--out", folder, "--resume", "--progress", "none"]
     full = in_process(FULL_DISK, len(before) // 2, *options)
-    assert full.returncode == 1
+    assert full.returncode == 3
     assert "checkpoint.pt: cannot be written" in full.stderr and "the checkpoint before it is kept" in full.stderr
     assert "Traceback" not in full.stderr
     assert path.read_bytes() == before and not list(folder.glob(".*.part"))
@@ -144,7 +136,7 @@ def test_a_full_disk_stops_a_run_that_goes_on_when_there_is_room(tiny, reference
 @needs_limits
 def test_a_full_disk_at_the_very_start_is_one_line(tiny, tmp_path):
     full = in_process(FULL_DISK, 100, *arguments(tiny.root, tmp_path / "run"))
-    assert full.returncode == 1 and "Traceback" not in full.stderr
+    assert full.returncode == 3 and "Traceback" not in full.stderr
     assert f"{tmp_path / 'run'}: cannot be made or written" in full.stderr
 
 

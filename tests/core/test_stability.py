@@ -164,7 +164,7 @@ def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):
 
 def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(stability, "run", lambda *_, **__: pytest.fail("ran"))
-    assert cli.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 1
+    assert cli.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
     assert "make it first" in capsys.readouterr().err
 
 

@@ -1,0 +1,100 @@
+"""Checks of the paths that commands are given. Needs the standard library alone, so a wrong path is reported at once.
+
+A path that the user may not look at passes: whoever opens it reports why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from . import errors
+
+SCENE_SUFFIX = ".r5dgs"
+RUN_FILE = "run.json"
+CAMERAS_FILE = "transforms_train.json"
+
+
+def check_dataset(root: Path) -> None:
+    """Raise `DatasetError` if a path is not a folder with cameras in a known layout."""
+    if not _holds(root.is_dir):
+        raise errors.DatasetError(f"{root}: expected a data set folder, found {_found(root)}")
+    if not _holds((root / CAMERAS_FILE).exists) and reconstruction(root) is None:
+        lone = (root / "transforms.json").exists()
+        remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
+        raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
+
+
+def reconstruction(root: Path) -> Path | None:
+    """Return the folder of the COLMAP reconstruction in a data set, or None if it has none."""
+    for candidate in (root / "sparse" / "0", root / "sparse"):
+        if any((candidate / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return candidate
+    return None
+
+
+def check_run(folder: Path) -> None:
+    """Raise `CheckpointError` if a path is not a run folder."""
+    if not _holds((folder / RUN_FILE).is_file):
+        raise errors.CheckpointError(f"{folder}: not a run folder (no {RUN_FILE}); make one with 'r5dgs train'")
+
+
+def check_foreign_run(folder: Path) -> None:
+    """Raise `CheckpointError` if a path is not a folder; its layout is up to the importer."""
+    if not _holds(folder.is_dir):
+        raise errors.CheckpointError(f"{folder}: expected a run folder, found {_found(folder)}")
+
+
+def check_scene(path: Path) -> None:
+    """Raise `SceneFileError` if a path is not a file."""
+    if not _holds(path.is_file):
+        found = "a folder; 'r5dgs train' makes a scene from a folder of images"
+        found = found if path.is_dir() else "nothing; look for its new place, or bake it again"
+        raise errors.SceneFileError(f"{path}: expected a {SCENE_SUFFIX} file, found {found}")
+
+
+def check_target(path: Path) -> None:
+    """Raise `CheckpointError` or `SceneFileError` if a path is neither a run folder nor a file."""
+    if _holds(path.is_dir):
+        check_run(path)
+    else:
+        check_scene(path)
+
+
+def check_scene_output(out: Path) -> None:
+    """Refuse an output path for a scene file that Blender would not find, or whose folder is missing.
+
+    Raises:
+        UsageError: The name has another suffix.
+        SceneFileError: The path is a folder, or lies in a folder that does not exist.
+    """
+    if out.is_dir():
+        raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
+    if out.suffix.lower() != SCENE_SUFFIX:
+        raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which is what Blender looks for")
+    if not out.parent.is_dir():
+        raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; make it first")
+
+
+def check_output(option: str, path: Path | None) -> None:
+    """Raise `ConfigError` if the file that an option names cannot be written because of its folder."""
+    if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
+        raise errors.ConfigError(f"{option} {path}: expected {expected}")
+
+
+def check_output_folder(option: str, path: Path) -> None:
+    """Raise `ConfigError` if the path for an output folder is taken by a file."""
+    if path.exists() and not path.is_dir():
+        raise errors.ConfigError(f"{option} {path}: expected a folder, or nothing yet; found a file")
+
+
+def _found(path: Path) -> str:
+    return "a file" if path.exists() else "nothing"
+
+
+def _holds(test: Callable[[], bool]) -> bool:
+    try:
+        return test()
+    except OSError:
+        return True
