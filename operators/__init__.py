@@ -5,6 +5,7 @@ import bpy
 from ..r5dgs_addon import running
 from . import (
     add_alias,
+    allow_scene_file,
     capture_dataset,
     check_worker,
     delete_object,
@@ -39,6 +40,7 @@ from . import (
 
 MODULES = (
     load_scene,
+    allow_scene_file,
     set_display,
     select_by_prompt,
     simplify_keys,

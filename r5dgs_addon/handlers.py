@@ -6,6 +6,8 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from . import trust
+
 
 def relative_to(path: str, blend_path: str) -> str:
     """Write a path relative to a .blend file (Blender's ``//``), absolute where that is impossible.
@@ -25,23 +27,6 @@ def relative_to(path: str, blend_path: str) -> str:
         return path
 
 
-def places(collection: bpy.types.Collection) -> list[Path]:
-    """Where the file of a loaded scene may lie, likeliest first.
-
-    That is where the .blend says, which for linked data is the library; beside the open .blend, as both may have moved
-    together; and where the file was last seen, as appended data comes from a .blend elsewhere.
-    """
-    override = collection.override_library
-    library = collection.library or (override.reference.library if override and override.reference else None)
-    stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=library))
-    found = [stored]
-    if bpy.data.filepath:
-        found.append(Path(bpy.path.abspath("//")) / stored.name)
-    if collection.r5dgs.seen_at:
-        found.append(Path(collection.r5dgs.seen_at))
-    return found
-
-
 _open_file: list[tuple[str, dict[int, str]]] = []  # before saving: the open .blend, and the paths in it by session_uid
 
 
@@ -55,9 +40,12 @@ def _relink_before_save(target, *_):
     scenes = _own_scenes()
     _open_file.append((bpy.data.filepath, {scene.session_uid: scene.r5dgs.filepath for scene in scenes}))
     for collection in scenes:
-        found = next((str(place.resolve()) for place in places(collection) if place.is_file()), None)
-        if found is not None:
-            collection.r5dgs.filepath, collection.r5dgs.seen_at = relative_to(found, target), found
+        place = trust.find(collection)
+        found = place.path or place.asked
+        if found is not None and not trust.on_network(found):
+            with trust.following():
+                collection.r5dgs.filepath = relative_to(str(found.resolve()), target)
+            collection.r5dgs.seen_at = str(found.resolve())
 
 
 @persistent
@@ -71,7 +59,8 @@ def _restore_after_save(target, *_):
     for collection in _own_scenes():
         stored = paths.get(collection.session_uid)
         if stored is not None:
-            collection.r5dgs.filepath = stored
+            with trust.following():
+                collection.r5dgs.filepath = stored
 
 
 def _own_scenes() -> list[bpy.types.Collection]:

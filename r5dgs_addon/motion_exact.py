@@ -5,6 +5,9 @@ collection's clouds keep their bind state in attributes of their own, and each f
 Nothing listens to frame changes while no scene has it on.
 """
 
+import logging
+from pathlib import Path
+
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
@@ -14,7 +17,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.motion import columns
 from ..r5dgs_core.scene import residuals, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
-from . import clouds, objects, picture, timeline
+from . import clouds, objects, picture, remembered, timeline
 
 BIND = "bind_state:"  # prefix of the attributes that keep what is overwritten
 PARTS = (
@@ -22,6 +25,9 @@ PARTS = (
     ("rotation", "QUATERNION", "value", 4),
     ("scale", "FLOAT_VECTOR", "vector", 3),
 )
+
+_log = logging.getLogger(__name__)
+_told: set[str] = set()  # errors that were logged
 
 
 class R5DGS_PG_exact(bpy.types.PropertyGroup):
@@ -32,31 +38,33 @@ class R5DGS_PG_exact(bpy.types.PropertyGroup):
     problem: StringProperty(name="Problem", description="Why nothing bends although it should", options={"HIDDEN"})
 
 
-_read: dict[
-    str, tuple[tuple[float, int], Residuals]
-] = {}  # by path: what was read last, and from which state of the file
+def _read_file(path: Path) -> tuple[int, Residuals]:
+    """Number of Gaussians and the residuals of a scene file."""
+    scene = scene_file.read(path)
+    return len(scene.means), residuals.Residuals(scene)
 
 
-def residuals_of(collection: bpy.types.Collection) -> Residuals:
-    """The residuals of a loaded scene, read from its file once.
+_files: remembered.Remembered[tuple[int, Residuals]] = remembered.Remembered(_read_file)
+
+
+def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Residuals:
+    """The residuals of a loaded scene; its file is read once for each state of it.
+
+    Args:
+        collection: The scene.
+        again: Read a file anew that could not be read before.
 
     Raises:
-        SceneFileError: The file is not there, cannot be read, or is of another scene.
+        SceneFileError: The file is missing, may not be read (`trust`), cannot be read, or is of another scene.
     """
     path = picture.scene_path(collection)
-    stat = path.stat()
-    stamp = (stat.st_mtime, stat.st_size)
-    known = _read.get(str(path))
-    if known is None or known[0] != stamp:
-        scene = scene_file.read(path)
-        if len(scene.means) != collection.r5dgs.gaussians:
-            raise errors.SceneFileError(
-                f"{path}: expected the {collection.r5dgs.gaussians} Gaussians that were loaded, found "
-                f"{len(scene.means)}; load the scene anew"
-            )
-        known = stamp, residuals.Residuals(scene)
-        _read[str(path)] = known
-    return known[1]
+    count, found = _files.get(path, again)
+    if count != collection.r5dgs.gaussians:
+        raise errors.SceneFileError(
+            f"{path}: expected the {collection.r5dgs.gaussians} Gaussians that were loaded, found {count}; load the "
+            "scene anew"
+        )
+    return found
 
 
 def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
@@ -68,7 +76,7 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
     """
     if collection.library is not None or any(c.data.library for c in objects.members(collection, "CLOUD")):
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
-    bending = residuals_of(collection)
+    bending = residuals_of(collection, again=True)
     if len(bending.rows) == 0:
         raise errors.ConfigError(f"{collection.name}: every object moves as a whole; there is nothing more to play")
     state = collection.r5dgs_exact
@@ -170,22 +178,30 @@ def _follow_frame(scene, *_):
 
 
 def _try(collection: bpy.types.Collection, frame: float) -> None:
-    """`apply`; a file that cannot be read is said in the sidebar, as a handler has nobody to report to."""
+    """`apply`; an error is shown in the sidebar and logged once, as a handler cannot report it."""
     try:
         apply(collection, frame)
         problem = ""
     except errors.R5dgsError as error:
         problem = str(error)
+        if problem not in _told:
+            _told.add(problem)
+            _log.warning("R5DGS: %s: Exact Mode plays nothing that bends: %s", collection.name, problem)
     if collection.r5dgs_exact.problem != problem:
         collection.r5dgs_exact.problem = problem
+
+
+def refresh() -> None:
+    """Bring the points of all scenes to the frame, once a file can be read that could not be before."""
+    for collection in _exact_scenes():
+        _try(collection, bpy.context.scene.frame_current_final)
 
 
 @persistent
 def _look_again(*_):
     """After loading, undo and redo: listen where it is on, and bring the points to the frame."""
     listen()
-    for collection in _exact_scenes():
-        _try(collection, bpy.context.scene.frame_current_final)
+    refresh()
 
 
 def listen() -> None:
@@ -213,6 +229,7 @@ def unregister():
             events.remove(_look_again)
     if _follow_frame in bpy.app.handlers.frame_change_pre:
         bpy.app.handlers.frame_change_pre.remove(_follow_frame)
-    _read.clear()
+    _files.clear()
+    _told.clear()
     del bpy.types.Collection.r5dgs_exact
     bpy.utils.unregister_class(R5DGS_PG_exact)

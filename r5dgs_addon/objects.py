@@ -284,7 +284,7 @@ def _describe(
     state = collection.r5dgs
     state.is_scene = True
     state.scene_name = scene.name
-    state.filepath = handlers.relative_to(str(path.resolve()), bpy.data.filepath)
+    state.filepath = handlers.relative_to(str(path.resolve()), bpy.data.filepath)  # allows the file, see `trust`
     state.seen_at = str(path.resolve())
     state.gaussians = len(scene.means)
     state.root = root

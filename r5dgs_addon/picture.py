@@ -16,7 +16,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
-from . import figures, handlers, views, visible, worker
+from . import figures, trust, views, visible, worker
 
 IMAGE = "R5DGS Preview"
 PREVIEW = "preview"  # what `worker.busy` knows previews by
@@ -103,18 +103,23 @@ def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tup
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:
-    """The file that a loaded scene came from, the first that exists of `handlers.places`.
+    """The file that a loaded scene came from, see `trust.find`.
 
     Raises:
-        SceneFileError: It is not there.
+        SceneFileError: It is missing, or the user has to allow it first.
     """
-    places = handlers.places(collection)
-    for place in places:
-        if place.is_file():
-            return place
+    found = trust.find(collection)
+    if found.path is not None:
+        return found.path
+    if found.asked is not None:
+        raise errors.SceneFileError(
+            f"{found.asked}: not read, as it lies neither beside nor below the .blend that names it; "
+            "press Allow in the panel Scene of the R5DGS tab, or add its folder to 'Trusted Folders' in the add-on's "
+            f"preferences or to the environment variable {trust.ENVIRONMENT}"
+        )
     raise errors.SceneFileError(
-        f"{os.path.normpath(places[0])}: expected the scene that '{collection.name}' was loaded from, found no file; "
-        "choose its new place under 'Scene File' in the R5DGS tab"
+        f"{os.path.normpath(trust.places(collection)[0])}: expected the scene that '{collection.name}' was loaded "
+        "from, found no file; choose its new place under 'Scene File' in the R5DGS tab"
     )
 
 

@@ -19,6 +19,7 @@ from . import pythons, worker_check
 
 ENVIRONMENT = "R5DGS_PYTHON"
 ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
+TRUSTED_ENVIRONMENT = "R5DGS_TRUSTED_FOLDERS"
 INSTALLED = "text"  # in place of a folder: the package of a small text encoder
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,6 +58,12 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         "'text' for the installed package",
         subtype="DIR_PATH",
     )
+    trusted_folders: StringProperty(
+        name="Trusted Folders",
+        description=f"Folders, separated by '{os.pathsep}', from which any .blend may have scene files read; files "
+        "beside and below a .blend need none",
+        update=_remember,
+    )
     found_python: StringProperty(
         name="Found Python", description="What the search for a Python found last", options={"HIDDEN"}
     )
@@ -74,6 +81,9 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         if os.environ.get(ENCODER_ENVIRONMENT):
             wins = f"{ENCODER_ENVIRONMENT} is set and wins: {os.environ[ENCODER_ENVIRONMENT]}"
             layout.label(text=wins, icon="INFO")
+        layout.prop(self, "trusted_folders")
+        if os.environ.get(TRUSTED_ENVIRONMENT):
+            layout.label(text=f"And {TRUSTED_ENVIRONMENT}: {os.environ[TRUSTED_ENVIRONMENT]}", icon="INFO")
         worker_check.draw(layout, context)
 
 
@@ -85,19 +95,21 @@ def get() -> "R5DGS_AP_preferences | None":
 
 @dataclass(frozen=True)
 class Choice:
-    """Which Python the worker shall have, as far as the preferences say it. Any thread may ask it.
+    """The preferences as other threads need them. Any thread may use it.
 
     Attributes:
         chosen: The environment's, or the user's; "" for the first one found that will do.
         kept: What an earlier search found; "" for nothing.
         beside: Folders that are the extension's own, where the search begins.
         timeout_s: Seconds to wait for an answer of the worker.
+        trusted: Folders from which any .blend may have scene files read.
     """
 
     chosen: str
     kept: str
     beside: tuple[Path, ...]
     timeout_s: float
+    trusted: tuple[str, ...] = ()
 
     def known(self) -> str | None:
         """The Python, where no search is needed; else None."""
@@ -141,6 +153,7 @@ def choice() -> Choice:
         kept=preferences.found_python if preferences is not None else "",
         beside=tuple(_beside()),
         timeout_s=float(preferences.worker_timeout) if preferences is not None else 120.0,
+        trusted=_trusted(preferences),
     )
     return _chosen
 
@@ -175,6 +188,20 @@ def forget() -> None:
     preferences = get()
     if preferences is not None and preferences.found_python:
         preferences.found_python = ""
+
+
+def trust(folder: str) -> None:
+    """Add a folder to the trusted ones, for this session and, if Blender saves preferences, for later ones."""
+    preferences = get()
+    if preferences is not None:
+        preferences.trusted_folders = os.pathsep.join(filter(None, (preferences.trusted_folders, folder)))
+        bpy.context.preferences.is_dirty = True
+
+
+def _trusted(preferences: "R5DGS_AP_preferences | None") -> tuple[str, ...]:
+    named = preferences.trusted_folders if preferences is not None else ""
+    entries = f"{named}{os.pathsep}{os.environ.get(TRUSTED_ENVIRONMENT, '')}".split(os.pathsep)
+    return tuple(str(Path(entry.strip()).expanduser()) for entry in entries if entry.strip())
 
 
 def _absolute(path: str) -> str:

@@ -7,18 +7,17 @@ the worker opens (`phrases`); its answers join the others.
 
 import functools
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import bpy
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import lookup, scene_file
-from . import phrases, picture, selection, table, windows
+from . import phrases, picture, remembered, selection, table, windows
 
 HISTORY = 12  # prompts kept
 ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
 STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
-_meanings: dict[Path, tuple[tuple[int, int], lookup.Meanings | None]] = {}  # by file, with its time and size
+_meanings: remembered.Remembered[lookup.Meanings | None] = remembered.Remembered(scene_file.read_meanings)
 
 
 @dataclass(frozen=True)
@@ -180,14 +179,9 @@ def _stored_meanings(collection: bpy.types.Collection) -> tuple[lookup.Meanings 
     if not collection.r5dgs_named.meanings:
         return None, ""
     try:
-        path = picture.scene_path(collection)
-        status = path.stat()
-        stamp = (status.st_mtime_ns, status.st_size)
-        if _meanings.get(path, (None,))[0] != stamp:
-            _meanings[path] = (stamp, scene_file.read_meanings(path))
-        return _meanings[path][1], ""
-    except (errors.SceneFileError, OSError):
-        return None, f"{collection.name}: searched by names alone, as its scene file cannot be read"
+        return _meanings.get(picture.scene_path(collection)), ""
+    except errors.SceneFileError as error:
+        return None, f"{collection.name}: searched by names alone, as its scene file cannot be read: {error}"
 
 
 def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:

@@ -16,7 +16,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import compat, displays, rows
+from . import compat, displays, rows, trust
 
 ROLES = (
     ("NONE", "None", "Not part of an R5DGS scene"),
@@ -99,6 +99,7 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
         description="The .r5dgs file that the preview reads; relative to the .blend file where possible",
         subtype="FILE_PATH",
         options={"ANIMATABLE"} | compat.PATH_OPTIONS,
+        update=trust.choose,
     )
     seen_at: StringProperty(
         name="Seen At", description="Where the scene file was last seen: a .blend that appends this starts elsewhere"

@@ -105,6 +105,7 @@ class Server:
     def __init__(self, warming: Warming | None = None) -> None:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
+        self._failed: dict[tuple[str, int, int], str] = {}  # the last file that could not be read, and why
         self._stage = None  # of the scenes, from the first picture on
         self._numbers: list[int] = []  # which of them each path of the last load is
         self._errors: list[quality.Quality] = []  # what is known of theirs
@@ -149,12 +150,23 @@ class Server:
         if stamps != list(self._scenes):
             known, self._scenes, self._numbers, self._stage, self._players = self._scenes, {}, [], None, {}
             known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # before others need room
-            found = {stamp: known.get(stamp) or scene_file.read(Path(stamp[0])) for stamp in stamps}
+            found = {stamp: known.get(stamp) or self._read(stamp) for stamp in stamps}
             self._errors = [quality.of(scene, Path(stamp[0])) for stamp, scene in found.items()]
             self._scenes = found
         self._numbers = [stamps.index(stamp) for stamp in named]
         scenes = [list(self._scenes.values())[number] for number in self._numbers]
         return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
+
+    def _read(self, stamp: tuple[str, int, int]) -> Scene:
+        """Read a scene file; one that failed last is not read again until it changes, as viewports ask at each move."""
+        if stamp not in self._failed:
+            try:
+                return scene_file.read(Path(stamp[0]))
+            except errors.SceneFileError as error:
+                if isinstance(error.__cause__, PermissionError):  # may pass without a change of the file
+                    raise
+                self._failed = {stamp: str(error)}
+        raise errors.SceneFileError(self._failed[stamp])
 
     def _render(self, request: dict[str, Any]) -> Answer:
         """Rasterize the loaded scenes.

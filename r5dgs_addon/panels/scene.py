@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import amounts, displays, objects, timeline
+from .. import amounts, displays, objects, timeline, trust
 from . import sidebar
 
 
@@ -37,6 +37,13 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         for value, name, _ in displays.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
         layout.prop(state, "filepath")
+        asked = trust.find(collection).asked
+        if asked is not None:
+            box = layout.box()
+            box.label(text=f"Outside this .blend's folder, not read: {asked}", icon="LOCKED")
+            row = box.row(align=True)
+            row.operator("r5dgs.allow_scene_file").always = False
+            row.operator("r5dgs.allow_scene_file", text="Always Allow Its Folder").always = True
 
 
 CLASSES = (R5DGS_PT_scene,)

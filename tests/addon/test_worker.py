@@ -223,7 +223,7 @@ def elsewhere_called(function):
 
 
 def test_another_thread_leaves_the_preferences_alone_and_knows_what_they_said_last(preferences, pythons, monkeypatch):
-    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=7)
+    kept = types.SimpleNamespace(worker_python="", found_python="", trusted_folders="", worker_timeout=7)
     asked = []
     monkeypatch.setattr(preferences, "get", lambda: asked.append(threading.current_thread()) or kept)
     monkeypatch.setattr(pythons, "find", lambda *_, **__: sys.executable)
@@ -272,7 +272,7 @@ def test_what_a_search_beside_the_window_finds_runs_the_worker_and_is_kept(
 ):
     gate = tmp_path / "gate"
     os.mkfifo(gate)
-    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=120)
+    kept = types.SimpleNamespace(worker_python="", found_python="", trusted_folders="", worker_timeout=120)
     monkeypatch.setattr(preferences, "get", lambda: kept)
     found = only_python(f'[ "$1" = -c ] && read line < {gate}\nexec {PYTHON} "$@"\n')
     job = worker.submit("view", HELLO)
@@ -352,7 +352,7 @@ def test_the_timeout_of_the_preferences_limits_the_start(worker, preferences, mo
     path.write_text("#!/bin/sh\nexec sleep 600\n")
     path.chmod(0o755)
     monkeypatch.setenv("R5DGS_PYTHON", str(path))
-    kept = types.SimpleNamespace(worker_python="", found_python="", worker_timeout=0.3)
+    kept = types.SimpleNamespace(worker_python="", found_python="", trusted_folders="", worker_timeout=0.3)
     monkeypatch.setattr(preferences, "get", lambda: kept)
     with pytest.raises(errors.BackendError, match=r"no answer to 'hello' within 0\.3 s.*'Timeout'"):
         worker.request("hello")

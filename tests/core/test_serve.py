@@ -3,13 +3,15 @@
 import dataclasses
 import io
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from r5dgs_core import serve
+from r5dgs_core import errors, serve
 from r5dgs_core.raster import compile as compilation
 from r5dgs_core.raster import scene_render, stage, warming
 from r5dgs_core.scene import playback, scene_file
@@ -189,6 +191,22 @@ def test_a_failed_load_forgets_the_scene_before(path, tmp_path):
     _, (failed, _), (render, _) = talk(load(path), load(broken), {"command": "render", "camera": CAMERA_JSON, "t": 0.0})
     assert failed["error"]["kind"] == "SceneFileError"
     assert "no scene is loaded" in render["error"]["message"]
+
+
+def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(path, tmp_path, monkeypatch):
+    path = Path(shutil.copy(path, tmp_path))
+    read, calls = serve.scene_file.read, []
+    monkeypatch.setattr(serve.scene_file, "read", lambda path: calls.append(path) or read(path))
+    whole, server, request = path.read_bytes(), serve.Server(), {"command": "load", "paths": [str(path)]}
+    path.write_bytes(whole[:1000])
+    said = []
+    for _ in range(3):
+        with pytest.raises(errors.SceneFileError, match=path.name) as caught:
+            server.answer(request)
+        said.append(str(caught.value))
+    assert len(calls) == 1 and len(set(said)) == 1
+    path.write_bytes(whole)
+    assert server.answer(request)[0]["scenes"] and len(calls) == 2
 
 
 def test_a_changed_file_is_read_again(path, tmp_path):

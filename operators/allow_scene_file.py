@@ -1,0 +1,35 @@
+"""Allow: let the file be read that a .blend names, though it lies elsewhere."""
+
+import bpy
+from bpy.props import BoolProperty
+
+from ..r5dgs_addon import actions, motion_exact, objects, preferences, trust, windows
+
+
+class R5DGS_OT_allow_scene_file(actions.NeedsScene, bpy.types.Operator):
+    """Let the scene file be read that this .blend names, though it lies neither beside nor below the .blend"""
+
+    bl_idname = "r5dgs.allow_scene_file"
+    bl_label = "Allow"
+
+    always: BoolProperty(
+        name="Always",
+        description="Add the file's folder to the trusted folders of the preferences",
+        options={"SKIP_SAVE"},
+    )
+
+    def execute(self, context):
+        found = trust.find(objects.active_collection(context))
+        if found.asked is None:
+            self.report({"WARNING"}, "There is no file to allow")
+            return {"CANCELLED"}
+        trust.allow(found.asked)
+        if self.always:
+            preferences.trust(str(found.asked.parent))
+        motion_exact.refresh()
+        windows.redraw()
+        self.report({"INFO"}, f"{found.asked}: may be read")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_allow_scene_file,)
