@@ -17,6 +17,13 @@ hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Counts of what tests draw at random."""
+    group = parser.getgroup("r5dgs")
+    group.addoption("--bit-flips", type=int, default=200, metavar="N", help="flipped bits of each checkpoint")
+    group.addoption("--kills", type=int, default=30, metavar="N", help="killed runs of the slow test")
+
+
 def pytest_report_header(config: pytest.Config) -> str:
     """Say beside the platform whether Blender's tests can run, and if not, why."""
     if importlib.util.find_spec("bpy") is not None:

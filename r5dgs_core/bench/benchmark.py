@@ -131,7 +131,9 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
 
 def _stamp(case: Case) -> list[int]:
     """What tells a checkpoint from another one."""
-    found = (case.run / checkpoint.CHECKPOINT_FILE).stat()
+    newest = checkpoint.newest_file(case.run)
+    assert newest is not None  # the case is finished
+    found = newest.stat()
     return [found.st_size, found.st_mtime_ns]
 
 

@@ -144,7 +144,7 @@ def _check_settings(case: Case, wanted: configs.Config) -> None:
 
 def _check_data(case: Case, digest: str) -> None:
     """Raise CheckpointError where the case was trained on other data than there is now."""
-    if not (case.run / checkpoint.CHECKPOINT_FILE).exists():
+    if checkpoint.newest_file(case.run) is None:
         return  # nothing of other data is in it
     if checkpoint.open_run(case.run).digest != digest:
         raise CheckpointError(
@@ -201,7 +201,7 @@ def is_finished(case: Case) -> bool:
     Raises:
         CheckpointError: The checkpoint is damaged.
     """
-    return (case.run / checkpoint.CHECKPOINT_FILE).exists() and checkpoint.load(case.run).finished
+    return checkpoint.newest_file(case.run) is not None and checkpoint.load(case.run).finished
 
 
 def cost(sittings: Sequence[dict[str, Any]]) -> dict[str, float | None]:

@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[BinaryIO]:
+def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[BinaryIO]:
     """A stream for the new content of a file, which becomes the file when the block ends without an error.
 
     The content goes under a hidden temporary name in the same folder, then to the disk, then to its place. After an
@@ -22,6 +22,8 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
 
     Args:
         path: The file; its folder must exist.
+        previous: Place of the old file from then on, in the same folder; None to drop it. A kill between the two moves
+            leaves the old content there and nothing at ``path``.
 
     Raises:
         OSError: It cannot be written; the caller says what that means.
@@ -33,6 +35,8 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
+        if previous is not None and path.exists():
+            os.replace(path, previous)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,41 +1,38 @@
 """Run folders and checkpoints: named tensors and plain values, written whole or not at all.
 
 A run folder holds ``run.json`` (configuration, data set, versions, platform), ``checkpoint.pt`` (the last state),
-``log.jsonl`` (one line per logged step) and ``learning_curves.png`` (the log as a picture).
+``checkpoint.previous.pt`` (the state before it), ``log.jsonl`` (one line per logged step) and ``learning_curves.png``
+(the log as a picture).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
-import io
 import json
-from collections.abc import Callable
+import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from .. import __version__, input_paths, strict_json
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
-from ..model.gaussians import PARAMETERS
 from ..raster import machine
 from ..scene import files
+from . import checkpoint_content, checkpoint_file
 from . import config as configs
+from .checkpoint_content import FORMAT_VERSION
 from .config import Config
 
-FORMAT_VERSION = 1
-RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE = (
-    input_paths.RUN_FILE,
-    "checkpoint.pt",
-    "log.jsonl",
-    "evaluation.json",
-)
-CURVES_FILE = "learning_curves.png"
-RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: what a body gains cannot always be said
+log = logging.getLogger(__name__)
+
+RUN_FILE = input_paths.RUN_FILE
+LOG_FILE, EVALUATION_FILE, CURVES_FILE = "log.jsonl", "evaluation.json", "learning_curves.png"
+CHECKPOINT_FILE, PREVIOUS_FILE = GENERATIONS = "checkpoint.pt", "checkpoint.previous.pt"
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,8 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
     }
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        for name in (CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
+        # The newest checkpoint goes last of the two: a kill in between leaves the old run as it was.
+        for name in (PREVIOUS_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
             (run.folder / name).unlink(missing_ok=True)
         remove_leftovers(run.folder)
         files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
@@ -165,7 +163,7 @@ def remove_leftovers(folder: Path) -> None:
 def refuse_to_lose(folder: Path) -> None:
     """Raise CheckpointError where a folder holds a run that a new one would replace."""
     folder = Path(folder)
-    if not ((folder / RUN_FILE).exists() and (folder / CHECKPOINT_FILE).exists()):
+    if not (folder / RUN_FILE).exists() or newest_file(folder) is None:
         return
     try:
         found = f"a run at step {load(folder).iteration}; add --resume to go on, or"
@@ -206,85 +204,71 @@ def open_run(folder: Path) -> Run:
         ) from error
 
 
+def newest_file(folder: Path) -> Path | None:
+    """Return the newest checkpoint file of a run, damaged or not; None if there is none yet."""
+    return next((path for name in GENERATIONS if (path := Path(folder) / name).exists()), None)
+
+
 def save(folder: Path, state: Checkpoint) -> None:
-    """Replace the checkpoint of a run; the old one stays until the new one is whole on the disk.
+    """Make a state the newest checkpoint of a run; the newest so far becomes the previous one.
+
+    A kill or an error at any moment leaves at least one whole checkpoint.
 
     Raises:
         CheckpointError: It cannot be written.
     """
-    path = Path(folder) / CHECKPOINT_FILE
+    path, previous = (Path(folder) / name for name in GENERATIONS)
     content = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
     try:
-        buffer = io.BytesIO()
-        torch.save({"format_version": FORMAT_VERSION, **content}, buffer)
-        with files.replacing(path) as stream:
-            stream.write(buffer.getbuffer())
+        checkpoint_file.write(path, {"format_version": FORMAT_VERSION, **content}, previous)
     except OSError as error:
         raise CheckpointError(
             f"{path}: cannot be written: {error}; the checkpoint before it is kept. Make room and go on with --resume"
         ) from error
 
 
-def load(folder: Path) -> Checkpoint:
-    """Read the checkpoint of a run.
+def load(folder: Path, *, mend: bool = False) -> Checkpoint:
+    """Read the newest checkpoint of a run that is whole, with a warning if that is the previous one.
+
+    Args:
+        folder: The run folder.
+        mend: Put the previous checkpoint into the place of a damaged newest one, so that `save` keeps it; for the
+            process that holds the folder.
 
     Raises:
-        CheckpointError: There is none, or it is damaged, incomplete or of another version.
+        CheckpointError: There is none, or both are damaged, incomplete or of another version.
     """
-    path = Path(folder) / CHECKPOINT_FILE
+    path, previous = (Path(folder) / name for name in GENERATIONS)
+    if newest_file(folder) is None:
+        raise CheckpointError(f"{path}: no checkpoint yet; go on with 'r5dgs train ... --resume'")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        return _read(path)
+    except CheckpointError as error:
+        if isinstance(error.__cause__, PermissionError):  # the file may be whole
+            raise
+        try:
+            state = _read(previous)
+        except CheckpointError as other:
+            also = f"; {other}" if previous.exists() else ""
+            raise CheckpointError(f"{error}{also}; train again with --overwrite") from error
+        log.warning("%s; taking the checkpoint before it, %s of step %d", error, previous.name, state.iteration)
+    if mend:
+        try:
+            os.replace(previous, path)
+        except OSError as error:
+            raise CheckpointError(f"{path}: cannot be replaced by {previous.name}: {error}") from error
+    return state
+
+
+def _read(path: Path) -> Checkpoint:
+    """Read one checkpoint file. Raises CheckpointError without a remedy."""
+    try:
+        return Checkpoint(**checkpoint_content.check(checkpoint_file.read(path)))
     except FileNotFoundError:
-        raise CheckpointError(f"{path}: no checkpoint yet; go on with 'r5dgs train ... --resume'") from None
-    except PermissionError as error:
+        raise CheckpointError(f"{path}: missing") from None
+    except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error}") from error
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise CheckpointError(f"{path}: damaged ({type(error).__name__}); train again with --overwrite") from error
-    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
-        raise CheckpointError(f"{path}: expected a checkpoint of format_version {FORMAT_VERSION}")
-    for name, (good, expected) in _RULES.items():
-        if name not in content:
-            raise CheckpointError(f"{path}: expected '{name}', found none; train again with --overwrite")
-        if not good(content[name]):
-            found = type(content[name]).__name__
-            raise CheckpointError(f"{path}: '{name}': expected {expected}, found {found}; train again with --overwrite")
-    for name in TENSORS:
-        if name not in content["tensors"]:
-            raise CheckpointError(f"{path}: expected the tensor '{name}', found none; train again with --overwrite")
-    values: dict[str, Any] = {name: content[name] for name in _RULES}
-    return Checkpoint(**values)
-
-
-def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:
-    """A test for a row of numbers of some kinds, of a length if one is given."""
-    return lambda value: (
-        isinstance(value, list | tuple)
-        and (length is None or len(value) == length)
-        and all(isinstance(x, kinds) and not isinstance(x, bool) for x in value)
-    )
-
-
-def _is(kinds: type | tuple[type, ...]) -> Callable[[Any], bool]:
-    """A test for a number of some kinds."""
-    return lambda value: _are(kinds, 1)([value])
-
-
-def _are_tensors(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(t, Tensor) for n, t in value.items())
-
-
-TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
-_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "tensors": (_are_tensors, "tensors by name"),
-    "representation": (lambda value: isinstance(value, str), "a name"),
-    "iteration": (_is(int), "a whole number"),
-    "entered": (_are(int, 2), "two whole numbers"),
-    "first_time": (_is(int), "a whole number"),
-    "queue": (_are(int), "whole numbers"),
-    "running_loss": (_is((int, float)), "a number"),
-    "origin": (_are((int, float), 3), "three numbers"),
-    "scale": (lambda value: _is((int, float))(value) and value > 0, "a positive number"),
-    "observed": (lambda value: isinstance(value, Tensor) and value.dtype == torch.bool, "a tensor of truth values"),
-    "finished": (lambda value: isinstance(value, bool), "true or false"),
-    "seconds": (_is((int, float)), "a number"),
-}
+    except checkpoint_file.DamagedError as error:
+        raise CheckpointError(f"{path}: damaged ({error})") from error
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from None

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import ConfigError
+from ..errors import CheckpointError, ConfigError
 from ..model import deformation, group_poses, spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..model.tracks import Tracks
@@ -295,6 +295,8 @@ def _parameters(motion: Motion) -> dict[str, Tensor]:
 @torch.no_grad()
 def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
     for name, parameter in _parameters(motion).items():
+        if name not in tensors or tensors[name].shape != parameter.shape:
+            raise CheckpointError(f"the checkpoint's '{name}': expected a tensor of shape {list(parameter.shape)}")
         parameter.copy_(tensors[name])
 
 

@@ -34,11 +34,15 @@ def unpack(packed: Tensor, sizes: Sequence[tuple[int, int]]) -> list[np.ndarray]
     Raises:
         CheckpointError: The bytes are damaged, or are of masks of other sizes.
     """
+    ends = np.cumsum([0, *(height * width for height, width in sizes)])
     try:
-        values = np.frombuffer(zlib.decompress(packed.numpy().tobytes()), "<u2")
+        inflate = zlib.decompressobj()
+        # One pixel more than expected is enough to notice that there are too many.
+        values = np.frombuffer(inflate.decompress(packed.numpy().tobytes(), 2 * int(ends[-1]) + 2), "<u2")
+        if not inflate.eof and not inflate.unconsumed_tail:
+            raise ValueError("incomplete")
     except (zlib.error, ValueError) as error:
         raise CheckpointError(f"'{NAME}': damaged ({error}); train again with --overwrite") from None
-    ends = np.cumsum([0, *(height * width for height, width in sizes)])
     if len(values) != ends[-1]:
         raise CheckpointError(
             f"'{NAME}': expected {ends[-1]} pixels, found {len(values)}; train again with --overwrite"

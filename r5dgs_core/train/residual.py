@@ -24,7 +24,7 @@ from ..model import residual_field
 from ..model.residual_field import Change, ResidualField
 from ..model.tracks import Tracks
 from ..motion import rotations
-from . import checkpoint
+from . import checkpoint_content
 from . import shading as shading_vectors
 from .config import Config
 from .groups import PointMotion
@@ -39,7 +39,7 @@ HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
 MIN_PIXELS = 50  # on these together, below which nothing is said of a body
 SEED_STEP = 2  # the trial draws from a generator of its own
 PREFIX = "residual."
-GAINS = checkpoint.RESIDUAL_GAINS
+GAINS = checkpoint_content.RESIDUAL_GAINS
 
 
 def decision_step(config: Config, all_entered: int) -> int | None:

@@ -18,7 +18,18 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
-from . import checkpoint, curves, identity, label_hygiene, mask_stack, needs, probing, representation, stopping
+from . import (
+    checkpoint,
+    checkpoint_content,
+    curves,
+    identity,
+    label_hygiene,
+    mask_stack,
+    needs,
+    probing,
+    representation,
+    stopping,
+)
 from .config import Config
 from .posing import Splats
 from .trainer import Trainer
@@ -71,7 +82,7 @@ def train(
     state, replaces = None, False
     if resume:
         run = checkpoint.open_run(folder)
-        state = checkpoint.load(folder) if (folder / checkpoint.CHECKPOINT_FILE).exists() else None
+        state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
         if run.digest != dataset.digest and state is None:  # nothing of the other data is in it
             run = checkpoint.create_run(folder, dataset, run.config)
         if run.digest != dataset.digest:
@@ -80,7 +91,7 @@ def train(
                 "restore the data set or train into another folder"
             )
     else:
-        replaces = (folder / checkpoint.CHECKPOINT_FILE).exists()
+        replaces = checkpoint.newest_file(folder) is not None
         run = (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config)
     iterations = run.config.train.iterations
     done = 0 if state is None else state.iteration
@@ -316,7 +327,9 @@ def _save(
     if mask_stack.LABELS in tensors:  # objects that nobody placed are taken to be there all the time
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
-    values = {name: t for name, t in tensors.items() if t.is_floating_point() and name != checkpoint.RESIDUAL_GAINS}
+    values = {
+        name: t for name, t in tensors.items() if t.is_floating_point() and name != checkpoint_content.RESIDUAL_GAINS
+    }
     bad = [name for name, tensor in values.items() if not tensor.isfinite().all()]
     if bad:
         raise TrainingError(

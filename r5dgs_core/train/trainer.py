@@ -425,14 +425,25 @@ class Trainer:
             self.identity.restore(tensors, self.gaussians)
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
         self.object_ids = tensors["object_ids"].numpy()
-        self.generator.set_state(tensors["generator"])
+        try:
+            self.generator.set_state(tensors["generator"])
+        except (RuntimeError, TypeError) as error:
+            raise CheckpointError(
+                f"the checkpoint's 'generator' is not a state of torch's generator: {error}"
+            ) from error
+        if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
+            raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.growth.restore(tensors)
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:
             prefix = f"adam.{group['name']}."
             moments = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
             if moments:
-                self.optimizer.state[group["params"][0]] = moments
+                parameter = group["params"][0]
+                if any(tensor.ndim and tensor.shape != parameter.shape for tensor in moments.values()):
+                    expected = list(parameter.shape)
+                    raise CheckpointError(f"the checkpoint's '{prefix}*': expected tensors of shape {expected}")
+                self.optimizer.state[parameter] = moments
         self.iteration = state.iteration
         self.entered = state.entered
         self.first_time = state.first_time

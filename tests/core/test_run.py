@@ -196,10 +196,12 @@ def test_a_run_is_not_replaced_unless_this_is_asked_for(tiny, copied):
     before = contents(copied)
     with pytest.raises(CheckpointError, match="holds a run at step 150; add --resume to go on, or --overwrite"):
         run.train(tiny.root, copied, tiny_datasets.settings())
-    (copied / checkpoint.CHECKPOINT_FILE).write_bytes(b"torn")
+    torn = dict.fromkeys(checkpoint.GENERATIONS, b"torn")
+    for file, content in torn.items():
+        (copied / file).write_bytes(content)
     with pytest.raises(CheckpointError, match="cannot be read; add --overwrite to begin again"):
         run.train(tiny.root, copied, tiny_datasets.settings())
-    assert contents(copied) == {**before, checkpoint.CHECKPOINT_FILE: b"torn"}
+    assert contents(copied) == {**before, **torn}
 
 
 def test_overwriting_begins_again_with_nothing_of_the_old_run(tiny, copied):
@@ -240,17 +242,17 @@ def test_half_written_files_of_a_kill_are_removed(tiny, tmp_path):
     (folder / f".{checkpoint.CHECKPOINT_FILE}.12ab.part").write_text("half")
     run.train(tiny.root, folder, settings, resume=True)
     run.train(tiny.root, folder, settings, overwrite=True)
-    assert {p.name for p in folder.iterdir()} == {checkpoint.RUN_FILE, checkpoint.CHECKPOINT_FILE, checkpoint.LOG_FILE}
+    assert {p.name for p in folder.iterdir()} == {checkpoint.RUN_FILE, checkpoint.LOG_FILE, *checkpoint.GENERATIONS}
 
 
 @pytest.mark.parametrize("name", [checkpoint.RUN_FILE, checkpoint.LOG_FILE, checkpoint.CHECKPOINT_FILE])
 def test_what_cannot_be_written_is_named(tiny, tmp_path, monkeypatch, name):
     real = files.replacing
 
-    def full(path):
+    def full(path, *previous):
         if path.name == name:
             raise OSError(28, "No space left on device")
-        return real(path)
+        return real(path, *previous)
 
     monkeypatch.setattr(files, "replacing", full)
     if name == checkpoint.LOG_FILE:

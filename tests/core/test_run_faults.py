@@ -43,15 +43,15 @@ class Torn:
         die()
 
 @contextlib.contextmanager
-def replacing(path):
-    with real(path) as stream:
+def replacing(path, *previous):
+    with real(path, *previous) as stream:
         if path.name == "checkpoint.pt":
             seen.append(path)
         yield Torn(stream) if moment == "half" and len(seen) == 2 else stream
 
 def rename(source, target):
     second = len(seen) == 2 and str(target).endswith("checkpoint.pt")
-    if second and moment == "before":
+    if second and moment == "between" or moment == "before" and str(target).endswith("checkpoint.previous.pt"):
         die()
     replace(source, target)
     if second and moment == "after":
@@ -101,7 +101,7 @@ def in_process(code, *given):
     return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
-@pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("after", 20)])
+@pytest.mark.parametrize(("moment", "kept"), [("half", 10), ("before", 10), ("between", 10), ("after", 20)])
 def test_a_kill_within_a_write_leaves_a_whole_checkpoint(tiny, reference, tmp_path, moment, kept):
     folder = tmp_path / "run"
     killed = in_process(KILLED_WITHIN_A_WRITE, moment, *arguments(tiny.root, folder))

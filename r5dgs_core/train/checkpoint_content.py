@@ -1,0 +1,174 @@
+"""Rules that the content of a checkpoint keeps: plain values, and tensors whose shapes and types fit each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CheckpointError
+from ..model.gaussians import PARAMETERS
+
+FORMAT_VERSION = 1
+RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: the gain of a body is not always known
+TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
+
+_WHOLE = (torch.int64, torch.int32)
+_DTYPES = (torch.float32, torch.float64, torch.uint8, torch.bool, *_WHOLE)
+# Lengths by letter: N Gaussians, B classes of them with the background, G bodies with the pinned one, S observed times,
+# W shadows. Other letters stand for any length; the same letter always stands for the same length.
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "gaussians.means": ("N", 3),
+    "gaussians.quats": ("N", 4),
+    "gaussians.log_scales": ("N", 3),
+    "gaussians.opacity_logits": ("N",),
+    "gaussians.sh": ("N", 1, 3),
+    "gaussians.sh_rest": ("N", "K - 1", 3),
+    "gaussians.shading": ("N", 3),
+    "gaussians.identities": ("N", "D"),
+    "gaussians.motion_ids": ("N",),
+    "object_ids": ("B",),
+    "background": ("Kb", 3),
+    "generator": ("bytes",),
+    "light": (3,),
+    "labels": ("N",),
+    "identities": ("N", "D"),
+    "classifier.weight": ("C", "D"),
+    "classifier.bias": ("C",),
+    "tracks.times": ("S",),
+    "tracks.centers": ("G", 3),
+    "tracks.translations": ("G", "S", 3),
+    "tracks.rotvecs": ("G", "S", 3),
+    "tracks.base_quats": ("G", "S", 4),
+    "tracks.slope": (3,),
+    "tracks.casters": ("W",),
+    "tracks.plane_normal": (3,),
+    "tracks.entered": (2,),
+    "field.times": ("S",),
+    "field.casters": ("W",),
+    "field.plane_normal": (3,),
+    "field.bodies": (),
+    "field.iteration": (),
+    "still.centers": ("G", 3),
+    "still.time": (),
+}
+_WHOLE_NUMBERS = {
+    "gaussians.motion_ids",
+    "object_ids",
+    "labels",
+    "tracks.casters",
+    "tracks.entered",
+    "field.casters",
+    "field.bodies",
+    "field.iteration",
+}
+_REQUIRED = {  # of each representation
+    "tracks": ("light", *(name for name in _SHAPES if name.startswith("tracks.") and name != "tracks.entered")),
+    "field": ("light", *(name for name in _SHAPES if name.startswith("field."))),
+    "still": ("still.centers", "still.time"),
+}
+
+
+def check(content: Any) -> dict[str, Any]:
+    """Return the values of a checkpoint by the names of its fields.
+
+    Args:
+        content: What the file holds.
+
+    Raises:
+        CheckpointError: Something is missing or does not fit; the message names it and not the file.
+    """
+    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
+        raise CheckpointError(f"expected a checkpoint of format_version {FORMAT_VERSION}")
+    for name, (good, expected) in _RULES.items():
+        if name not in content:
+            raise CheckpointError(f"expected '{name}', found none")
+        if not good(content[name]):
+            raise CheckpointError(f"'{name}': expected {expected}, found {type(content[name]).__name__}")
+    tensors = content["tensors"]
+    for name in (*TENSORS, *_REQUIRED.get(content["representation"], ())):
+        if name not in tensors:
+            raise CheckpointError(f"expected the tensor '{name}', found none")
+    _check_tensors({**tensors, "observed": content["observed"]})
+    return {name: content[name] for name in _RULES}
+
+
+def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
+    """Raise CheckpointError if a tensor is not plain memory, or two do not fit each other."""
+    lengths: dict[str, int] = {}
+    for name, tensor in tensors.items():
+        if not _is_plain(tensor):
+            kind = f"{tensor.dtype}, {tensor.layout}, {tensor.device}".replace("torch.", "")
+            raise CheckpointError(f"'{name}': expected a dense tensor of real numbers, found one of {kind}")
+        shape = _SHAPES.get(name)
+        if shape is None:
+            continue
+        found = tuple(tensor.shape)
+        fits = len(shape) == len(found)
+        for length, letter in zip(found, shape, strict=False):
+            fits = fits and length == (letter if isinstance(letter, int) else lengths.setdefault(letter, length))
+        if not fits:
+            expected = ", ".join(f"{x} = {lengths[x]}" if x in lengths else str(x) for x in map(str, shape))
+            raise CheckpointError(f"'{name}': expected shape [{expected}], found {list(found)}")
+        if (name in _WHOLE_NUMBERS) != (tensor.dtype in _WHOLE) and name != "generator":
+            raise CheckpointError(f"'{name}': expected another type of number than {tensor.dtype}")
+    if len(tensors["observed"]) != max(0, lengths["B"] - 1) and "discovery.labels" not in tensors:
+        raise CheckpointError(f"'observed': expected {lengths['B'] - 1} rows, found {len(tensors['observed'])}")
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Return True for a dense tensor in memory; one whose elements share memory is none."""
+    return (
+        type(tensor) is Tensor
+        and tensor.layout == torch.strided
+        and tensor.device.type == "cpu"
+        and tensor.dtype in _DTYPES
+        and (tensor.numel() == 0 or not _overlaps(tensor))
+    )
+
+
+def _overlaps(tensor: Tensor) -> bool:
+    """Return True if two elements share memory, as those of an axis with stride 0 do."""
+    end = 1
+    for stride, length in sorted(zip(tensor.stride(), tensor.shape, strict=True)):
+        if length > 1:
+            if stride < end:
+                return True
+            end = stride * length
+    return False
+
+
+def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:
+    """A test for a row of numbers of some kinds, of a length if one is given."""
+    return lambda value: (
+        isinstance(value, list | tuple)
+        and (length is None or len(value) == length)
+        and all(isinstance(x, kinds) and not isinstance(x, bool) for x in value)
+    )
+
+
+def _is(kinds: type | tuple[type, ...]) -> Callable[[Any], bool]:
+    """A test for a number of some kinds."""
+    return lambda value: _are(kinds, 1)([value])
+
+
+def _are_tensors(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(n, str) and isinstance(t, Tensor) for n, t in value.items())
+
+
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "tensors": (_are_tensors, "tensors by name"),
+    "representation": (lambda value: isinstance(value, str), "a name"),
+    "iteration": (_is(int), "a whole number"),
+    "entered": (_are(int, 2), "two whole numbers"),
+    "first_time": (_is(int), "a whole number"),
+    "queue": (_are(int), "whole numbers"),
+    "running_loss": (_is((int, float)), "a number"),
+    "origin": (_are((int, float), 3), "three numbers"),
+    "scale": (lambda value: _is((int, float))(value) and value > 0, "a positive number"),
+    "observed": (lambda value: isinstance(value, Tensor) and value.dtype == torch.bool, "a tensor of truth values"),
+    "finished": (lambda value: isinstance(value, bool), "true or false"),
+    "seconds": (_is((int, float)), "a number"),
+}

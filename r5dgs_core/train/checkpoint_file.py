@@ -1,0 +1,83 @@
+"""Checkpoint files: the zip of ``torch.save`` with a digest of every byte before it as the archive's comment.
+
+``torch.load`` does not compare a member with its stored CRC, so a damaged file would be loaded with other numbers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..scene import files
+
+_MARK = b"sha256:"
+_COMMENT_SIZE = len(_MARK) + hashlib.sha256().digest_size * 2
+_LENGTH = struct.Struct("<H")  # of the comment: the last field of a zip archive
+
+
+class DamagedError(Exception):
+    """A file is not what was written; the message gives the reason."""
+
+
+def write(path: Path, content: dict[str, Any], previous: Path) -> None:
+    """Replace a checkpoint file.
+
+    Args:
+        path: The file.
+        content: Tensors and plain values.
+        previous: Place of the old file from then on.
+
+    Raises:
+        OSError: It cannot be written; the old file is kept.
+    """
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    buffer.seek(-_LENGTH.size, io.SEEK_END)
+    buffer.write(_LENGTH.pack(_COMMENT_SIZE))
+    with files.replacing(path, previous) as stream:
+        stream.write(buffer.getbuffer())
+        stream.write(_MARK + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
+
+
+def read(path: Path) -> Any:
+    """Read a checkpoint file whose bytes are all as they were written.
+
+    Files of earlier versions have no digest; the CRC of each of their members is checked instead.
+
+    Raises:
+        DamagedError: A byte differs, or the content is more than tensors and plain values.
+        OSError: The file cannot be read.
+    """
+    data = path.read_bytes()
+    try:
+        _check(data)
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except DamagedError:
+        raise
+    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
+        raise DamagedError(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
+
+
+def _check(data: bytes) -> None:
+    """Compare an archive with its digest, or with its CRCs if it has none."""
+    body, comment = memoryview(data)[:-_COMMENT_SIZE], data[-_COMMENT_SIZE:]
+    sealed = comment.startswith(_MARK)
+    if sealed and comment != _MARK + hashlib.sha256(body).hexdigest().encode():
+        raise DamagedError("its content does not match its digest")
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = archive.infolist()
+        if archive.comment != (comment if sealed else b""):
+            raise DamagedError("its digest is incomplete")
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise DamagedError("a member is compressed, which torch.save never does")
+        if len({member.filename for member in members}) < len(members):
+            raise DamagedError("two members have the same name")
+        broken = None if sealed else archive.testzip()
+        if broken is not None:
+            raise DamagedError(f"the CRC of {broken} is wrong")
