@@ -243,7 +243,7 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
         trained_on = scene.provenance.get("dataset_digest")
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data than this; it is used all the same", dataset.root, target)
-    return scene, dataset
+    return scene, None if dataset is None else dataset.relative_to(scene.origin)
 
 
 def check_target(target: Path, data: Path | None) -> None:

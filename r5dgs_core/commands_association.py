@@ -56,6 +56,7 @@ def run_associate(
         folder = (Path(out) if out is not None else target / datasets.MASKS).resolve()
         if masks is not None or dataset.mask_folder is None:
             dataset = datasets.read(dataset.root, datasets.MASKS if masks is None else str(Path(masks).resolve()))
+            dataset = dataset.relative_to(scene.origin)
         assert dataset.mask_folder is not None
         if folder == dataset.mask_folder.resolve():
             raise errors.ConfigError(f"--out {folder}: holds the incoming masks; name another folder")

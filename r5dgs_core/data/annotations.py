@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,12 @@ class GroundTruth:
     names: tuple[str, ...]
     matrices: np.ndarray
     t_max: float
+
+    def moved(self, shift: np.ndarray) -> GroundTruth:
+        """The poses with all objects moved by a vector. [3]"""
+        matrices = self.matrices.copy()
+        matrices[..., :3, 3] += shift
+        return replace(self, matrices=matrices)
 
 
 def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]]:

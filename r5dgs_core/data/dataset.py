@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from .. import errors, input_paths
 from ..scene import cameras
 from . import colmap, images, mask_notes, masks, transforms
+from . import origin as origins
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
 
 SPLITS = ("train", "val", "test")
@@ -74,6 +75,8 @@ class Dataset:
         point_colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
         mask_folder: Folder of the training views' masks; None where they are passed over.
         own_ids: Whether the ids in it are its own, not those of the data set.
+        origin: Point of the world of the files from which all positions here are measured; zero unless the cameras
+            stand so far from the world's that float32 would lose detail (`origin`). [3] float64
     """
 
     root: Path
@@ -92,6 +95,7 @@ class Dataset:
     point_colors: np.ndarray | None = None
     mask_folder: Path | None = None
     own_ids: bool = False
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def views(self, split: str) -> tuple[View, ...]:
         """The views of "train", "val" or "test"."""
@@ -117,6 +121,23 @@ class Dataset:
     def t_max(self) -> float:
         """Last observed time: that of the latest training view."""
         return float(self.times[-1])
+
+    def relative_to(self, origin: np.ndarray) -> Dataset:
+        """The same data set with positions measured from another point of the world of the files. [3]"""
+        shift = self.origin - origin
+        if not shift.any():
+            return self
+        splits = {
+            split: tuple(replace(view, camera=cameras.moved(view.camera, shift)) for view in self.views(split))
+            for split in SPLITS
+        }
+        return replace(
+            self,
+            **splits,
+            ground_truth=None if self.ground_truth is None else self.ground_truth.moved(shift),
+            points=None if self.points is None else self.points + shift,
+            origin=np.asarray(origin, np.float64),
+        )
 
     def require_one_numbering(self) -> None:
         """Refuse masks of the training views that cannot be trained with.
@@ -169,7 +190,12 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
     if not entries["train"]:
         raise errors.DatasetError(f"{root / 'transforms_train.json'}: expected at least one frame, found none")
 
-    camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]])
+    origin = origins.find(np.stack([e.matrix[:3, 3] for split in SPLITS for e in entries[split]]), str(root))
+    if origin.any():
+        entries = {split: [entry.moved(-origin) for entry in entries[split]] for split in SPLITS}
+        _log.info("the cameras stand far from the world's origin: positions are measured from %s", origin.tolist())
+    rounding = float(np.spacing(np.abs(origin).max()))
+    camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]], rounding)
     image_root = root if reconstruction is None else root / colmap.IMAGES
     folders = {"train": _mask_folder(root, train_masks), "val": root / MASKS, "test": root / MASKS}
     views = {split: _make_views(folders[split], image_root, split, entries[split], camera_names) for split in SPLITS}
@@ -198,6 +224,7 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         )
     ground_truth = None if own_ids else read_ground_truth(root)  # which goes by the ids of the data set's own masks
     if ground_truth is not None:
+        ground_truth = ground_truth.moved(-origin)
         for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
             names.setdefault(object_id, name)
     return Dataset(
@@ -213,10 +240,11 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         frames_per_unit=_frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]]),
         has_alpha=_has_alpha(views["train"]),
         digest=hasher.hexdigest(),
-        points=None if reconstruction is None else reconstruction.points,
+        points=None if reconstruction is None or reconstruction.points is None else reconstruction.points - origin,
         point_colors=None if reconstruction is None else reconstruction.colors,
         mask_folder=mask_folder,
         own_ids=own_ids,
+        origin=origin,
     )
 
 
@@ -256,13 +284,14 @@ class _CameraNames:
 
     Args:
         entries: All views of the data set; a made name is none of those that they give.
+        rounding: Error of the cameras' positions, world units.
     """
 
-    def __init__(self, entries: list[transforms.Entry]) -> None:
+    def __init__(self, entries: list[transforms.Entry], rounding: float) -> None:
         centers = np.array([entry.matrix[:3, 3] for entry in entries], np.float64)
         middle = np.median(centers, axis=0)
         apart = float(np.median(np.linalg.norm(centers - middle, axis=1)))
-        self.step = max(1e-6 * apart, 1e-9 * float(np.linalg.norm(middle)), 1e-300)
+        self.step = max(1e-6 * apart, 1e-9 * float(np.linalg.norm(middle)), 4 * rounding, 1e-300)
         self.taken = {entry.camera for entry in entries if entry.camera}
         self.by_key: dict[tuple, str] = {}
         self.uses: dict[str, int] = {}

@@ -8,7 +8,7 @@ axes (y up, looking along -z). Where no time is given a frame has index / (n - 1
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -41,6 +41,12 @@ class Entry:
     camera: str
     lens: dict[str, float]
     frame: float | None
+
+    def moved(self, shift: np.ndarray) -> Entry:
+        """The frame with its camera moved by a vector. [3]"""
+        matrix = self.matrix.copy()
+        matrix[:3, 3] += shift
+        return replace(self, matrix=matrix)
 
 
 def read(path: Path) -> tuple[list[Entry], dict[str, Any]]:

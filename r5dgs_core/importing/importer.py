@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import __version__
 from ..data import dataset as datasets
+from ..data import origin as origins
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
@@ -88,7 +89,7 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
         R5dgsError: The folder or the data set cannot be used; the message says why.
     """
     run = run_folder.open_run(folder, options.iteration)
-    dataset = None if options.data is None else datasets.read(options.data)
+    dataset = None if options.data is None else datasets.read(options.data).relative_to(np.zeros(3))
     foreign = read(run, options.t_max)
     motion, times = None, np.zeros(1)
     if foreign.state is not None:
@@ -114,7 +115,28 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
             "versions": {"r5dgs": __version__},
         },
     )
-    return scene
+    return _among_cameras(scene, run.folder)
+
+
+def _among_cameras(scene: Scene, folder: Path) -> Scene:
+    """The scene with an origin among its cameras if these stand far from the world's."""
+    if not scene.cameras:
+        return scene
+    origin = origins.find(np.stack([camera.center for camera in scene.cameras]), f"{folder}: cameras")
+    if not origin.any():
+        return scene
+    _log.warning(
+        "%s: the run lies far from the origin of its world; its Gaussians were stored to %.2g units there. "
+        "Train it nearer to the origin for sharp pictures",
+        folder,
+        np.spacing(np.float32(np.abs(origin).max())),
+    )
+    return dataclasses.replace(
+        scene,
+        means=(scene.means.astype(np.float64) - origin).astype(np.float32),
+        cameras=tuple(cameras.moved(camera, -origin) for camera in scene.cameras),
+        origin=origin,
+    )
 
 
 def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> np.ndarray:

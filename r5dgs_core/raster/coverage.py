@@ -6,11 +6,10 @@ group covers before the eye, and all groups together are the pixel's alpha.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import torch
 
+from ..scene import cameras
 from ..scene.cameras import Camera
 from . import rasterize, scene_render
 from .settings import RasterSettings
@@ -44,7 +43,7 @@ def shares(
     size = (ranks, camera.height * camera.width)
     best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
     groups = np.asarray(groups, np.int64)
-    gaussians, seen = scene_render.PosedGaussians(posed), _seen_from(camera, posed.origin)
+    gaussians, seen = scene_render.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
     present = np.unique(groups[groups >= 0])
     for first in range(0, len(present), CHANNELS):
         chosen = present[first : first + CHANNELS]
@@ -75,10 +74,3 @@ def _insert(best: np.ndarray, found: np.ndarray, values: np.ndarray, group: int)
         shares[larger], names[larger] = passed, passed_names
         left = shares > 0
         pixels, shares, names = pixels[left], shares[left], names[left]
-
-
-def _seen_from(camera: Camera, origin: np.ndarray) -> Camera:
-    """The camera of a world whose origin is a point of ours."""
-    T_cam_world = camera.T_cam_world.copy()
-    T_cam_world[:3, 3] += T_cam_world[:3, :3] @ origin
-    return dataclasses.replace(camera, T_cam_world=T_cam_world)

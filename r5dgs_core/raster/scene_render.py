@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ..model import spherical_harmonics
-from ..scene import playback
+from ..scene import cameras, playback
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import RasterSettings, RenderOutput, harmonics, posed_scene, rasterize
@@ -60,7 +60,7 @@ def render_frame(
     with torch.no_grad():
         return rasterize(
             PosedGaussians(posed),
-            _relative(camera, posed.origin),
+            cameras.moved(camera, -posed.origin),
             None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
             None if background is None else tensor(background),
             colors=tensor(colors(posed, camera)),
@@ -121,15 +121,6 @@ def behind(scene: Scene, camera: Camera) -> np.ndarray:
     """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
     image = sky(scene, camera)
     return image[0, 0] if len(scene.background_sh) == 1 else image
-
-
-def _relative(camera: Camera, origin: np.ndarray) -> Camera:
-    """The camera of a world whose origin is a point of ours; itself where that is our origin."""
-    if not origin.any():
-        return camera
-    T_cam_world = camera.T_cam_world.copy()
-    T_cam_world[:3, 3] += T_cam_world[:3, :3] @ origin
-    return dataclasses.replace(camera, T_cam_world=T_cam_world)
 
 
 def to_numpy(value: Any, dtype: type) -> np.ndarray:

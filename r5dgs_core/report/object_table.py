@@ -245,5 +245,5 @@ def _residual(scene: Scene, groups: Sequence[MotionGroup]) -> float | None:
     if not any(group.rigid_max > 0 for group in groups):
         return None
     counts = np.array([max(int((scene.motion_ids == group.id).sum()), 1) for group in groups])
-    squares = np.array([(group.rigid_rms / max(group.model.radius, 1e-12)) ** 2 for group in groups])
+    squares = np.array([(group.rigid_rms / max(group.model.radius, 1e-9 * scene.extent)) ** 2 for group in groups])
     return float(np.sqrt(np.average(squares, weights=counts)))

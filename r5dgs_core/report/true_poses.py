@@ -151,4 +151,6 @@ def _size(scene: Scene, group: MotionGroup) -> float:
     if group.role == "body":
         return 2 * group.model.radius
     distances = np.linalg.norm(scene.means[scene.object_ids == group.object_id] - group.pivot, axis=-1)
-    return 2 * max(float(np.quantile(distances, 0.9)), 1e-9) if len(distances) else 2 * group.model.radius
+    if not len(distances):
+        return 2 * group.model.radius
+    return 2 * max(float(np.quantile(distances, 0.9)), 1e-9 * scene.extent)

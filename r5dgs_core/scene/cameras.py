@@ -104,6 +104,15 @@ def is_parallel(projection: np.ndarray) -> bool:
     return bool(abs(projection[3, 3]) > 0.5)
 
 
+def moved(camera: Camera, shift: np.ndarray) -> Camera:
+    """The camera moved by a vector of the world; itself if that is zero. [3]"""
+    if not np.any(shift):
+        return camera
+    T_cam_world = camera.T_cam_world.copy()
+    T_cam_world[:3, 3] -= T_cam_world[:3, :3] @ shift
+    return dataclasses.replace(camera, T_cam_world=T_cam_world)
+
+
 def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
     """The camera of a part of the picture, in pixels from its upper left corner; what lies outside is seen, too."""
     intrinsics = camera.intrinsics.copy()
@@ -131,8 +140,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """
     p_cam = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     z = p_cam[..., 2]
-    safe = np.where(z > 1e-9, z, np.nan)
-    uv = p_cam[..., :2] / safe[..., None]
+    in_front = z > 1e-9 * np.abs(p_cam).max(axis=-1)  # whatever the unit of the world
+    uv = p_cam[..., :2] / np.where(in_front, z, np.nan)[..., None]
     k = camera.intrinsics
     pixels = np.stack([k[0, 0] * uv[..., 0] + k[0, 1] * uv[..., 1] + k[0, 2], k[1, 1] * uv[..., 1] + k[1, 2]], axis=-1)
     return pixels, z

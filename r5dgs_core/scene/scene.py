@@ -181,7 +181,7 @@ class Scene:
         if len(self.means) == 0:
             return 1.0
         low, high = np.quantile(self.means.astype(np.float64), [0.01, 0.99], axis=0)
-        return float(max(np.linalg.norm(high - low), 1e-12))
+        return float(max(np.linalg.norm(high - low), 1e-30))
 
     def object(self, object_id: int) -> SceneObject:
         """The object with this id. Raises KeyError where there is none."""

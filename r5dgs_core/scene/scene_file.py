@@ -192,6 +192,7 @@ def info(scene: Scene) -> dict[str, Any]:
         "world_convention": scene.world_convention,
         "cameras": len(scene.cameras),
         "extent": scene.extent,
+        **({"origin": scene.origin.tolist()} if scene.origin.any() else {}),
         "identities": scene.identities is not None,
         "shading": scene.shading is not None,
         "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),

@@ -130,7 +130,7 @@ def overview(scene: Scene) -> Camera:
     right = np.cross(up, back)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, -np.cross(back, right), -back])  # OpenCV: x right, y down, z forward
-    center = middle + 3.0 * max(radius, 1e-6) * back
+    center = middle + 3.0 * max(radius, 1e-6 * scene.extent) * back
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = rotation, -rotation @ center
     focal = 640 * 1.2

@@ -62,7 +62,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     found = mask_stack.NAME in tensors or mask_stack.LABELS in tensors
     if found:
         dataset = dataclasses.replace(dataset, object_names={}, object_aliases={})
-    norm = Normalization(np.array(state.origin), state.scale)
+    norm = Normalization(np.array(state.origin) - dataset.origin, state.scale)
     cloud, motion = _observed(run, state, norm)
     light, strength = _unit(motion.light)
     cloud.shading *= strength
@@ -145,6 +145,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         },
         needs=(*decisions, *bound.of_objects),
         near_plane=NEAR_PLANE * norm.scale,
+        origin=dataset.origin,
         **single,
     )
     cleaned = label_hygiene.changes_of(tensors)
@@ -279,7 +280,7 @@ def _bind(
             poses[:first] = poses[first]
         trained.append(poses.copy())
         pivots.append(pivot)
-        radius = _radius(cloud.means[members], opacities[members], pivot)
+        radius = max(_radius(cloud.means[members], opacities[members], pivot), 1e-9 * norm.scale)
         if wanted.rotation == "off":
             poses[:, :4] = needs.STILL_QUAT
         if needs.is_pinned(group.role, poses, radius, wanted):
@@ -324,7 +325,7 @@ def _radius(means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> floa
     """Distance from the pivot that holds nine of ten members that can be seen."""
     if len(means) == 0:
         return 1.0
-    return max(float(np.quantile(np.linalg.norm(means - pivot, axis=1)[visibility.seen(opacities)], 0.9)), 1e-9)
+    return float(np.quantile(np.linalg.norm(means - pivot, axis=1)[visibility.seen(opacities)], 0.9))
 
 
 def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> int:

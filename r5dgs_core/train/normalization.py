@@ -59,11 +59,12 @@ def from_cameras(cameras: Sequence[Camera]) -> Normalization:
     system = projector.mean(0)
     eigenvalues = np.linalg.eigvalsh(system)
     spread = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    rounding = 1e-9 * float(np.abs(centers).max())  # cameras at one place differ by less
     if eigenvalues[0] > 1e-3:
         focus = np.linalg.solve(system, np.einsum("nij,nj->i", projector, centers) / len(cameras))
         depth = np.einsum("nj,nj->n", focus - centers, forward)
-        if np.mean(depth > 0) > 0.7 and np.median(depth) > 1e-9:
+        if np.mean(depth > 0) > 0.7 and np.median(depth) > rounding:
             return Normalization(focus, float(np.median(depth)) / TARGET_DISTANCE)
-    if spread > 1e-9:
+    if spread > rounding:
         return Normalization(centers.mean(0) + forward.mean(0) * spread, spread / TARGET_DISTANCE * 2)
     return Normalization(centers.mean(0) + forward.mean(0) * TARGET_DISTANCE, 1.0)

@@ -389,7 +389,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             moments = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
-        x, y, z = (float(v) for v in self.normalization.origin)
+        x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
         return Checkpoint(
             tensors={n: t.detach().clone() for n, t in tensors.items()},
             representation=self.motion.name,

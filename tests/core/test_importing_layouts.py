@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -249,3 +252,19 @@ def test_freegave_keeps_what_hardly_moves_as_at_time_zero(tmp_path):
     code, _ = code_and_shares(codes, cloud)
     moved, turn, growth = foreign.deform(deform, 6, 8, cloud.means, 0.0, code)
     assert_drawn(scene, 0.4, foreign.twisted(cloud, moved, turn, growth, None, 0.0))
+
+
+def test_a_run_far_from_the_origin_keeps_what_its_files_hold_and_gets_an_origin(tmp_path, caplog):
+    shift = np.array([2.0**21, -(2.0**20), 0.0])
+    cloud = foreign.cloud()
+    far = dataclasses.replace(cloud, means=cloud.means + torch.from_numpy(shift))
+    foreign.write_common(tmp_path / "run", far, 7000, "white_background=True, source_path='nowhere'")
+    path = tmp_path / "run" / "cameras.json"
+    rows = json.loads(path.read_text())
+    path.write_text(json.dumps([{**row, "position": (np.array(row["position"]) + shift).tolist()} for row in rows]))
+    scene = imported(tmp_path / "run", tmp_path)
+    assert np.abs(scene.origin - shift).max() < 8 and np.abs(scene.means).max() < 8
+    stored = far.means.numpy().astype(np.float32).astype(np.float64)
+    np.testing.assert_allclose(scene.means + scene.origin, stored, atol=1e-6)
+    np.testing.assert_allclose(scene.cameras[0].center + scene.origin, foreign.view().center + shift, atol=1e-8)
+    assert [record.getMessage() for record in caplog.records if "to 0.25 units" in record.getMessage()]
