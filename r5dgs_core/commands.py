@@ -235,11 +235,11 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
 
     if target.is_dir():
         run = checkpoint.open_run(target)
-        dataset = datasets.read(run.data(data), run.config.data.masks)
+        dataset = datasets.read(run.data(data), run.config.data.masks, run.config.data.min_registered)
         scene, trained_on = bake.bake(run, dataset), run.digest
     else:
         scene = scene_file.read(target)
-        dataset = None if data is None else datasets.read(data)
+        dataset = None if data is None else datasets.read(data, min_registered=0.0)
         trained_on = scene.provenance.get("dataset_digest")
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
         log.warning("%s: %s was trained on other data than this; it is used all the same", dataset.root, target)

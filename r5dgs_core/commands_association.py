@@ -55,7 +55,7 @@ def run_associate(
         assert dataset is not None
         folder = (Path(out) if out is not None else target / datasets.MASKS).resolve()
         if masks is not None or dataset.mask_folder is None:
-            dataset = datasets.read(dataset.root, datasets.MASKS if masks is None else str(Path(masks).resolve()))
+            dataset = datasets.read(dataset.root, datasets.MASKS if masks is None else str(Path(masks).resolve()), 0.0)
             dataset = dataset.relative_to(scene.origin)
         assert dataset.mask_folder is not None
         if folder == dataset.mask_folder.resolve():

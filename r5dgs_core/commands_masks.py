@@ -65,7 +65,7 @@ def run_masks(
     from .progress import make
     from .semantics import mask_making
 
-    dataset = datasets.read(data, datasets.NO_MASKS)
+    dataset = datasets.read(data, datasets.NO_MASKS, min_registered=0.0)
     folder = dataset.root / datasets.MASKS if out is None else Path(out)
     views = dataset.train
     if backend == "sam2":

@@ -2,7 +2,15 @@
 
 
 class R5dgsError(Exception):
-    """Base of everything that the command line and the add-on report without a traceback."""
+    """Base of everything that the command line and the add-on report without a traceback.
+
+    Attributes:
+        code: Code of the fault in the table of `r5dgs check`, "" if it has none.
+    """
+
+    def __init__(self, message: str = "", *, code: str = ""):
+        super().__init__(message)
+        self.code = code
 
 
 class ConfigError(R5dgsError):

@@ -23,12 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, input_paths, strict_json
+from .. import errors, findings, input_paths, strict_json
 from ..scene import cameras
 from . import colmap_model, images, transforms
 from .colmap_model import Registered
 from .transforms import Entry
 
+MIN_REGISTERED = 0.5  # share of the images; fewer are a failed reconstruction
 HELD_OUT = 8  # every eighth camera is held out, as 3D Gaussian Splatting does
 IMAGES = "images"
 _log = logging.getLogger(__name__)
@@ -63,33 +64,44 @@ class _Frame:
     t: float = 0.0
 
 
-def read(root: Path) -> Found:
+def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Guard = findings.STRICT) -> Found:
     """Read cameras, times and points of a data set.
 
     Every eighth camera (by name, from the first one on) is held out where there are at least eight, within the span of
     times that the others observe: what it took outside is left out, and a camera that took nothing inside is trained
     on. Views later than "t_max" of ``times.json`` are the test.
 
+    Args:
+        root: Folder of the data set.
+        min_registered: Smallest share of the images that must have a pose. With ``times.json``, images that it does not
+            list do not count.
+        guard: Entered around each image that may lack a pose or a time.
+
     Raises:
-        DatasetError: Something is missing or damaged; distorted lenses are not supported.
+        DatasetError: Something is missing or damaged, or too few images are registered; distorted lenses are not
+            supported.
     """
     sparse = input_paths.reconstruction(root)
     if sparse is None:
-        raise errors.DatasetError(f"{root / 'sparse' / '0'}: expected a COLMAP reconstruction, found none")
+        raise errors.DatasetError(f"{root / 'sparse' / '0'}: expected a COLMAP reconstruction, found none", code="D14")
     if not (root / IMAGES).is_dir():
-        raise errors.DatasetError(f"{root / IMAGES}: expected the folder of the images, found none")
-    model = colmap_model.read(sparse)
+        raise errors.DatasetError(f"{root / IMAGES}: expected the folder of the images, found none", code="D14")
+    with findings.coded("D14"):
+        model = colmap_model.read(sparse)
     path = root / "times.json"
     header: dict[str, Any] = {"world_convention": "colmap"}
     if path.exists():
-        times, more = _read_times(path)
+        with findings.coded("D16"):
+            times, more = _read_times(path)
         header |= more
-        frames = _timed(root, model.images, times, path)
+        frames = _timed(root, model.images, times, path, guard)
     else:
-        frames, numbers = _videos(root, model.images)
+        frames, numbers = _videos(root, model.images, guard)
         if numbers:
             header["frames_per_unit"] = float(numbers)
         frames = frames or [_Frame(image.name, image, _stem(image.name)) for image in model.images]
+        with guard():
+            _check_registered(root, frames, model.images, min_registered)
     splits = _split(frames, header.get("t_max", math.inf))
     entries = {
         split: [_entry(sparse, frame) for frame in sorted(part, key=lambda frame: (frame.t, frame.name))]
@@ -103,7 +115,7 @@ def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
     """Time of each image, and the other keys of ``times.json``."""
     content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
-        raise errors.DatasetError(f"{path}: expected image names and times, found {type(content).__name__}")
+        raise errors.DatasetError(f"{path}: expected image names and times, found {type(content).__name__}", code="D16")
     more = {}
     times = content
     if isinstance(content.get("times"), dict):
@@ -111,30 +123,74 @@ def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
         given = (key for key in ("t_max", "frames_per_unit") if key in content)
         more = {key: transforms.finite(str(path), key, content[key]) for key in given}
     if not times:
-        raise errors.DatasetError(f"{path}: expected image names and times, found none")
+        raise errors.DatasetError(f"{path}: expected image names and times, found none", code="D16")
     return {str(name).replace("\\", "/"): transforms.finite(str(path), name, t) for name, t in times.items()}, more
 
 
-def _timed(root: Path, registered: tuple[Registered, ...], times: dict[str, float], path: Path) -> list[_Frame]:
+def _check_registered(
+    root: Path, frames: list[_Frame], registered: tuple[Registered, ...], min_registered: float
+) -> None:
+    """Refuse a data set if most of its images have no pose, or if there are videos among them."""
+    placed = {frame.name for frame in frames} | {image.name for image in registered}
+    kinds = (*images.SUFFIXES, *images.UNREADABLE_SUFFIXES, *images.VIDEO_SUFFIXES)
+    present = {
+        path.relative_to(root / IMAGES).as_posix()
+        for path in (root / IMAGES).rglob("*")
+        if path.suffix.lower() in kinds and not path.name.startswith(".") and path.is_file()
+    }
+    missing = sorted(present - placed)
+    for name in missing:
+        if name.lower().endswith(images.VIDEO_SUFFIXES):
+            raise images.unreadable_kind(root / IMAGES / name)
+    if len(present) - len(missing) >= min_registered * len(present):
+        if missing:
+            _log.warning("%d of %d images have no pose and are left out: %s", len(missing), len(present), missing[0])
+        return
+    if all(name.lower().endswith(images.UNREADABLE_SUFFIXES) for name in missing):
+        raise images.unreadable_kind(root / IMAGES / missing[0])
+    accepted = 100 * (len(present) - len(missing)) // len(present) / 100
+    raise errors.DatasetError(
+        f"{root / IMAGES}: expected poses for most images, found {len(present) - len(missing)} of {len(present)} "
+        f"registered by COLMAP ({missing[0]} is not). Remedy: match more pairs of images ('colmap exhaustive_matcher', "
+        f"then 'colmap mapper'), remove the others from {IMAGES}/, or set data.min_registered to {accepted:g}",
+        code="D15",
+    )
+
+
+def _timed(
+    root: Path, registered: tuple[Registered, ...], times: dict[str, float], path: Path, guard: findings.Guard
+) -> list[_Frame]:
     """The images that ``times.json`` lists."""
     own = {image.name: image for image in registered}
     standing = _standing(registered)
     frames = []
     for name, t in times.items():
-        camera = name.rpartition("/")[0]
-        if name in own and not (camera in standing and _count(root, camera) > 1):
-            frames.append(_Frame(name, own[name], _stem(name), t))
-        elif camera in standing:
-            frames.append(_Frame(name, standing[camera], camera, t))
-        else:
-            raise errors.DatasetError(
-                f"{path}: {name!r}: expected a registered image, or one of a camera that is registered once, found "
-                "neither; was it left out by COLMAP? Remove it here"
-            )
+        with guard():
+            camera = name.rpartition("/")[0]
+            _check_kind(root, name, f"{path}: {name!r}")
+            if name in own and not (camera in standing and _count(root, camera) > 1):
+                frames.append(_Frame(name, own[name], _stem(name), t))
+            elif camera in standing:
+                frames.append(_Frame(name, standing[camera], camera, t))
+            else:
+                raise errors.DatasetError(
+                    f"{path}: {name!r}: expected a registered image, or one of a camera that is registered once, found "
+                    "neither; was it left out by COLMAP? Remove it here",
+                    code="D16",
+                )
     return frames
 
 
-def _videos(root: Path, registered: tuple[Registered, ...]) -> tuple[list[_Frame], int]:
+def _check_kind(root: Path, name: str, place: str) -> None:
+    """Raise the error for an image that is missing or of a kind that is not read; others pass."""
+    path = root / IMAGES / name
+    if not path.is_file():
+        raise errors.DatasetError(f"{place}: the image is missing, expected {path}", code="D10")
+    if path.suffix.lower() not in images.SUFFIXES:
+        raise images.unreadable_kind(path, place)
+
+
+def _videos(root: Path, registered: tuple[Registered, ...], guard: findings.Guard) -> tuple[list[_Frame], int]:
     """The frames of cameras that stand still, none where no camera has more than one, and the last of their numbers.
 
     The first number is 0.
@@ -153,13 +209,16 @@ def _videos(root: Path, registered: tuple[Registered, ...]) -> tuple[list[_Frame
         if match is None:
             raise errors.DatasetError(
                 f"{root / IMAGES / name}: expected a number at the end of the frame's name, found none; give the times "
-                f"in {root / 'times.json'}"
+                f"in {root / 'times.json'}",
+                code="D16",
             )
         numbers.append(int(match[1]))
     first, span = min(numbers), max(numbers) - min(numbers)
     used = {pose.name for _, pose, _ in found}
     for image in registered:
         if image.name not in used:
+            with guard():
+                _check_kind(root, image.name, f"{root / IMAGES / image.name}")
             _log.warning("%s: left out, as nothing says its time; give times.json", image.name)
     frames = [
         _Frame(name, pose, camera, (number - first) / max(span, 1))
@@ -199,7 +258,7 @@ def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
     held = set(names[::HELD_OUT]) if len(names) >= HELD_OUT else set()
     early = [frame for frame in frames if frame.t <= t_max + 1e-9]
     if not early:
-        raise errors.DatasetError(f"t_max {t_max:g} of times.json: expected images up to it, found none")
+        raise errors.DatasetError(f"t_max {t_max:g} of times.json: expected images up to it, found none", code="D16")
     first, last = _span(early, held)
     held &= {frame.camera for frame in early if first <= frame.t <= last}
     first, last = _span(early, held)

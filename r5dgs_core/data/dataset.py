@@ -7,6 +7,7 @@ camera files, images with a COLMAP reconstruction are read the same (`colmap`).
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import logging
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, input_paths
+from .. import errors, findings, input_paths
 from ..scene import cameras
 from . import colmap, images, mask_notes, masks, transforms
 from . import origin as origins
@@ -155,7 +156,12 @@ class Dataset:
             )
 
 
-def read(root: Path, train_masks: str = MASKS) -> Dataset:
+def read(
+    root: Path,
+    train_masks: str = MASKS,
+    min_registered: float = colmap.MIN_REGISTERED,
+    guard: findings.Guard = findings.STRICT,
+) -> Dataset:
     """Read and check a data set; images and masks are looked at, not loaded.
 
     Args:
@@ -163,6 +169,8 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         train_masks: Folder of the training views' masks, within ``root`` or anywhere; ``none`` passes all of them over.
             The other splits keep those of the data set: they are what a run is measured by. An ``objects.json`` in
             the folder says that its ids are its own; true poses, which go by the data set's, are then left out.
+        min_registered: Smallest share of the images in ``images`` that a COLMAP reconstruction must have registered.
+        guard: Entered around each frame, image and file, for callers that read on after a fault (`findings`).
 
     Returns:
         The data set. A split without camera file is empty.
@@ -171,8 +179,11 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         DatasetError: A file is missing or cannot be used; the message names it and says what to do.
     """
     root = Path(root)
-    input_paths.check_dataset(root)
-    reconstruction = None if (root / input_paths.CAMERAS_FILE).exists() else colmap.read(root)
+    with findings.coded("D01"):
+        input_paths.check_dataset(root)
+    reconstruction = None
+    if not (root / input_paths.CAMERAS_FILE).exists():
+        reconstruction = colmap.read(root, min_registered, guard)
     entries: dict[str, list[transforms.Entry]] = {}
     header: dict[str, Any] = {}
     hasher = hashlib.sha256()
@@ -180,15 +191,18 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         path = root / f"transforms_{split}.json"
         entries[split] = []
         if path.exists():
-            entries[split], top = transforms.read(path)
-            header = {**top, **header}
+            with guard():
+                entries[split], top = transforms.read(path, guard)
+                header = {**top, **header}
             hasher.update(path.read_bytes())
     if reconstruction is not None:
         entries, header = reconstruction.entries, reconstruction.header
         for path in reconstruction.files:
             hasher.update(path.read_bytes())
     if not entries["train"]:
-        raise errors.DatasetError(f"{root / 'transforms_train.json'}: expected at least one frame, found none")
+        raise errors.DatasetError(
+            f"{root / 'transforms_train.json'}: expected at least one frame, found none", code="D24"
+        )
 
     origin = origins.find(np.stack([e.matrix[:3, 3] for split in SPLITS for e in entries[split]]), str(root))
     if origin.any():
@@ -198,16 +212,23 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
     camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]], rounding)
     image_root = root if reconstruction is None else root / colmap.IMAGES
     folders = {"train": _mask_folder(root, train_masks), "val": root / MASKS, "test": root / MASKS}
-    views = {split: _make_views(folders[split], image_root, split, entries[split], camera_names) for split in SPLITS}
+    views = {
+        split: _make_views(folders[split], image_root, split, entries[split], camera_names, guard) for split in SPLITS
+    }
     named = folders["train"] if folders["train"] != folders["val"] else None
     if named is not None and all(view.mask_path is None for view in views["train"]):
         raise errors.DatasetError(
             f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: 'r5dgs masks' with "
-            "--from takes masks over that lie flat, --masks none goes without"
+            "--from takes masks over that lie flat, --masks none goes without",
+            code="D17",
         )
     for folder in dict.fromkeys(folders.values()):
-        alike = _attach_mask_colors({split: views[split] for split in SPLITS if folders[split] == folder})
-        views |= _attach_notes(alike, folder, hasher)
+        alike = {split: views[split] for split in SPLITS if folders[split] == folder}
+        with guard(), findings.coded("D17"):
+            alike = _attach_mask_colors(alike)
+        with guard(), findings.coded("D22"):
+            alike = _attach_notes(alike, folder, hasher)
+        views |= alike
     every = [view for split in SPLITS for view in views[split]]
     for view in every:
         for file in (view.image_path, view.mask_path):
@@ -215,18 +236,29 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
                 hasher.update(_fingerprint(root, file))
     mask_folder = folders["train"]
     own_ids = mask_folder is not None and (mask_folder / OBJECTS).exists()
-    names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
+    names: dict[int, str] = {}
+    aliases: dict[int, tuple[str, ...]] = {}
+    with guard(), findings.coded("D20"):
+        names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
     convention = header.get("world_convention", "blender")
-    if convention not in cameras.WORLD_TO_BLENDER:
-        raise errors.DatasetError(
-            f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
-            f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}"
-        )
-    ground_truth = None if own_ids else read_ground_truth(root)  # which goes by the ids of the data set's own masks
+    with guard():
+        if convention not in cameras.WORLD_TO_BLENDER:
+            raise errors.DatasetError(
+                f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
+                f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}",
+                code="D23",
+            )
+    ground_truth = None
+    with guard(), findings.coded("D21"):
+        if not own_ids:  # poses go by the ids of the data set's own masks
+            ground_truth = read_ground_truth(root)
     if ground_truth is not None:
         ground_truth = ground_truth.moved(-origin)
         for object_id, name in zip(ground_truth.object_ids, ground_truth.names, strict=True):
             names.setdefault(object_id, name)
+    frames_per_unit = FRAMES_PER_UNIT
+    with guard():
+        frames_per_unit = _frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]])
     return Dataset(
         root=root,
         name=root.resolve().name,
@@ -237,7 +269,7 @@ def read(root: Path, train_masks: str = MASKS) -> Dataset:
         object_aliases=aliases,
         ground_truth=ground_truth,
         world_convention=convention,
-        frames_per_unit=_frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]]),
+        frames_per_unit=frames_per_unit,
         has_alpha=_has_alpha(views["train"]),
         digest=hasher.hexdigest(),
         points=None if reconstruction is None or reconstruction.points is None else reconstruction.points - origin,
@@ -323,27 +355,37 @@ def _mask_folder(root: Path, name: str) -> Path | None:
     if folder.resolve() == (root / MASKS).resolve():
         return root / MASKS
     if name != MASKS and not folder.is_dir():
-        raise errors.DatasetError(f"{folder}: no such folder of masks; give another with --masks, or 'none'")
+        raise errors.DatasetError(
+            f"{folder}: no such folder of masks; give another with --masks, or 'none'", code="D17"
+        )
     return folder
 
 
 def _make_views(
-    mask_folder: Path | None, image_root: Path, split: str, entries: list[transforms.Entry], names: _CameraNames
+    mask_folder: Path | None,
+    image_root: Path,
+    split: str,
+    entries: list[transforms.Entry],
+    names: _CameraNames,
+    guard: findings.Guard,
 ) -> tuple[View, ...]:
     views: dict[str, View] = {}
     for entry in entries:
-        name = transforms.view_name(entry.file_path)
-        if name in views:
-            raise errors.DatasetError(f"{entry.place}: the image is listed twice; each frame needs its own")
-        image_path = _find_image(image_root, entry)
-        width, height, _ = images.size(image_path)
-        matrix = cameras.opengl_to_cam_world(entry.matrix)
-        camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
-        camera = replace(camera, name=names.name(entry.camera, camera))
-        mask_path = None if mask_folder is None else mask_folder / f"{name}.png"
-        if mask_path is not None and not mask_path.is_file():
-            mask_path = None
-        views[name] = View(name, camera, entry.t, split, image_path, mask_path)
+        with guard():
+            name = transforms.view_name(entry.file_path)
+            if name in views:
+                raise errors.DatasetError(
+                    f"{entry.place}: the image is listed twice; each frame needs its own", code="D13"
+                )
+            image_path = _find_image(image_root, entry)
+            width, height, _ = images.size(image_path)
+            matrix = cameras.opengl_to_cam_world(entry.matrix)
+            camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
+            camera = replace(camera, name=names.name(entry.camera, camera))
+            mask_path = None if mask_folder is None else mask_folder / f"{name}.png"
+            if mask_path is not None and not mask_path.is_file():
+                mask_path = None
+            views[name] = View(name, camera, entry.t, split, image_path, mask_path)
     return tuple(views.values())
 
 
@@ -354,7 +396,10 @@ def _find_image(root: Path, entry: transforms.Entry) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise errors.DatasetError(f"{entry.place}: the image is missing, expected {candidates[0]}")
+    present = [path] if path.is_file() else sorted(path.parent.glob(f"{glob.escape(path.name)}.*"))
+    if present:
+        raise images.unreadable_kind(present[0], entry.place)
+    raise errors.DatasetError(f"{entry.place}: the image is missing, expected {candidates[0]}", code="D10")
 
 
 def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
@@ -393,7 +438,7 @@ def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transform
         if header.get(key) is not None:
             value = header[key]
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-                raise errors.DatasetError(f"{root}: '{key}' must be a positive number, found {value!r}")
+                raise errors.DatasetError(f"{root}: '{key}' must be a positive number, found {value!r}", code="D23")
             hints[key] = float(value)
     if "frames_per_unit" in hints:
         return hints["frames_per_unit"]

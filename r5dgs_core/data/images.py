@@ -16,6 +16,23 @@ from .. import errors
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".gif", ".bmp", ".psd")
+
+
+def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
+    """Return the error for a file that is there but of a kind that is not read.
+
+    Args:
+        path: The file.
+        place: What names it; the path itself by default.
+    """
+    kind = path.suffix.lower()
+    found = f"{path.name}, of the unreadable kind {kind.removeprefix('.') or 'without suffix'}"
+    remedy = "convert it to PNG or JPEG"
+    if kind in VIDEO_SUFFIXES:
+        remedy = f"extract its frames, for example with 'ffmpeg -i {path.name} %04d.png'"
+    return errors.DatasetError(f"{place or path}: expected an image, found {found}. Remedy: {remedy}", code="D11")
 
 
 def size(path: Path) -> tuple[int, int, int]:
@@ -44,7 +61,7 @@ def read(path: Path) -> np.ndarray:
     colors = 3 if pixels.shape[2] >= 3 else 1
     pixels = pixels.astype(np.float32)
     if not np.isfinite(pixels).all():
-        raise errors.DatasetError(f"{path}: expected finite pixels, found NaN or infinity; render it again")
+        raise errors.DatasetError(f"{path}: expected finite pixels, found NaN or infinity; render it again", code="D12")
     if pixels.shape[2] in (2, 4):  # the alpha of linear float files is premultiplied
         alpha = pixels[..., -1:]
         pixels[..., :-1] = np.where(alpha > 0, pixels[..., :-1] / np.maximum(alpha, 1e-8), 0.0)
@@ -62,7 +79,9 @@ def read_raw(path: Path) -> np.ndarray:
     problem = " ".join(source.geterror().split())
     source.close()
     if pixels is None or problem:
-        raise errors.DatasetError(f"{path}: the image cannot be decoded ({problem or 'no pixels'}); is it truncated?")
+        raise errors.DatasetError(
+            f"{path}: the image cannot be decoded ({problem or 'no pixels'}); is it truncated?", code="D12"
+        )
     return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
 
 
@@ -155,12 +174,13 @@ def composite(rgba: np.ndarray, background: np.ndarray | None = None) -> np.ndar
 def _open(path: Path):
     path = Path(path)
     if not path.is_file():
-        raise errors.DatasetError(f"{path}: the image is missing")
+        raise errors.DatasetError(f"{path}: the image is missing", code="D10")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)  # else the reader multiplies the colours by alpha
     source = oiio.ImageInput.open(str(path), hints)
     if source is None:
+        reason = oiio.geterror().strip() or "unknown format"
         raise errors.DatasetError(
-            f"{path}: not an image that can be read ({oiio.geterror().strip() or 'unknown format'})"
+            f"{path}: not an image that can be read ({reason}); convert it to PNG or JPEG", code="D11"
         )
     return source

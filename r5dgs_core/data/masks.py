@@ -70,7 +70,8 @@ def _read_gray(path: Path) -> np.ndarray:
     pixels = images.read_png(path)
     if pixels.shape[2] >= 3 and not _is_gray(pixels):
         raise errors.DatasetError(
-            f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette"
+            f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette",
+            code="D17",
         )
     ids = pixels[..., 0].astype(np.int32)
     if pixels.shape[2] in (2, 4):
@@ -110,7 +111,9 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
             color = min(foreign)
             raise errors.DatasetError(
                 f"{path}: shows ({color >> 16}, {color >> 8 & 255}, {color & 255}), which no mask of colours like "
-                f"{colored} does: does it hold ids or colours? Write all masks in one way, best with one channel of ids"
+                f"{colored} does: does it hold ids or colours? Write all masks in one way, best with one channel of "
+                "ids",
+                code="D19",
             )
     return {0: 0} | {color: i + 1 for i, color in enumerate(sorted(found - {0}))}
 
@@ -126,7 +129,8 @@ def _collect(path: Path, pixels: np.ndarray, found: set[int], flat: set[int]) ->
         raise errors.DatasetError(
             f"{path}: expected one flat colour per object, found {len(found)} colours in the masks so far, {blended} "
             "of which fill no area; write them without anti-aliasing and without lossy compression, or with one "
-            "channel of ids"
+            "channel of ids",
+            code="D19",
         )
 
 
@@ -148,7 +152,8 @@ def resize(ids: np.ndarray, width: int, height: int, where: str) -> np.ndarray:
     if abs(w * height - h * width) > max(w, width):  # more than a pixel off the same aspect ratio
         raise errors.DatasetError(
             f"{where}: the mask is {w}x{h}, its image {width}x{height}: not the same shape; "
-            "write masks in the size of the images"
+            "write masks in the size of the images",
+            code="D18",
         )
     rows = np.minimum((np.arange(height) + 0.5) * h / height, h - 1).astype(np.intp)
     columns = np.minimum((np.arange(width) + 0.5) * w / width, w - 1).astype(np.intp)
@@ -163,7 +168,8 @@ def _pack(path: Path, pixels: np.ndarray) -> np.ndarray:
     """Colours R << 16 | G << 8 | B; gray is a colour of three equal channels, transparent pixels are black. [H, W]"""
     if pixels.dtype != np.uint8:
         raise errors.DatasetError(
-            f"{path}: expected 8 bits per channel, as masks of this data set are coded by colour, found {pixels.dtype}"
+            f"{path}: expected 8 bits per channel, as masks of this data set are coded by colour, found {pixels.dtype}",
+            code="D19",
         )
     channels = (0, 1, 2) if pixels.shape[2] >= 3 else (0, 0, 0)
     red, green, blue = (pixels[..., c].astype(np.int64) for c in channels)
@@ -199,7 +205,7 @@ def _png_header(path: Path) -> tuple[int, int, int, int, int] | None:
         with path.open("rb") as file:
             head = file.read(33)
     except OSError as error:
-        raise errors.DatasetError(f"{path}: the mask cannot be read ({error.strerror})") from error
+        raise errors.DatasetError(f"{path}: the mask cannot be read ({error.strerror})", code="D17") from error
     if len(head) < 33 or head[:8] != _PNG_SIGNATURE or head[12:16] != b"IHDR":
         return None
     width, height, depth, kind, _, _, interlace = struct.unpack(">IIBBBBB", head[16:29])
@@ -216,7 +222,9 @@ def _read_indices(path: Path) -> np.ndarray:
     assert header is not None
     width, height, depth, _, interlace = header
     if interlace:
-        raise errors.DatasetError(f"{path}: interlaced palette masks are not read; save it without interlacing")
+        raise errors.DatasetError(
+            f"{path}: interlaced palette masks are not read; save it without interlacing", code="D17"
+        )
     packed, at = bytearray(), 8
     while at + 12 <= len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])
@@ -227,9 +235,13 @@ def _read_indices(path: Path) -> np.ndarray:
     try:
         raw = np.frombuffer(zlib.decompress(bytes(packed)), np.uint8)
     except zlib.error as error:
-        raise errors.DatasetError(f"{path}: the mask cannot be decoded ({error}); is it truncated?") from error
+        raise errors.DatasetError(
+            f"{path}: the mask cannot be decoded ({error}); is it truncated?", code="D17"
+        ) from error
     if raw.size != height * (stride + 1):
-        raise errors.DatasetError(f"{path}: expected {height * (stride + 1)} bytes of pixels, found {raw.size}")
+        raise errors.DatasetError(
+            f"{path}: expected {height * (stride + 1)} bytes of pixels, found {raw.size}", code="D17"
+        )
     lines = raw.reshape(height, stride + 1)
     rows = np.zeros((height, stride), np.uint8)
     above = np.zeros(stride, np.uint8)

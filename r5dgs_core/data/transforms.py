@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, strict_json
+from .. import errors, findings, strict_json
 
 RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -49,27 +49,34 @@ class Entry:
         return replace(self, matrix=matrix)
 
 
-def read(path: Path) -> tuple[list[Entry], dict[str, Any]]:
+def read(path: Path, guard: findings.Guard = findings.STRICT) -> tuple[list[Entry], dict[str, Any]]:
     """Read one camera file.
+
+    Args:
+        path: The file.
+        guard: Entered around each frame.
 
     Returns:
         The frames in the file's order, and the file's top-level keys other than the frames.
     """
-    content = strict_json.read(path, errors.DatasetError)
+    with findings.coded("D02"):
+        content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
-        raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}")
+        raise errors.DatasetError(f"{path}: expected a JSON object, found {type(content).__name__}", code="D02")
     if isinstance(content.get("frames"), list):
-        entries = _read_frames(str(path), content["frames"], content, None, "")
+        entries = _read_frames(str(path), content["frames"], content, None, "", guard)
     elif isinstance(content.get("data"), dict):
         entries = []
         for camera, part in content["data"].items():
             place = f"{path}: data[{camera!r}]"
-            if not isinstance(part, dict) or not isinstance(part.get("frames"), list):
-                raise errors.DatasetError(f"{place}: expected 'transform_matrix' and 'frames'")
-            entries += _read_frames(place, part["frames"], {**content, **part}, part.get("transform_matrix"), camera)
+            with guard():
+                if not isinstance(part, dict) or not isinstance(part.get("frames"), list):
+                    raise errors.DatasetError(f"{place}: expected 'transform_matrix' and 'frames'", code="D02")
+                common = {**content, **part}
+                entries += _read_frames(place, part["frames"], common, part.get("transform_matrix"), camera, guard)
     else:
         keys = ", ".join(sorted(content)) or "nothing"
-        raise errors.DatasetError(f"{path}: expected 'frames' (D-NeRF) or 'data' (NVFi), found {keys}")
+        raise errors.DatasetError(f"{path}: expected 'frames' (D-NeRF) or 'data' (NVFi), found {keys}", code="D02")
     return entries, {key: value for key, value in content.items() if key not in ("frames", "data")}
 
 
@@ -92,12 +99,13 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     scale = np.array([width / declared[0], height / declared[1]])
     if abs(scale[0] - scale[1]) * max(declared) > 1.5:
         raise errors.DatasetError(
-            f"{entry.place}: the image is {width}x{height}, 'w' and 'h' say {declared[0]:g}x{declared[1]:g}"
+            f"{entry.place}: the image is {width}x{height}, 'w' and 'h' say {declared[0]:g}x{declared[1]:g}", code="D09"
         )
     distorted = [key for key in _DISTORTION if abs(lens.get(key, 0.0)) > 1e-9]
     if distorted:
         raise errors.DatasetError(
-            f"{entry.place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first"
+            f"{entry.place}: lens distortion ({', '.join(distorted)}) is not supported; undistort the images first",
+            code="D08",
         )
     if "fl_x" in lens or "fl_y" in lens:
         focal_x = lens.get("fl_x", lens.get("fl_y", 0.0)) * scale[0]
@@ -105,14 +113,18 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
     elif "camera_angle_x" in lens or "camera_angle_y" in lens:
         for key in ("camera_angle_x", "camera_angle_y"):
             if key in lens and not 0.0 < lens[key] < math.pi:
-                raise errors.DatasetError(f"{entry.place}: '{key}' is {lens[key]:g}, expected radians in (0, pi)")
+                raise errors.DatasetError(
+                    f"{entry.place}: '{key}' is {lens[key]:g}, expected radians in (0, pi)", code="D08"
+                )
         focal_x = 0.5 * width / math.tan(0.5 * lens["camera_angle_x"]) if "camera_angle_x" in lens else 0.0
         focal_y = 0.5 * height / math.tan(0.5 * lens["camera_angle_y"]) if "camera_angle_y" in lens else focal_x
         focal_x = focal_x or focal_y
     else:
-        raise errors.DatasetError(f"{entry.place}: expected 'camera_angle_x' or 'fl_x', found neither")
+        raise errors.DatasetError(f"{entry.place}: expected 'camera_angle_x' or 'fl_x', found neither", code="D08")
     if not (focal_x > 0 and focal_y > 0):
-        raise errors.DatasetError(f"{entry.place}: the focal length must be positive, found {focal_x:g}, {focal_y:g}")
+        raise errors.DatasetError(
+            f"{entry.place}: the focal length must be positive, found {focal_x:g}, {focal_y:g}", code="D08"
+        )
     cx = lens["cx"] * scale[0] if "cx" in lens else 0.5 * width
     cy = lens["cy"] * scale[1] if "cy" in lens else 0.5 * height
     return np.array([[focal_x, 0.0, cx], [0.0, focal_y, cy], [0.0, 0.0, 1.0]])
@@ -126,46 +138,53 @@ def view_name(file_path: str) -> str:
     return head if head and suffix.lower() in ("png", "jpg", "jpeg", "exr", "webp", "tif", "tiff") else name
 
 
-def _read_frames(place: str, frames: list, common: dict, shared_matrix: Any, camera: str) -> list[Entry]:
+def _read_frames(
+    place: str, frames: list, common: dict, shared_matrix: Any, camera: str, guard: findings.Guard
+) -> list[Entry]:
     given = ["time" in frame for frame in frames if isinstance(frame, dict)]
-    if any(given) and not all(given):
-        raise errors.DatasetError(f"{place}: frame {given.index(False)} has no 'time', others have; give all or none")
+    with guard():
+        if any(given) and not all(given):
+            raise errors.DatasetError(
+                f"{place}: frame {given.index(False)} has no 'time', others have; give all or none", code="D04"
+            )
     entries = []
     for i, frame in enumerate(frames):
-        at = f"{place}: frame {i}"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise errors.DatasetError(f"{at}: expected an object with a 'file_path'")
-        at = f"{at} ({frame['file_path']})"
-        t = finite(at, "time", frame["time"]) if "time" in frame else i / max(len(frames) - 1, 1)
-        lens = {
-            key: finite(at, key, value)
-            for source in (common, frame)
-            for key, value in _lens_keys(source).items()
-            if value is not None
-        }
-        for key in ("w", "h"):
-            if key in lens and lens[key] <= 0:
-                raise errors.DatasetError(f"{at}: '{key}' must be positive, found {lens[key]:g}")
-        raw_matrix = frame.get("transform_matrix", shared_matrix)
-        number = frame.get("frame")
-        entries.append(
-            Entry(
-                place=at,
-                file_path=frame["file_path"],
-                t=t,
-                matrix=rigid_matrix(at, raw_matrix),
-                camera=str(frame.get("view", frame.get("camera", camera))),
-                lens=lens,
-                frame=float(number) if isinstance(number, (int, float)) and not isinstance(number, bool) else None,
-            )
-        )
+        with guard():
+            t = i / max(len(frames) - 1, 1)
+            entries.append(_read_frame(f"{place}: frame {i}", frame, common, shared_matrix, camera, t))
     return entries
+
+
+def _read_frame(at: str, frame: Any, common: dict, shared_matrix: Any, camera: str, t: float) -> Entry:
+    """Read one frame; ``t`` is its time if it gives none."""
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+        raise errors.DatasetError(f"{at}: expected an object with a 'file_path'", code="D03")
+    at = f"{at} ({frame['file_path']})"
+    lens = {
+        key: finite(at, key, value)
+        for source in (common, frame)
+        for key, value in _lens_keys(source).items()
+        if value is not None
+    }
+    for key in ("w", "h"):
+        if key in lens and lens[key] <= 0:
+            raise errors.DatasetError(f"{at}: '{key}' must be positive, found {lens[key]:g}", code="D08")
+    number = frame.get("frame")
+    return Entry(
+        place=at,
+        file_path=frame["file_path"],
+        t=finite(at, "time", frame["time"]) if "time" in frame else t,
+        matrix=rigid_matrix(at, frame.get("transform_matrix", shared_matrix)),
+        camera=str(frame.get("view", frame.get("camera", camera))),
+        lens=lens,
+        frame=float(number) if isinstance(number, (int, float)) and not isinstance(number, bool) else None,
+    )
 
 
 def rigid_matrix(place: str, value: Any) -> np.ndarray:
     """Check a camera-to-world matrix: finite, and a rotation, an optional uniform scale and a translation. [4, 4]"""
     if value is None:
-        raise errors.DatasetError(f"{place}: 'transform_matrix' is missing")
+        raise errors.DatasetError(f"{place}: 'transform_matrix' is missing", code="D05")
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
@@ -173,21 +192,22 @@ def rigid_matrix(place: str, value: Any) -> np.ndarray:
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     if matrix.shape != (4, 4):
-        raise errors.DatasetError(f"{place}: expected a 'transform_matrix' of 4x4 numbers")
+        raise errors.DatasetError(f"{place}: expected a 'transform_matrix' of 4x4 numbers", code="D05")
     if not np.isfinite(matrix).all():
-        raise errors.DatasetError(f"{place}: 'transform_matrix' holds NaN or infinity")
+        raise errors.DatasetError(f"{place}: 'transform_matrix' holds NaN or infinity", code="D06")
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if lengths.min() < 1e-9 or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
-        raise errors.DatasetError(f"{place}: 'transform_matrix' is not a rigid camera-to-world matrix")
+        raise errors.DatasetError(f"{place}: 'transform_matrix' is not a rigid camera-to-world matrix", code="D07")
     unit = matrix[:3, :3] / lengths
     off = max(float(np.abs(unit.T @ unit - np.eye(3)).max()), float(np.ptp(lengths) / lengths.mean()))
     if off > RIGID_TOLERANCE:
         raise errors.DatasetError(
             f"{place}: 'transform_matrix' is not rigid (axes off by {off:.2g}, allowed {RIGID_TOLERANCE:g}); "
-            "remove shear and uneven scale"
+            "remove shear and uneven scale",
+            code="D07",
         )
     if np.linalg.det(unit) < 0:
-        raise errors.DatasetError(f"{place}: 'transform_matrix' mirrors the scene (determinant -1)")
+        raise errors.DatasetError(f"{place}: 'transform_matrix' mirrors the scene (determinant -1)", code="D07")
     return matrix
 
 
@@ -200,5 +220,5 @@ def _lens_keys(source: dict) -> dict[str, Any]:
 def finite(place: str, key: str, value: Any) -> float:
     """The value of a key as a float; DatasetError naming place and key where it is none or not finite."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise errors.DatasetError(f"{place}: '{key}' must be a finite number, found {value!r}")
+        raise errors.DatasetError(f"{place}: '{key}' must be a finite number, found {value!r}", code="D03")
     return float(value)

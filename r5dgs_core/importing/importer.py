@@ -89,7 +89,7 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
         R5dgsError: The folder or the data set cannot be used; the message says why.
     """
     run = run_folder.open_run(folder, options.iteration)
-    dataset = None if options.data is None else datasets.read(options.data).relative_to(np.zeros(3))
+    dataset = None if options.data is None else datasets.read(options.data, min_registered=0.0).relative_to(np.zeros(3))
     foreign = read(run, options.t_max)
     motion, times = None, np.zeros(1)
     if foreign.state is not None:

@@ -151,7 +151,7 @@ def reduce(
     forced = possible[::intervals]
     every_frame = None if all(followed) or frames is None else _at_frames(sample, t0, t1, frames, nearest, most)
     keys = [
-        curve.greedy(possible, forced) if holds or every_frame is None else framed
+        framed if framed is not None and not holds else curve.greedy(possible, forced)
         for curve, holds, framed in zip((location, rotation), followed, every_frame or (None, None), strict=True)
     ]
     return Curves(keys[0], keys[1], all(followed))

@@ -55,7 +55,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     Raises:
         CheckpointError, DatasetError: A file is missing or damaged.
     """
-    dataset = dataset if dataset is not None else datasets.read(run.data(), run.config.data.masks)
+    dataset = (
+        dataset
+        if dataset is not None
+        else datasets.read(run.data(), run.config.data.masks, run.config.data.min_registered)
+    )
     state = checkpoint.load(run.folder)
     tensors, wanted = state.tensors, run.config.needs
     # Objects that nobody named: their ids mean nothing to the data set.
@@ -429,7 +433,7 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
     run = checkpoint.open_run(folder)
     configs.require_needs(overrides)
     run = dataclasses.replace(run, config=run.config.override(overrides))
-    dataset = datasets.read(run.data(dataset_root), run.config.data.masks)
+    dataset = datasets.read(run.data(dataset_root), run.config.data.masks, run.config.data.min_registered)
     if dataset.digest != run.digest:
         raise CheckpointError(
             f"{dataset.root}: is not the data that {folder} was trained on, or has changed since; "

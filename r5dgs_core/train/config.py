@@ -239,6 +239,7 @@ _POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more t
 _INSIDE: tuple[Callable[[Any], bool], str] = (lambda value: 0 < value < 1, "between 0 and 1")
 # What a value must be beyond its type; all numbers are finite and not negative (`_check`).
 _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "data.min_registered": _SHARE,
     "train.iterations": _AT_LEAST_1,
     "train.seed": (lambda value: value < 2**63 - 1, "less than 2^63 - 1"),
     "train.representation": (lambda value: value in REPRESENTATIONS, " or ".join(REPRESENTATIONS)),

@@ -76,7 +76,7 @@ def train(
     if not resume and not overwrite:
         checkpoint.refuse_to_lose(folder)
     settled = checkpoint.open_run(folder).config if resume else config
-    dataset = datasets.read(dataset_root, settled.data.masks)
+    dataset = datasets.read(dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
     go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
     state, replaces = None, False

@@ -62,9 +62,11 @@ class DataSection:
 
     Attributes:
         masks: Folder of the training views' masks, within the data set or anywhere; ``none`` passes them over.
+        min_registered: Smallest share of the images that a COLMAP reconstruction must have registered.
     """
 
     masks: str = "object_mask"
+    min_registered: float = 0.5
 
 
 @dataclass(frozen=True)

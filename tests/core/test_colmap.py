@@ -259,7 +259,7 @@ def test_an_unknown_lens_is_named(flat):
         ([1, 2], "times.json: expected image names and times, found list"),
         ({}, "expected image names and times, found none"),
         ({"img_00.png": "early"}, "'img_00.png' must be a finite number, found 'early'"),
-        ({"img_99.png": 0.0}, "'img_99.png': expected a registered image"),
+        ({"img_99.png": 0.0}, "'img_99.png': the image is missing"),
         ({"times": {"img_00.png": 0.5}, "t_max": 0.1}, "t_max 0.1 of times.json: expected images up to it"),
     ],
 )
@@ -279,3 +279,49 @@ def test_frames_without_numbers_ask_for_times(rig):
 def test_points_are_optional(flat):
     (flat[0] / "sparse" / "0" / "points3D.bin").unlink()
     assert datasets.read(flat[0]).points is None
+
+
+def test_a_reconstruction_of_few_of_the_images_is_refused_with_the_remedy(flat):
+    root, _ = flat
+    for k in range(90):
+        picture(root / "images" / f"lost_{k:02d}.png")
+    message = r"found 10 of 100 registered by COLMAP \(lost_00.png is not\). Remedy: match more.*min_registered to 0.1"
+    with pytest.raises(DatasetError, match=message):
+        datasets.read(root)
+    assert len(datasets.read(root, min_registered=0.1).train) == 8
+
+
+def test_images_that_times_json_leaves_out_need_no_pose(flat):
+    root, views = flat
+    for k in range(90):
+        picture(root / "images" / f"lost_{k:02d}.png")
+    (root / "times.json").write_text(json.dumps({name: k for k, name in enumerate(views)}))
+    assert len(datasets.read(root).train) > 0
+
+
+@pytest.mark.parametrize("suffix, remedy", [(".heic", "convert it to PNG"), (".MP4", "ffmpeg")])
+def test_files_of_unreadable_kinds_are_named_as_such(rig, suffix, remedy):
+    root, _ = rig
+    for k in range(9):
+        for number in (6, 8, 12):
+            path = root / "images" / f"cam{k}" / f"frame_{number:04d}.png"
+            path.rename(path.with_suffix(suffix))
+    kind = suffix.lower().removeprefix(".")
+    message = rf"cam0/frame_\d+{suffix}: expected an image.*unreadable kind {kind}.*{remedy}"
+    with pytest.raises(DatasetError, match=message):
+        datasets.read(root)
+    kinds = {4: ".png", 6: suffix}
+    times = {f"cam{k}/frame_{number:04d}{kinds[number]}": number for k in range(9) for number in kinds}
+    (root / "times.json").write_text(json.dumps(times))
+    with pytest.raises(DatasetError, match=f"frame_0006{suffix}.*unreadable kind {kind}"):
+        datasets.read(root)
+
+
+def test_a_registered_image_that_is_missing_or_unreadable_is_not_left_out(rig):
+    root, views = rig
+    colmap_files.write(root / "sparse" / "0", {**views, "extra/a.png": camera(20), "extra/b.png": camera(21)}, POINTS)
+    with pytest.raises(DatasetError, match=r"extra/a.png: the image is missing"):
+        datasets.read(root)
+    for name in ("a.png", "b.png"):
+        picture(root / "images" / "extra" / name)
+    assert len(datasets.read(root).train) == 7 * 4  # two of the nine cameras are held out

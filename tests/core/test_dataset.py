@@ -460,3 +460,15 @@ def test_a_folder_of_masks_with_names_of_its_own_has_ids_of_its_own(flat, tmp_pa
 def test_a_folder_of_masks_that_is_missing_is_an_error(flat):
     with pytest.raises(errors.DatasetError, match=r"nowhere: no such folder of masks; give another with --masks"):
         dataset.read(flat, "nowhere")
+
+
+@pytest.mark.parametrize("listed", ["./train/r_000", "./train/r_000.heic"])
+def test_an_image_of_an_unreadable_kind_is_named_as_such(tmp_path, listed):
+    files = write_flat(tmp_path)
+    image = tmp_path / "train" / "r_000.png"
+    image.rename(image.with_suffix(".heic"))
+    files["train"]["frames"][0]["file_path"] = listed
+    write_json(tmp_path / "transforms_train.json", files["train"])
+    message = r"expected an image, found r_000.heic, of the unreadable kind heic. Remedy: convert it to PNG or JPEG"
+    with pytest.raises(errors.DatasetError, match=message):
+        dataset.read(tmp_path)
