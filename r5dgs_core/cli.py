@@ -1,5 +1,5 @@
 """The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, objects, lookup,
-query, name, warm-up.
+query, name, config, warm-up.
 
 `command_line` has the arguments, `commands` and its neighbours do the work, `exit_status` has the exit statuses.
 """
@@ -166,6 +166,15 @@ def _name(args: argparse.Namespace) -> None:
     commands_words.run_name(args.file, args.object, args.name, aliases=args.alias, caption=args.caption)
 
 
+def _config(args: argparse.Namespace) -> None:
+    from . import commands_config
+
+    if args.user is not None:
+        commands_config.run_user_config(args.user, as_json=args.json)
+    else:
+        commands_config.run_config(args.target, as_json=args.json)
+
+
 def _warm_up(args: argparse.Namespace) -> None:
     commands.run_warm_up(progress_kind=args.progress)
 
@@ -189,6 +198,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], ExitStatus | None]] = {
     "lookup": _lookup,
     "query": _query,
     "name": _name,
+    "config": _config,
     "warm-up": _warm_up,
 }
 

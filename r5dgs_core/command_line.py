@@ -91,7 +91,7 @@ def _masks(commands: Any) -> None:
     made = "precomputed (a folder; the default), blender (of a capture) or sam2"
     p.add_argument("--backend", default="precomputed", metavar="NAME", help=made)
     p.add_argument("--from", dest="source", type=Path, metavar="FOLDER", help="folder of masks, or of a capture")
-    p.add_argument("--model", type=Path, metavar="DIR", help="folder of SAM2")
+    p.add_argument("--model", type=Path, metavar="DIR", help="folder of SAM2 (default: sam2 of 'config --user')")
     p.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: DATA/object_mask)")
     key_frames = "images of each video in which sam2 looks for all objects (default: 3)"
     p.add_argument("--key-frames", type=int, metavar="N", help=key_frames)
@@ -271,8 +271,8 @@ def _lookup(commands: Any) -> None:
         "words.md",
     )
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
-    encoder = "folder of the encoder, or 'text' for a small one"
-    p.add_argument("--encoder", required=True, metavar="DIR|text", help=encoder)
+    encoder = "folder of the encoder, or 'text' for a small one (default: encoder of 'config --user')"
+    p.add_argument("--encoder", metavar="DIR|text", help=encoder)
     p.add_argument("--out", type=Path, metavar="FILE.r5dgs", help="write this scene file instead")
     p.add_argument("--captions", type=Path, metavar="FILE.json", help="captions, names, aliases by id or name")
     p.add_argument("--words", type=Path, metavar="FILE.txt", help="more words to store, one per line")
@@ -291,7 +291,7 @@ def _query(commands: Any) -> None:
     )
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file")
     p.add_argument("text", help="one or several things: 'red mug', 'mugs and lemon'")
-    encoder = "encoder of the scene's table, for words that it does not store"
+    encoder = "encoder of the scene's table, for words that it does not store (default: encoder of 'config --user')"
     p.add_argument("--encoder", metavar="DIR|text", help=encoder)
     p.add_argument("--threshold", type=float, metavar="SCORE", help="least score of a match, 0 to 1 (default: 0.5)")
     p.add_argument("--json", action="store_true", help="print JSON")
@@ -316,6 +316,23 @@ def _name(commands: Any) -> None:
     p.add_argument("--caption", metavar="TEXT", help="a sentence about it")
 
 
+def _config(commands: Any) -> None:
+    p = _command(
+        commands,
+        "config",
+        "print all training keys, or the user's settings",
+        "Print every training key with meaning, unit, default and the value in force: of a run, of a TOML file, or\n"
+        "the defaults. With --user print the user's settings (paths of weights), or change one of them.",
+        "RUN\n  r5dgs config --user set encoder ~/models/clip",
+        "command_line.md",
+    )
+    where = p.add_mutually_exclusive_group()
+    where.add_argument("target", type=Path, nargs="?", metavar="RUN|FILE.toml", help="run folder or TOML file")
+    user = "show the user's settings; 'set KEY VALUE' changes one, 'set KEY \"\"' removes it"
+    where.add_argument("--user", nargs="*", metavar="set KEY VALUE", help=user)
+    p.add_argument("--json", action="store_true", help="print JSON")
+
+
 def _warm_up(commands: Any) -> None:
     p = _command(
         commands,
@@ -330,5 +347,5 @@ def _warm_up(commands: Any) -> None:
 
 _COMMANDS = (
     *(_demo, _train, _masks, _associate, _bake, _import, _evaluate, _report, _bench),
-    *(_info, _objects, _lookup, _query, _name, _warm_up),
+    *(_info, _objects, _lookup, _query, _name, _config, _warm_up),
 )

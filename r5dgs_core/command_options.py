@@ -29,7 +29,7 @@ def add_settings(p: argparse.ArgumentParser) -> None:
     """Add the options that configure training."""
     named = "fast (a first look), cpu or paper (the deformation field); --config and --set override it"
     p.add_argument("--preset", metavar="NAME", help=named)
-    p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration")
+    p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; 'r5dgs config' lists all keys")
     add_overrides(p, "SECTION.KEY=VALUE", "override a key")
     steps = "optimisation steps; train.iterations (default: 6000)"
     p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)

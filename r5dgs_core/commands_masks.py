@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from . import errors, input_paths
+from . import errors, input_paths, user_settings
 
 if TYPE_CHECKING:
     from .semantics.mask_making import Made
@@ -58,6 +58,8 @@ def run_masks(
     """
     tuned = {"points": points, "score": score, "stability": stability, "max_area": max_area}
     tuned = {name: value for name, value in tuned.items() if value is not None}
+    if backend == "sam2" and model is None:
+        model = _user_model()
     _check(backend, model, source, device, unknown, {"key_frames": key_frames, **tuned})
     input_paths.check_dataset(data)
     from .data import dataset as datasets
@@ -109,6 +111,11 @@ def run_masks(
     return made
 
 
+def _user_model() -> Path | None:
+    found = user_settings.read().get("sam2")
+    return None if found is None else Path(found)
+
+
 def _check(
     backend: str,
     model: Path | None,
@@ -122,7 +129,10 @@ def _check(
         raise errors.UsageError(f"--backend {backend}: expected one of {', '.join(BACKENDS)}")
     if backend == "sam2":
         if model is None:
-            raise errors.UsageError("--backend sam2: name the folder of the model with --model DIR (docs/masks.md)")
+            raise errors.UsageError(
+                "--backend sam2: name the folder of the model with --model DIR, or once with "
+                "'r5dgs config --user set sam2 DIR' (docs/masks.md)"
+            )
         misplaced = {"--from": source, "--unknown": unknown}
     else:
         misplaced = {"--model": model, "--device": device}

@@ -10,10 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors, input_paths, strict_json
+from . import commands, errors, input_paths, strict_json, user_settings
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
+    from .scene.meanings import EncoderCard
     from .scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 
 def run_lookup(
     path: Path,
-    encoder: str,
+    encoder: str | None,
     *,
     out: Path | None = None,
     captions: Path | None = None,
@@ -33,7 +34,7 @@ def run_lookup(
 
     Args:
         path: The scene file.
-        encoder: Folder of the encoder, or "text".
+        encoder: Folder of the encoder, or "text"; that of the user's settings if None.
         out: Where to write instead of ``path``.
         captions: JSON by object id or name: a caption, or an object of ``name aliases caption``.
         words: Text file of words to store, one a line.
@@ -45,6 +46,11 @@ def run_lookup(
     """
     if out is not None:
         input_paths.check_scene_output(out)
+    encoder = encoder or user_settings.read().get("encoder")
+    if encoder is None:
+        raise errors.UsageError(
+            "lookup: name an encoder with --encoder DIR, or once with 'r5dgs config --user set encoder DIR'"
+        )
     input_paths.check_scene(path)
     from .progress import make
     from .scene import scene_file
@@ -92,7 +98,8 @@ def run_query(
         path: The scene file.
         text: One or several things.
         encoder: Folder of the encoder that made the scene's table, or "text", for what names and stored words leave
-            unanswered; another one is refused even where nothing is left.
+            unanswered; another one is refused even where nothing is left. If None, that of the user's settings serves
+            where the scene's table was made with it.
         threshold: Least score of a match, the usual one where None.
         as_json: Print JSON instead of a table.
 
@@ -110,12 +117,15 @@ def run_query(
         raise errors.UsageError(f"query {text!r}: expected words for the objects to find, such as 'red mug'")
     scene = scene_file.read(path)
     unknown = query.unknown(scene, text)
-    opened = _encoder_for(scene, encoder, unknown, path)
+    if encoder is None and unknown and scene.lookup is not None:
+        opened = _user_encoder(scene.lookup.encoder)
+    else:
+        opened = _encoder_for(scene, encoder, unknown, path)
     found = query.find(scene, text, opened, least)
     if found:
         said = "\n".join(f"nothing matches {phrase!r}" for phrase in query.unanswered(scene, text, opened, least))
     else:
-        said = nothing(scene, text, unknown if encoder is None else [])
+        said = nothing(scene, text, unknown if encoder is None and opened is None else [])
     if as_json:
         names = {item.id: item.name for item in scene.objects}
         rows = [
@@ -219,6 +229,22 @@ def nothing(scene: Scene, text: str, unknown: Sequence[str] = ()) -> str:
     if scene.lookup is None:
         return f"{said}\nthe scene has no lookup table: by names alone; make one: r5dgs lookup SCENE --encoder DIR"
     return f"{said}\n{asked} is not among the stored words; give the table's encoder for others: --encoder DIR"
+
+
+def _user_encoder(card: EncoderCard) -> Any:
+    """Open the encoder of the user's settings if the table was made with it; else None."""
+    found = user_settings.read().get("encoder")
+    if found is None:
+        return None
+    from .semantics import encoders, query
+
+    opened = encoders.open_encoder(found)
+    try:
+        query.check(card, opened.card, found)
+    except errors.BackendError as error:
+        log.warning("the encoder of the user's settings is not used: %s", error)
+        return None
+    return opened
 
 
 def _encoder_for(scene: Scene, encoder: str | None, unknown: Sequence[str], path: Path) -> Any:

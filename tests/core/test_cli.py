@@ -381,6 +381,8 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["query", "nowhere", "mug", "--threshold", "2"],
     ["name", "nowhere", "1", "mug"],
     ["name", "nowhere", "1"],
+    ["config", "nowhere"],
+    ["config", "--user", "get"],
     ["warm-up", "now"],
     ["train", "--help"],
     ["--help"],
