@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import errors, input_paths
+from . import errors, folder_lock, input_paths
 from .scene import modes as scene_modes
 from .train import config as configs
 
@@ -67,6 +67,7 @@ def use_threads(count: int | None) -> None:
         compilation.set_threads(count)
 
 
+@folder_lock.writes("out")
 def run_bake(
     run_folder: Path,
     out: Path,
@@ -100,6 +101,7 @@ def run_bake(
     Console().print(table.needs(scene.needs))
 
 
+@folder_lock.writes("out")
 def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **options: Any) -> None:
     """Turn a run folder that another program trained into a scene file (see `importing.importer.import_run`).
 
@@ -137,6 +139,7 @@ def _tell_scene(scene: Scene, out: Path) -> None:
     print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
 
 
+@folder_lock.writes("json_path", "target")
 def run_evaluate(
     target: Path,
     data: Path | None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors, input_paths
+from . import commands, errors, folder_lock, input_paths
 
 if TYPE_CHECKING:
     from .semantics.mask_repair import Repair
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 SHOWN = 12  # changes that are printed
 
 
+@folder_lock.writes("out", "target")
 def run_associate(
     target: Path,
     data: Path | None = None,

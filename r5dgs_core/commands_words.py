@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors, input_paths, strict_json, user_settings
+from . import commands, errors, folder_lock, input_paths, strict_json, user_settings
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
+@folder_lock.writes("out", "path")
 def run_lookup(
     path: Path,
     encoder: str | None,
@@ -148,6 +149,7 @@ def run_query(
     return scene, found
 
 
+@folder_lock.writes("path")
 def run_name(
     path: Path, which: str, name: str | None, *, aliases: Sequence[str] = (), caption: str | None = None
 ) -> Scene:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import commands, errors, strict_json
+from . import commands, errors, folder_lock, strict_json
 
 NAME = "tabletop"
 
@@ -67,7 +67,7 @@ def run_demo(
             go_on=go_on,
             progress=progress,
         )
-        with stopping.at_once(f"stopped after training; go on with: {go_on}"):
+        with stopping.at_once(f"stopped after training; go on with: {go_on}"), folder_lock.hold(out):
             progress({"event": "bake", "text": "motion models and scene file"})
             dataset = datasets.read(data)
             scene = bake.bake(trained, dataset)
@@ -80,7 +80,8 @@ def run_demo(
             )
     if progress_kind != "json":
         Console().print(table.make(result))
-    with make(progress_kind) as progress, stopping.at_once(f"stopped before the contact sheet; go on with: {go_on}"):
+    stopped = f"stopped before the contact sheet; go on with: {go_on}"
+    with make(progress_kind) as progress, stopping.at_once(stopped), folder_lock.hold(out):
         json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)
         progress({"event": "sheet", "text": "contact sheet"})
         sheet = contact_sheet.write(scene, dataset, out / "contact_sheet.png")

@@ -18,7 +18,7 @@ from typing import Any
 
 from torch import Tensor
 
-from .. import __version__, input_paths, strict_json
+from .. import __version__, folder_lock, input_paths, strict_json
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..raster import machine
@@ -113,7 +113,8 @@ def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
     """
     folder = Path(folder)
     try:
-        half_written = files.leftovers(folder / RUN_FILE)  # all that a kill at the very start leaves
+        # All that a kill at the very start leaves.
+        half_written = [*files.leftovers(folder / RUN_FILE), folder / folder_lock.LOCK_FILE]
         foreign = folder.exists() and (
             not folder.is_dir()
             or (not (folder / RUN_FILE).exists() and any(path not in half_written for path in folder.iterdir()))
@@ -146,7 +147,6 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         # The newest checkpoint goes last of the two: a kill in between leaves the old run as it was.
         for name in (PREVIOUS_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
             (run.folder / name).unlink(missing_ok=True)
-        remove_leftovers(run.folder)
         files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
     except OSError as error:
         raise CheckpointError(f"{run.folder}: cannot be made or written: {error}; choose another --out") from error
@@ -154,10 +154,17 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a kill in the middle of writing left in a run folder."""
-    for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE, CURVES_FILE):
+    """Remove what a kill in the middle of writing left in a run folder; for the process that holds it.
+
+    Raises:
+        CheckpointError: A file cannot be removed.
+    """
+    for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
         for path in files.leftovers(Path(folder) / name):
-            path.unlink(missing_ok=True)
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise CheckpointError(f"{path}: cannot be removed: {error}") from error
 
 
 def refuse_to_lose(folder: Path) -> None:

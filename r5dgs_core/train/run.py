@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import logging
@@ -14,6 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 import torch
 
+from .. import folder_lock
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..raster import warm_up
@@ -68,8 +70,30 @@ def train(
         DatasetError, CheckpointError, TrainingError: As their messages say.
         Interrupted: SIGINT or SIGTERM came; everything is kept that is needed to go on.
     """
-    progress = progress or (lambda event: None)
     folder = Path(folder)
+    with contextlib.ExitStack() as stack:
+
+        def claim() -> None:
+            if stack.enter_context(folder_lock.hold(folder)):  # what is half-written is of processes that are dead
+                checkpoint.remove_leftovers(folder)
+
+        return _train(dataset_root, folder, config, resume, overwrite, go_on, progress or (lambda event: None), claim)
+
+
+def _train(
+    dataset_root: Path,
+    folder: Path,
+    config: Config,
+    resume: bool,
+    overwrite: bool,
+    go_on: str | None,
+    progress: Progress,
+    claim: Callable[[], None],
+) -> checkpoint.Run:
+    """As `train`; ``claim`` locks the folder."""
+    is_new = not folder.is_dir()
+    if not is_new:
+        claim()
     if resume and not (folder / checkpoint.RUN_FILE).exists():
         log.warning("%s: no run to go on with; starting a new one", folder)
         resume = False
@@ -78,6 +102,11 @@ def train(
     settled = checkpoint.open_run(folder).config if resume else config
     dataset = datasets.read(dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
+    if is_new:  # made only now, so that a data set that cannot be read leaves no folder
+        checkpoint.plan_run(folder, dataset, config)
+        claim()
+        if not overwrite:
+            checkpoint.refuse_to_lose(folder)  # another process may have trained there meanwhile
     go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
     state, replaces = None, False
     if resume:
@@ -211,11 +240,10 @@ def _append(path: Path, stream: TextIO, event: dict[str, Any]) -> None:
 
 
 def _clean_up(folder: Path, iteration: int) -> None:
-    """Drop the log's lines of steps that will be taken again, a torn line, and half-written files."""
+    """Drop the log's lines of steps that will be taken again, and a torn line."""
     path = folder / checkpoint.LOG_FILE
     kept = []
     try:
-        checkpoint.remove_leftovers(folder)
         if not path.exists():
             return
         for line in path.read_bytes().splitlines():

@@ -1,0 +1,175 @@
+"""Locks of run folders: one process at a time writes into a folder.
+
+The system releases a lock when its process ends, however that happens. Readers take none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import functools
+import inspect
+import json
+import logging
+import os
+import shlex
+import socket
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+from . import input_paths, strict_json
+from .errors import CheckpointError
+
+log = logging.getLogger(__name__)
+P = ParamSpec("P")
+T = TypeVar("T")
+
+LOCK_FILE = ".lock"
+_PLACE = 1 << 30  # of the locked byte on Windows, which nobody else can read: past the holder's description
+_MOST_BYTES = 1 << 16  # of that description
+
+
+@contextlib.contextmanager
+def hold(folder: Path) -> Iterator[bool]:
+    """Lock a folder for the block; a missing folder is made.
+
+    Yields:
+        False if the file system has no locks; a warning names the folder then.
+
+    Raises:
+        CheckpointError: Another process holds the folder, which the message names, or the folder cannot be written.
+    """
+    path = Path(folder) / LOCK_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, locked = _open(path)
+    except BlockingIOError as error:
+        raise CheckpointError(
+            f"{folder}: in use by {_holder(path)}; wait until that ends or stop it, or use another folder"
+        ) from error
+    except OSError as error:
+        raise CheckpointError(f"{folder}: cannot be made or written: {error}; choose another --out") from error
+    try:
+        yield locked
+    finally:
+        if locked and os.name == "posix":
+            path.unlink(missing_ok=True)  # before the release: the next process makes a file of its own
+        os.close(descriptor)
+        if os.name != "posix":
+            with contextlib.suppress(OSError):  # Windows keeps a file that another process has open
+                path.unlink(missing_ok=True)
+
+
+def hold_run_around(path: Path) -> contextlib.AbstractContextManager[object]:
+    """Lock the run folder in which a command writes a file or folder; nothing if the path is in no run folder.
+
+    Raises:
+        CheckpointError: As of `hold`.
+    """
+    path = Path(path).absolute()
+    run = next((folder for folder in (path, *path.parents) if (folder / input_paths.RUN_FILE).is_file()), None)
+    return contextlib.nullcontext() if run is None else hold(run)
+
+
+def writes(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Return a decorator that locks the run folder around what a function writes, see `hold_run_around`.
+
+    Args:
+        names: Arguments with the path; the first one that is not None counts.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def locked(*args: P.args, **kwargs: P.kwargs) -> T:
+            given = signature.bind(*args, **kwargs).arguments
+            with hold_run_around(next(given[name] for name in names if given.get(name) is not None)):
+                return function(*args, **kwargs)
+
+        return locked
+
+    return decorate
+
+
+def _open(path: Path) -> tuple[int, bool]:
+    """Open and lock the file at a path, and describe this process in it.
+
+    Raises:
+        BlockingIOError: Another process holds the lock.
+        OSError: The file cannot be opened.
+    """
+    while True:
+        # A link is refused: its target would be overwritten.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise OSError(f"{path} is not a regular file")
+            locked = _lock(descriptor, path)
+            if locked and not _is_at(path, descriptor):  # the holder removed it in between
+                os.close(descriptor)
+                continue
+            with contextlib.suppress(OSError):  # a full disk takes no description, but the lock holds
+                os.ftruncate(descriptor, 0)
+                os.lseek(descriptor, 0, os.SEEK_SET)
+                os.write(descriptor, json.dumps(_description()).encode())
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor, locked
+
+
+def _lock(descriptor: int, path: Path) -> bool:
+    """Lock an open file; returns False if its file system has no locks."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(descriptor, _PLACE, os.SEEK_SET)
+            try:
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            except PermissionError as error:
+                raise BlockingIOError(*error.args) from error
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        log.warning(
+            "%s: its file system has no locks (%s); make sure that no other process writes there",
+            path.parent,
+            error.strerror,
+        )
+        return False
+    return True
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def _description() -> dict[str, str | int]:
+    return {
+        "pid": os.getpid(),
+        "host": socket.gethostname(),
+        "since": datetime.datetime.now().astimezone().isoformat(sep=" ", timespec="seconds"),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])[:1000],
+    }
+
+
+def _holder(path: Path) -> str:
+    """Describe the process that holds a lock, as well as its file tells."""
+    try:
+        with open(path, "rb") as stream:
+            found = strict_json.parse(stream.read(_MOST_BYTES), str(path), CheckpointError)
+        return f"process {found['pid']} on {found['host']} since {found['since']} ({found['command']})"
+    except (OSError, CheckpointError, KeyError, TypeError):
+        return "another process"
