@@ -38,6 +38,7 @@ _VECTORS = (
     "offset_rotvec",
     "offset_displacement",
 )
+_RATE_NAMES = (*(f"{name}.{axis}" for name in _VECTORS for axis in "xyz"), "frequency")
 _STEP_TOLERANCE = 1e-9  # of the radius; Magnus-4 error of `world_twist`
 _MOST_STEPS = 1 << 20  # of these
 
@@ -120,6 +121,9 @@ class MotionModel:
             inertia.flags.writeable = False
             object.__setattr__(self, "inertia", inertia)
         object.__setattr__(self, "covariance_names", tuple(self.covariance_names))
+        foreign = [name for name in self.covariance_names if name not in _RATE_NAMES]
+        if foreign:
+            raise ValueError(f"covariance_names: expected names such as 'velocity.x', got {foreign[0]!r:.60}")
         if self.covariance is not None:
             covariance = np.array(self.covariance, np.float64)
             size = len(self.covariance_names)

@@ -8,10 +8,10 @@ import logging
 import math
 from typing import Any
 
-import numpy as np
 import torch
 
 from .. import errors
+from ..scene import cameras
 from ..scene.cameras import Camera
 from . import harmonics
 from .settings import BACKENDS, RasterSettings, RasterStats, RenderOutput, SplatImage
@@ -111,7 +111,7 @@ def rasterize(
     """
     means = gaussians.means
     _check_tensor("means", means)
-    _check_camera(camera)
+    cameras.check(camera)
     if colors is not None:
         _check_companion("colors", colors, means, (len(means), 3))
     if features is not None:
@@ -224,7 +224,7 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
                 f"{name}: expected {means.dtype} on {means.device}, as the means are, got {tensor.dtype} on "
                 f"{tensor.device}; remedy: {name}.to(means), or the means in the kind of the others"
             )
-    _check_camera(camera)
+    cameras.check(camera)
     if background is not None:
         _check_background(background, means, camera, channels.shape[-1])
         inputs["background"] = background.to(means.dtype)
@@ -233,9 +233,6 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
     for name, tensor in inputs.items():
         _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
 
-
-_RIGID_TOLERANCE = 1e-3  # largest entry of R R^T - 1
-_ROUNDING = 1e-9  # of the entries of a camera that are 0 or 1 and not read
 
 # Smallest and largest value of the inputs that have them, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
@@ -327,44 +324,6 @@ def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | Non
             at = tuple(torch.nonzero(bad)[0].tolist())
             return ValueError(f"{name}: expected {wanted}, found {values[at].item()} at index {at}")
     return None
-
-
-def _check_camera(camera: Camera) -> None:
-    """Raise ValueError naming the entry of the camera that no image can be drawn with."""
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
-    place = f"camera {camera.name!r}" if camera.name else "camera"
-    if not all(isinstance(side, int | np.integer) for side in (camera.width, camera.height)):
-        raise TypeError(f"{place}: expected whole numbers of pixels, got {camera.width!r} x {camera.height!r}")
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"{place}: expected a width and height of 1 or more, got {camera.width} x {camera.height}")
-    for name, shape in (("intrinsics", (3, 3)), ("T_cam_world", (4, 4))):
-        matrix = getattr(camera, name)
-        if not isinstance(matrix, np.ndarray):
-            raise TypeError(f"{place}: {name}: expected an array, got {type(matrix).__name__}; cameras get no gradient")
-        if matrix.shape != shape:
-            raise ValueError(f"{place}: {name}: expected shape {shape}, got {matrix.shape}")
-        bad = np.argwhere(~np.isfinite(matrix))
-        if len(bad):
-            at = tuple(bad[0].tolist())
-            raise ValueError(f"{place}: {name}: expected finite values, found {matrix[at]} at index {at}")
-        last = np.eye(len(matrix))[-1]
-        if not np.allclose(matrix[-1], last, rtol=0, atol=_ROUNDING):
-            raise ValueError(f"{place}: {name}: expected {last.tolist()} as the last row, found {matrix[-1].tolist()}")
-    rotation = camera.T_cam_world[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise ValueError(
-            f"{place}: T_cam_world: expected a rotation in its first three rows and columns, found one that is off by "
-            f"{off:.2g} or mirrors; remedy: take scale and mirroring out of it"
-        )
-    if abs(camera.intrinsics[1, 0]) > _ROUNDING:
-        raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")
-    for at in ((0, 0), (1, 1)):
-        if not camera.intrinsics[at] > 0:
-            raise ValueError(
-                f"{place}: intrinsics: expected focal lengths above 0, found {camera.intrinsics[at]} at index {at}"
-            )
 
 
 def _check_values(name: str, values: torch.Tensor, low: float, high: float, remedy: str) -> None:

@@ -12,6 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+FARTHEST = 1e15  # largest coordinate that is drawn: single precision can square it
+MOST_PIXELS = 1 << 16  # of a side of an image
+_MOST_FOCAL = 1e12  # pixels; the least is one in so many
+_RIGID_TOLERANCE = 1e-3  # largest entry of R R^T - 1
+_ROUNDING = 1e-9  # of the entries of a camera that are 0 or 1 and not read
 FAR = 1e4  # what parallel projections take for infinity, in half depths of what they show
 
 
@@ -42,6 +47,49 @@ class Camera:
     def forward(self) -> np.ndarray:
         """Viewing direction in the world, unit. [3]"""
         return self.T_cam_world[2, :3].copy()
+
+
+def check(camera: Camera) -> None:
+    """Raise ValueError or TypeError naming the entry of a camera that no image can be drawn with."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
+    place = f"camera {camera.name!r}" if camera.name else "camera"
+    if not all(isinstance(side, int | np.integer) for side in (camera.width, camera.height)):
+        raise TypeError(f"{place}: expected whole numbers of pixels, got {camera.width!r} x {camera.height!r}")
+    if not (1 <= camera.width <= MOST_PIXELS and 1 <= camera.height <= MOST_PIXELS):
+        raise ValueError(
+            f"{place}: expected a width and height of 1 to {MOST_PIXELS}, got {camera.width} x {camera.height}"
+        )
+    for name, shape in (("intrinsics", (3, 3)), ("T_cam_world", (4, 4))):
+        matrix = getattr(camera, name)
+        if not isinstance(matrix, np.ndarray):
+            raise TypeError(f"{place}: {name}: expected an array, got {type(matrix).__name__}; cameras get no gradient")
+        if matrix.shape != shape:
+            raise ValueError(f"{place}: {name}: expected shape {shape}, got {matrix.shape}")
+        bad = np.argwhere(~(np.abs(matrix) <= FARTHEST))
+        if len(bad):
+            at = tuple(bad[0].tolist())
+            raise ValueError(
+                f"{place}: {name}: expected finite values, found {matrix[at]} at index {at} (largest: {FARTHEST:g})"
+            )
+        last = np.eye(len(matrix))[-1]
+        if not np.allclose(matrix[-1], last, rtol=0, atol=_ROUNDING):
+            raise ValueError(f"{place}: {name}: expected {last.tolist()} as the last row, found {matrix[-1].tolist()}")
+    rotation = camera.T_cam_world[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"{place}: T_cam_world: expected a rotation in its first three rows and columns, found one that is off by "
+            f"{off:.2g} or mirrors; remedy: take scale and mirroring out of it"
+        )
+    if abs(camera.intrinsics[1, 0]) > _ROUNDING:
+        raise ValueError(f"{place}: intrinsics: expected 0 at index (1, 0), found {camera.intrinsics[1, 0]}")
+    for at in ((0, 0), (1, 1)):
+        if not 1 / _MOST_FOCAL <= camera.intrinsics[at] <= _MOST_FOCAL:
+            raise ValueError(
+                f"{place}: intrinsics: expected focal lengths above 0, up to {_MOST_FOCAL:g}, found "
+                f"{camera.intrinsics[at]} at index {at}"
+            )
 
 
 def opengl_to_cam_world(matrix_world: np.ndarray) -> np.ndarray:

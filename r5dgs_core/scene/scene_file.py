@@ -8,18 +8,17 @@ residuals as int16).
 from __future__ import annotations
 
 import io
-import json
 import logging
-import struct
 import zipfile
-import zlib
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from .. import errors, input_paths
+from .. import errors, strict_json
 from . import features, files, meanings, playback, scene_json, validation
+from .archive import Archive, Header, most_content
 from .scene import Scene
 
 FORMAT = "r5dgs scene"
@@ -82,9 +81,6 @@ for _name in FIXED_POINT:
     _STORED_DTYPES[_name].add("<i2")
 for _name in _HALF:
     _STORED_DTYPES[_name].add("<f2")
-# What zipfile, zlib and numpy raise on damaged bytes; the encrypted flag is a RuntimeError, odd names a ValueError.
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError, KeyError)
-
 _log = logging.getLogger(__name__)
 
 
@@ -113,8 +109,8 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
 
 def read(path: str | Path) -> Scene:
     """Read and check a scene. Raises `SceneFileError` naming the member and what was expected."""
-    with _open(Path(path)) as archive:
-        scene = _read_zip(archive, str(path))
+    with Archive(Path(path)) as archive:
+        scene = _read_zip(archive)
     validation.check(scene, str(path))
     return scene
 
@@ -122,48 +118,31 @@ def read(path: str | Path) -> Scene:
 def is_exact(path: str | Path) -> bool:
     """Whether a file stores anything in the precision of memory that the compact form would round: who writes what was
     read of it loses nothing with ``exact``."""
-    with _open(Path(path)) as archive:
-        listed = scene_json.words(_read_json(archive, str(path)), "arrays", f"{path}: {JSON_MEMBER}")
-        for name in (*FIXED_POINT, *_HALF):
-            if name in listed and f"{name}.npy" in archive.namelist():
-                with archive.open(f"{name}.npy") as stream:
-                    np.lib.format.read_magic(stream)
-                    if np.lib.format.read_array_header_1_0(stream)[2].itemsize == 4:
-                        return True
-    return False
+    with Archive(Path(path)) as archive:
+        headers = _read_headers(archive, _read_json(archive), (*FIXED_POINT, *_HALF))
+    return any(header.dtype == "<f4" for header in headers.values())
 
 
 def read_meanings(path: str | Path) -> meanings.Meanings | None:
     """Only the stored embeddings of a scene, None where it has none. Raises as `read` does."""
     place = str(path)
-    with _open(Path(path)) as archive:
-        data = _read_json(archive, place)
+    with Archive(Path(path)) as archive:
+        data = _read_json(archive)
         json_place = f"{place}: {JSON_MEMBER}"
-        listed = scene_json.words(data, "arrays", json_place)
-        arrays = {name: _read_array(archive, name, place, name in listed) for name in validation.EMBEDDINGS}
+        headers = _read_headers(archive, data, validation.EMBEDDINGS)
+        ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
+        vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
+        table = scene_json.table(data, json_place)
+        shapes = {name: header.shape for name, header in headers.items()}
+        validation.check_meaning_shapes(shapes, len(ids), len(vocabulary), table, place)
+        arrays = _read_arrays(archive, headers, validation.EMBEDDINGS)
+    validation.check_meanings(arrays, table, place)
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
         return None
-    ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
-    vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
-    table = scene_json.table(data, json_place)
-    validation.check_meanings(arrays, len(ids), len(vocabulary), table, place)
     return meanings.Meanings(
         ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"]
     )
-
-
-def _open(path: Path) -> zipfile.ZipFile:
-    try:
-        input_paths.check_scene(path)
-        return zipfile.ZipFile(path)
-    except PermissionError as error:
-        raise errors.SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error
-    except (*_BROKEN, struct.error) as error:
-        raise errors.SceneFileError(
-            f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "
-            "bake or copy it again"
-        ) from error
 
 
 def info(scene: Scene) -> dict[str, Any]:
@@ -203,26 +182,36 @@ def info(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _write_zip(scene: Scene, stream: Any, exact: bool) -> None:
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:
+    content = _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED)
+    if content > most_content(stream.tell()):  # made scenes, of equal Gaussians: a reader would take it for a bomb
+        stream.seek(0)
+        stream.truncate()
+        _write_members(scene, stream, exact, zipfile.ZIP_STORED)
+
+
+def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> int:
+    """Write the zip; returns the size of its content, bytes."""
+    with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
         arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None and name not in still]
         head = {"format": FORMAT, "format_version": features.version(scene), "arrays": arrays, **features.dump(scene)}
-        _add(archive, JSON_MEMBER, scene_json.dump(scene, head))
+        _add(archive, JSON_MEMBER, scene_json.dump(scene, head), compression)
         for name in arrays:
             array, dtype = getattr(scene, name), _MEMORY_DTYPES[name]
             buffer = io.BytesIO()
             stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
             np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
-            _add(archive, f"{name}.npy", buffer.getvalue())
+            _add(archive, f"{name}.npy", buffer.getvalue(), compression)
+        return sum(info.file_size for info in archive.infolist())
 
 
-def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> None:
     # A fixed date makes equal scenes equal files.
     entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
-    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.compress_type = compression
     entry.external_attr = 0o644 << 16
-    archive.writestr(entry, data)
+    archive.writestr(entry, data, compresslevel=6)
 
 
 def _encode(name: str, array: np.ndarray) -> np.ndarray:
@@ -268,71 +257,67 @@ def _decode(name: str, array: np.ndarray) -> np.ndarray:
     return array.astype(_MEMORY_DTYPES[name])
 
 
-def _read_zip(archive: zipfile.ZipFile, place: str) -> Scene:
-    data = _read_json(archive, place)
-    json_place = f"{place}: {JSON_MEMBER}"
+def _read_zip(archive: Archive) -> Scene:
+    data = _read_json(archive)
+    place, json_place = archive.place, f"{archive.place}: {JSON_MEMBER}"
     if skipped := features.skipped(data):
         _log.warning("%s: skipped what this release cannot read: %s", json_place, ", ".join(skipped))
-    listed = scene_json.words(data, "arrays", json_place)
-    arrays = {name: _read_array(archive, name, place, name in listed) for name in _MEMORY_DTYPES}
-    count, means = scene_json.get(data, "gaussians", int, json_place), arrays["means"]
-    if means is None or means.shape[:1] != (count,):
-        found = None if means is None else means.shape
-        raise errors.SceneFileError(
-            f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
-        )
+    headers = _read_headers(archive, data, _MEMORY_DTYPES)
     fields = scene_json.fields(data, json_place) | features.fields(data, json_place)
-    if not set(listed) & set(_TRACKS):
+    shapes = {name: header.shape for name, header in headers.items()}
+    still = not set(shapes) & set(_TRACKS)
+    if still:
+        shapes |= {"track_times": (1,), "track_poses": (len(fields["groups"]), 1, 7)}
+    for name in _TRACKS:
+        if name not in shapes:
+            raise errors.SceneFileError(f"{json_place}: arrays: expected both of {' and '.join(_TRACKS)}, or none")
+    count = scene_json.get(data, "gaussians", int, json_place)
+    if shapes["means"][:1] != (count,):
+        raise errors.SceneFileError(
+            f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {shapes['means']}"
+        )
+    objects, groups, vocabulary, table = (fields[name] for name in ("objects", "groups", "vocabulary", "lookup"))
+    validation.check_shapes(shapes, objects, groups, vocabulary, table, place)
+    arrays = _read_arrays(archive, headers, _MEMORY_DTYPES)
+    if still:
         arrays["track_times"] = np.array([fields["t_max"]])
         arrays["track_poses"] = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
-    for name in _TRACKS:
-        if arrays[name] is None:
-            raise errors.SceneFileError(f"{json_place}: arrays: expected both of {' and '.join(_TRACKS)}, or none")
     return Scene(**arrays, **fields)  # type: ignore[arg-type]
 
 
-def _read_json(archive: zipfile.ZipFile, place: str) -> dict[str, Any]:
-    def refuse(constant: str) -> float:
-        raise ValueError(f"the number {constant}")
-
-    where = f"{place}: {JSON_MEMBER}"
-    if JSON_MEMBER not in archive.namelist():
+def _read_json(archive: Archive) -> dict[str, Any]:
+    where = f"{archive.place}: {JSON_MEMBER}"
+    if JSON_MEMBER not in archive:
         raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found; this is another kind of zip")
-    try:
-        data = json.loads(archive.read(JSON_MEMBER).decode("utf-8"), parse_constant=refuse)
-    except (*_BROKEN, RecursionError) as error:
-        raise errors.SceneFileError(f"{where}: expected readable JSON, found damage ({error})") from error
+    if archive.size(JSON_MEMBER) > strict_json.MOST_BYTES:
+        raise errors.SceneFileError(
+            f"{where}: expected at most {strict_json.MOST_BYTES >> 20} MiB, found {archive.size(JSON_MEMBER) >> 20} MiB"
+        )
+    memory = min(strict_json.MOST_MEMORY, most_content(archive.compressed_size(JSON_MEMBER)))
+    remedy = "bake or copy the file again"
+    data = strict_json.parse(archive.read(JSON_MEMBER), where, errors.SceneFileError, remedy, memory=memory)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise errors.SceneFileError(f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file')
     features.check(data, where)
     return data
 
 
-def _read_array(archive: zipfile.ZipFile, name: str, place: str, listed: bool) -> np.ndarray | None:
-    """One array. An optional one is absent where scene.json does not list it, so that a lost one is noticed."""
-    member = f"{name}.npy"
-    where = f"{place}: {member}"
-    if name in _OPTIONAL and not listed:
-        return None
-    if member not in archive.namelist():
-        raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found")
-    try:
-        data = archive.read(member)
-        stream = io.BytesIO(data)
-        version = np.lib.format.read_magic(stream)
-        if version != (1, 0):
-            raise ValueError(f"npy version {version} instead of (1, 0)")
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    except _BROKEN as error:
-        raise errors.SceneFileError(f"{where}: expected a readable array, found damage ({error})") from error
-    if dtype.str not in _STORED_DTYPES[name] or fortran:
-        raise errors.SceneFileError(
-            f"{where}: expected dtype {' or '.join(sorted(_STORED_DTYPES[name]))} in C order, "
-            f"found {dtype.str}{' in Fortran order' if fortran else ''}"
-        )
-    size = dtype.itemsize * int(np.prod(shape, dtype=object)) if shape else dtype.itemsize
-    if len(data) - stream.tell() != size:
-        raise errors.SceneFileError(
-            f"{where}: expected {size} bytes for shape {shape}, found {len(data) - stream.tell()}"
-        )
-    return _decode(name, np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape))
+def _read_headers(archive: Archive, data: dict[str, Any], names: Iterable[str]) -> dict[str, Header]:
+    """Headers of some arrays that a file has.
+
+    An optional one is absent where scene.json does not list it, so that a lost one is noticed.
+    """
+    listed = set(scene_json.words(data, "arrays", f"{archive.place}: {JSON_MEMBER}"))
+    wanted = [name for name in names if name in listed or name not in _OPTIONAL]
+    for name in wanted:
+        if f"{name}.npy" not in archive:
+            raise errors.SceneFileError(f"{archive.place}: {name}.npy: expected in a .r5dgs file, not found")
+    return {name: archive.header(f"{name}.npy", _STORED_DTYPES[name]) for name in wanted}
+
+
+def _read_arrays(archive: Archive, there: Collection[str], names: Iterable[str]) -> dict[str, np.ndarray | None]:
+    """Arrays in their dtypes of memory, None for those that a file does not have."""
+    return {
+        name: _decode(name, archive.array(f"{name}.npy", _STORED_DTYPES[name])) if name in there else None
+        for name in names
+    }

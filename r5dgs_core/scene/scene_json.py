@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__, errors
+from .. import __version__, errors, strict_json
 from ..motion.models import MotionModel
 from .cameras import Camera
 from .meanings import POOLINGS, EncoderCard, Table, View
@@ -73,7 +73,12 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         "provenance": scene.provenance,
         "needs": list(scene.needs),
     }
-    return json.dumps(tree, indent=1, allow_nan=False, default=_plain, ensure_ascii=False).encode()
+    try:
+        data = json.dumps(tree, indent=1, allow_nan=False, default=_plain, ensure_ascii=False).encode()
+    except (ValueError, TypeError, RecursionError) as error:  # of what the caller put into provenance and needs
+        raise errors.SceneFileError(f"scene.json: expected what JSON can hold: {error}") from error
+    strict_json.parse(data, "scene.json", errors.SceneFileError, "change names, provenance or needs")
+    return data
 
 
 def fields(data: dict[str, Any], place: str) -> dict[str, Any]:

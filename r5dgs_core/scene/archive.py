@@ -1,0 +1,208 @@
+"""Bounded reading of a zip of `.npy` arrays: sizes are checked before anything is decompressed or allocated.
+
+Notation: a file of F bytes may declare `ALLOWANCE` + `RATIO` F bytes of content in all. A declared size is the size: a
+member that inflates to more or less is an error.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from .. import input_paths
+from ..errors import SceneFileError
+
+ALLOWANCE = 32 << 20
+RATIO = 64
+_BLOCK = 1 << 20  # what is read at once; also the largest directory of a zip
+_MOST_DIMENSIONS = 8
+_MAGIC = b"\x93NUMPY\x01\x00"
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|=]?[A-Za-z][0-9]*)', 'fortran_order': (True|False), 'shape': \(([0-9, ]*)\), \} *\n"
+)
+_DIMENSION = re.compile(r"(?:[0-9]{1,18}(?:, ?[0-9]{1,18})*,?)?")
+# What zipfile and zlib raise on damaged bytes; the encrypted flag is a RuntimeError, odd names a ValueError.
+_BROKEN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    OSError,
+    ValueError,
+)
+
+
+def most_content(size: int) -> int:
+    """Bytes of content that a file of a size may hold."""
+    return ALLOWANCE + RATIO * size
+
+
+@dataclass(frozen=True)
+class Header:
+    """Header of an array in C order.
+
+    Attributes:
+        dtype: Code of the dtype, such as "<f4".
+        shape: Its shape.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+
+
+class Archive:
+    """A zip that is open for reading. Every fault of it is a `SceneFileError`.
+
+    Args:
+        path: The file.
+
+    Raises:
+        SceneFileError: It is missing, no zip, damaged, or declares more content than its size allows.
+    """
+
+    def __init__(self, path: Path):
+        self.place = str(path)
+        input_paths.check_scene(path)
+        try:
+            self._stream: BinaryIO = _Bounded(io.FileIO(path))
+        except OSError as error:
+            raise SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error
+        try:
+            self._zip = zipfile.ZipFile(self._stream)
+            self._members = self._checked(path.stat().st_size)
+        except _BROKEN as error:
+            self._stream.close()
+            raise SceneFileError(
+                f"{path}: expected a .r5dgs file (a zip), found a truncated or foreign file ({error}); "
+                "bake or copy it again"
+            ) from error
+        except SceneFileError:
+            self._stream.close()
+            raise
+
+    def __enter__(self) -> Archive:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._zip.close()
+        self._stream.close()
+
+    def __contains__(self, member: str) -> bool:
+        return member in self._members
+
+    def size(self, member: str) -> int:
+        """Declared size of a member, bytes."""
+        return self._members[member].file_size
+
+    def compressed_size(self, member: str) -> int:
+        """Bytes of a member in the file."""
+        return self._members[member].compress_size
+
+    def read(self, member: str) -> bytes:
+        """Content of a member, of its declared size."""
+        with self._reading(member) as stream:
+            return _read_exactly(stream, bytearray(self.size(member)))
+
+    def header(self, member: str, dtypes: Collection[str]) -> Header:
+        """Header of an array of one of some dtypes, whose declared size is the one that its header gives it."""
+        with self._reading(member) as stream:
+            return self._header(stream, member, dtypes)
+
+    def array(self, member: str, dtypes: Collection[str]) -> np.ndarray:
+        """An array of one of some dtypes."""
+        with self._reading(member) as stream:
+            header = self._header(stream, member, dtypes)
+            result = np.empty(header.shape, header.dtype)
+            _read_exactly(stream, result.reshape(-1).view(np.uint8).data if result.size else bytearray())
+            return result
+
+    def _checked(self, size: int) -> dict[str, zipfile.ZipInfo]:
+        """The members by name, their sizes checked against that of the file."""
+        found = self._zip.infolist()
+        members = {info.filename: info for info in found}
+        if len(members) < len(found):
+            names = [info.filename for info in found]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise SceneFileError(f"{self.place}: expected each member once, found {twice[:60]!r} twice")
+        if sum(info.compress_size for info in found) > size:
+            raise SceneFileError(f"{self.place}: expected members beside each other, found members that overlap")
+        declared, most = sum(info.file_size for info in found), most_content(size)
+        if declared > most:
+            raise SceneFileError(
+                f"{self.place}: expected at most {most >> 20} MiB of content in a file of {size / 2**20:.1f} MiB, "
+                f"found {declared >> 20} MiB declared; no scene compresses so well, so nothing was read. "
+                "Get the file from somebody you trust"
+            )
+        return members
+
+    @contextmanager
+    def _reading(self, member: str) -> Iterator[BinaryIO]:
+        # One byte more than declared, so that a member that goes on past its size is noticed.
+        info = copy.copy(self._members[member])
+        info.file_size += 1
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others inflate without a bound
+            raise SceneFileError(f"{self.place}: {member}: expected a stored or deflated member, found another kind")
+        try:
+            with self._zip.open(info) as stream:
+                yield stream  # type: ignore[misc]
+        except _BROKEN as error:
+            raise SceneFileError(
+                f"{self.place}: {member}: found damage ({error}); bake or copy the file again"
+            ) from error
+
+    def _header(self, stream: BinaryIO, member: str, dtypes: Collection[str]) -> Header:
+        start = stream.read(len(_MAGIC) + 2)
+        if start[:-2] != _MAGIC or len(start) < len(_MAGIC) + 2:
+            raise ValueError(f"expected an array in npy version 1.0, found {start!r}")
+        text = stream.read(int.from_bytes(start[-2:], "little"))
+        match = _HEADER.fullmatch(text)
+        if match is None or not _DIMENSION.fullmatch(match[3].decode()):
+            raise ValueError(f"expected the header of an array, found {text[:80]!r}")
+        dtype, fortran = match[1].decode(), match[2] == b"True"
+        if dtype not in dtypes or fortran:
+            raise SceneFileError(
+                f"{self.place}: {member}: expected dtype {' or '.join(sorted(dtypes))} in C order, "
+                f"found {dtype}{' in Fortran order' if fortran else ''}"
+            )
+        shape = tuple(int(n) for n in match[3].decode().split(",") if n.strip())
+        size, found = math.prod(shape) * np.dtype(dtype).itemsize, self.size(member) - len(start) - len(text)
+        if size != found or len(shape) > _MOST_DIMENSIONS:
+            raise ValueError(f"expected {size} bytes for shape {shape}, found {found}")
+        return Header(dtype, shape)
+
+
+class _Bounded(io.BufferedReader):
+    """A file that is read in pieces of at most `_BLOCK` bytes; a zip's directory, which is read whole, is one piece."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > _BLOCK:
+            raise zipfile.BadZipFile(f"a directory or piece of {size} bytes, more than {_BLOCK}")
+        return super().read(size)
+
+
+def _read_exactly(stream: BinaryIO, target: bytearray | memoryview) -> bytes:
+    """Fill the target to its end and make sure that nothing follows."""
+    view, at = memoryview(target), 0
+    while at < len(view):
+        piece = stream.read(min(_BLOCK, len(view) - at))
+        if not piece:
+            raise ValueError(f"the data ends after {at} of {len(view)} bytes")
+        view[at : at + len(piece)] = piece
+        at += len(piece)
+    if stream.read(1):
+        raise ValueError(f"the data goes on after the declared {len(view)} bytes")
+    return bytes(target) if isinstance(target, bytearray) else b""
