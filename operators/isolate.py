@@ -27,6 +27,9 @@ class R5DGS_OT_isolate(actions.Selects, bpy.types.Operator):
             wanted = [] if found is None else [found]
         elif self.text.strip():
             answer = prompt.ask(context, self.text)
+            if answer.error:
+                self.report({"ERROR"}, answer.error)
+                return {"CANCELLED"}
             if not answer.matches:
                 self.report({"WARNING"}, prompt.explain_nothing(prompt.scope(context), self.text, answer))
                 return {"CANCELLED"}

@@ -42,6 +42,13 @@ class R5DGS_OT_select_by_prompt(actions.Selects, bpy.types.Operator):
         else:
             self.threshold = settings.threshold
         answer = prompt.ask(context, text)
+        if answer.error:
+            self.report({"ERROR"}, answer.error)
+            return {"CANCELLED"}
+        if answer.nothing:
+            selection.select(context, [], self.mode)
+            self.report({"INFO"}, "No object is asked for")
+            return {"FINISHED"}
         if not answer.matches:
             self.report({"WARNING"}, prompt.explain_nothing(prompt.scope(context), text, answer))
             return {"CANCELLED"}

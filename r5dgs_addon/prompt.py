@@ -40,12 +40,16 @@ class Answer:
         meant: Names that may have been meant where nothing matches.
         notes: Sentences: matches that were deleted, files that were not found.
         missing: Phrases that the encoder of the preferences could answer, and was not asked for yet.
+        error: Why the prompt cannot be answered; else empty.
+        nothing: True for a prompt that asks for no object, such as "none".
     """
 
     matches: list[Match]
     meant: list[str]
     notes: list[str]
     missing: tuple[str, ...] = ()
+    error: str = ""
+    nothing: bool = False
 
     @property
     def objects(self) -> list[selection.Wanted]:
@@ -64,8 +68,16 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
     Returns:
         The answer; equal scores are in the order of ``loaded``.
     """
+    try:
+        return _search(loaded, text, threshold)
+    except errors.ConfigError as error:
+        return Answer([], [], [str(error)], error=str(error))
+
+
+def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> Answer:
     matches, deleted, notes, known, missing, lost = [], [], [], [], [], []
     left: list[list[str]] = []
+    kept: list[list[str]] = []  # phrases that were to be left out and match nothing
     for collection in loaded:
         labels = table.labels(collection)
         there = table.present(collection)
@@ -82,11 +94,16 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrases.of, card=card)
         left.append(lookup.unanswered(labels, text, threshold, meanings, embed))
+        kept.append(lookup.not_excluded(labels, text, threshold, meanings, embed))
         for found in lookup.search_labels(labels, text, threshold, meanings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
-            else:
+            elif not found.why.startswith(lookup.EVERYTHING):
                 deleted.append(names[found.object_id])
+    unfit = [phrase for phrase in kept[0] if all(phrase in each for each in kept)] if kept else []
+    if unfit:  # until the encoder has been asked, nobody knows what is left out
+        matches = []
+        lookup.check_exclusions(known, text, [phrase for phrase in unfit if phrase not in missing])
     if lost and not matches:
         asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
         notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
@@ -97,7 +114,8 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = loo
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     matches.sort(key=lambda match: -round(match.score, 6))
     meant = [] if matches or not text.strip() else list(dict.fromkeys(lookup.suggest(known, text)))
-    return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)))
+    nothing = bool(loaded) and all(lookup.is_nothing(table.labels(each), text) for each in loaded)
+    return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)), nothing=nothing)
 
 
 def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:

@@ -125,6 +125,8 @@ def run_query(
     found = query.find(scene, text, opened, least)
     if found:
         said = "\n".join(f"nothing matches {phrase!r}" for phrase in query.unanswered(scene, text, opened, least))
+    elif lookup.is_nothing(lookup.labels_of(scene), text):
+        said = f"{text.strip()!r} asks for no object"
     else:
         said = nothing(scene, text, unknown if encoder is None and opened is None else [])
     if as_json:

@@ -1,7 +1,7 @@
 """Find objects by words, without any network: names and aliases first, then what stored embeddings say.
 
 A query is cut into wishes at "and", "," and the like, unless it is a name with such a word; each wish is compared with
-every name and alias of the table.
+every name and alias of the table. "Everything", "not" and their like are understood by `prompts`.
 Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo. A name that says a
 wish whole settles it; other wishes are asked of the embeddings, too (`meanings`), where their words have one.
 """
@@ -10,39 +10,25 @@ from __future__ import annotations
 
 import difflib
 import functools
-import re
-import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from .. import errors
+from . import english, prompts
 from . import meanings as stored
 from .meanings import Meanings
 from .scene import Scene
 
 THRESHOLD = stored.PASS
+EVERYTHING = "everything"  # begins the reason of a match that no word of its own found
 Embed = Callable[[str], np.ndarray | None]  # embedding of a phrase, unit [D]; None where it cannot be had
 _SETTLED = 0.9  # of a name that says the wish whole
 _TYPO_RATIO = 0.75
 _LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
 _MOST_SLIPS = 3
-_FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
-# Said before what is counted, they are no part of its name; "mug two" keeps its number.
-_COUNTS = frozenset(("both", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "some", "few"))
 _HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
-# Plurals that no ending tells, and words that only look like one.
-_PLURALS = {
-    **{"men": "man", "women": "woman", "children": "child", "people": "person", "lives": "life"},
-    **{"feet": "foot", "teeth": "tooth", "geese": "goose", "mice": "mouse", "quizzes": "quiz"},
-    **{f"{word}es": word for word in ("gas", "lens", "iris", "canvas", "atlas", "potato", "tomato", "mango", "hero")},
-}
-_NO_PLURALS = frozenset(("gas", "lens", "canvas", "atlas"))
-_PLURAL_ENDINGS = (
-    *((f"{start}ves", f"{start}f") for start in ("lea", "loa", "el", "hal", "cal", "wol", "scar", "hoo", "thie")),
-    *(("knives", "knife"), ("wives", "wife")),
-)
-_SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -88,9 +74,14 @@ def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed |
         embed: Gives the embedding of other words, by the encoder that made the scene's.
 
     Returns:
-        Matches with score >= threshold, ranked by score, then by id; empty where nothing matches.
+        Matches with score >= threshold, ranked by score, then by id; empty if nothing matches.
+
+    Raises:
+        ConfigError: Something is to be left out that nothing matches.
     """
-    return search_labels(labels_of(scene), text, threshold, Meanings.of(scene), embed)
+    labels, meanings = labels_of(scene), Meanings.of(scene)
+    check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
+    return search_labels(labels, text, threshold, meanings, embed)
 
 
 def search_labels(
@@ -100,12 +91,20 @@ def search_labels(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[Match]:
-    """As `search`, on names and aliases, and on stored embeddings where they are given."""
-    best: dict[int, Match] = {}
-    for said, wish in _asked(labels, text):
-        for match in _fulfil(labels, said, wish, meanings, embed):
-            if match.score >= threshold and (match.object_id not in best or match.score > best[match.object_id].score):
-                best[match.object_id] = match
+    """As `search`, on names and aliases, and on stored embeddings if they are given.
+
+    What cannot be left out, as nothing matches it, is ignored here: the caller asks `not_excluded`.
+    """
+    asked, best = _asked(labels, text), {}
+    if asked.everything:
+        why = " and ".join(repr(said) for said, _ in asked.excluded)
+        why = f"{EVERYTHING} but {why}" if why else EVERYTHING
+        best = {label.object_id: Match(label.object_id, 1.0, why) for label in labels if label.object_id > 0}
+    for match in _matches(labels, asked.wanted, threshold, meanings, embed):
+        if match.object_id not in best or match.score > best[match.object_id].score:
+            best[match.object_id] = match
+    for match in _matches(labels, asked.excluded, threshold, meanings, embed):
+        best.pop(match.object_id, None)
     return _ranked(best.values())
 
 
@@ -116,19 +115,52 @@ def unanswered(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
-    """Phrases of a text that nothing matches; arguments as of `search_labels`."""
-    return [
-        said
-        for said, wish in _asked(labels, text)
-        if all(match.score < threshold for match in _fulfil(labels, said, wish, meanings, embed))
-    ]
+    """Phrases of a text that are wanted and that nothing matches; arguments as of `search_labels`."""
+    wanted = _asked(labels, text).wanted
+    return [said for said, wish in wanted if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+
+
+def not_excluded(
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
+) -> list[str]:
+    """Phrases that a text leaves out and that nothing matches; arguments as of `search_labels`."""
+    excluded = _asked(labels, text).excluded
+    return [said for said, wish in excluded if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+
+
+def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str]) -> None:
+    """Refuse a text that leaves out what is not there: that would select what the user did not mean.
+
+    Args:
+        labels: What the objects answer to.
+        text: The text.
+        missing: Its phrases of `not_excluded`.
+
+    Raises:
+        ConfigError: There are such phrases.
+    """
+    if missing:
+        raise errors.ConfigError(
+            f"{text.strip()!r} leaves out what is not there: {explain_nothing(labels, missing[0])}"
+        )
+
+
+def is_nothing(labels: Sequence[Label], text: str) -> bool:
+    """True for a text that asks for no object at all, such as "none" and "not everything"."""
+    asked = _asked(labels, text)
+    return bool(english.words_of(text)) and not asked.wanted and not asked.everything
 
 
 def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
     """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
+    asked = _asked(labels, text)
     return [
         said
-        for said, wish in _asked(labels, text)
+        for said, wish in (*asked.wanted, *asked.excluded)
         if not any(match.score >= _SETTLED for match in _named(labels, wish))
         and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
     ]
@@ -165,7 +197,7 @@ def explain_nothing(labels: Sequence[Label], text: str) -> str:
 
 def wishes(text: str) -> list[list[str]]:
     """Words of each thing that a text asks for, normalised, fillers left out."""
-    return [words for _, words in _parts(text)]
+    return [words for _, words in english.phrases(text)]
 
 
 def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
@@ -184,52 +216,20 @@ def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
     return rows
 
 
-def words_of(text: str) -> list[str]:
-    """Words in lower case without accents, as `singular` spells them; digits are words."""
-    plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
-    return [singular(word) for word in re.findall(r"[^\W_]+", plain.casefold())]
+def _asked(labels: Sequence[Label], text: str) -> prompts.Prompt:
+    return prompts.parse(text, [name for label in labels for name in (label.name, *label.aliases)])
 
 
-def singular(word: str) -> str:
-    """One spelling for an English noun and its plural: the singular, but for endings that a plural does not tell.
-
-    "cookies" and "berries" end alike, as "caches" and "torches" and "fuses" and "buses" do; so "cookie", "cache" and
-    "fuse" are spelled "cooky", "cach" and "fus".
-    """
-    if word in _PLURALS:
-        return _PLURALS[word]
-    for plural, one in _PLURAL_ENDINGS:
-        if word.endswith(plural):
-            return word.removesuffix(plural) + one
-    if word.endswith("s") and not word.endswith(("ss", "us", "is")) and word not in _NO_PLURALS and len(word) > 3:
-        word = word[:-1]
-    if len(word) > 3 and word.endswith("ie"):
-        return word[:-2] + "y"
-    if len(word) > 3 and (word.endswith(("che", "she", "xe", "sse", "ze")) or re.search("[^ao]use$", word)):
-        return word[:-1]
-    return word
-
-
-def _asked(labels: Sequence[Label], text: str) -> list[tuple[str, list[str]]]:
-    """As `_parts`; a text that is a name as it stands asks for that alone."""
-    said, words = " ".join(text.casefold().split()), words_of(text)
-    names = (name for label in labels for name in (label.name, *label.aliases))
-    if words and any(" ".join(name.casefold().split()) == said for name in names):
-        return [(text.strip(), words)]
-    return _parts(text)
-
-
-def _parts(text: str) -> list[tuple[str, list[str]]]:
-    """Each thing that a text asks for: as it was said, and its words as in `wishes`."""
-    result = []
-    for part in _SPLIT.split(text):
-        words = words_of(part)
-        kept = [word for word in words if word not in _FILLER] or words
-        while len(kept) > 1 and kept[0] in _COUNTS:
-            kept = kept[1:]
-        if kept:
-            result.append((part.strip(), kept))
-    return result
+def _matches(
+    labels: Sequence[Label],
+    phrases: Sequence[tuple[str, list[str]]],
+    threshold: float,
+    meanings: Meanings | None,
+    embed: Embed | None,
+) -> list[Match]:
+    """Everything that fits one of some phrases well enough."""
+    found = [match for said, wish in phrases for match in _fulfil(labels, said, wish, meanings, embed)]
+    return [match for match in found if match.score >= threshold]
 
 
 def _fulfil(
@@ -264,7 +264,7 @@ def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
 
 def _ends_with(label: Label, word: str) -> bool:
     """Whether a word is the end of one of a name: a chessboard is a board."""
-    return any(present.endswith(word) for name in (label.name, *label.aliases) for present in words_of(name))
+    return any(present.endswith(word) for name in (label.name, *label.aliases) for present in english.words_of(name))
 
 
 def _ranked(matches: Iterable[Match]) -> list[Match]:
@@ -276,7 +276,7 @@ def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
     """Best of the object's name and aliases for one wish; an alias counts a little less than a name."""
     best: Match | None = None
     for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
-        words = words_of(text)
+        words = english.words_of(text)
         if not words:
             continue
         table = [[_similarity(word, present) for present in words] for word in wish]
@@ -318,7 +318,7 @@ def _similarity(word: str, present: str) -> float:
 def _closeness(text: str, name: str) -> float:
     """How near two texts are, in [0, 1]: the best of their words, or all of them run together; 0 where none is."""
     asked = [word for wish in wishes(text) for word in wish]
-    present = words_of(name)
+    present = english.words_of(name)
     if not asked or not present:
         return 0.0
     pairs = [(a, b) for a in asked for b in present] + [("".join(asked), "".join(present))]

@@ -10,7 +10,7 @@ import functools
 
 import numpy as np
 
-from ..scene import lookup
+from ..scene import english
 
 _KINDS = """\
 food: bread cheese egg rice pasta soup sandwich pizza hamburger sausage meat steak chicken salad honey butter sushi \
@@ -151,10 +151,10 @@ def relations() -> np.ndarray:
 def known(phrase: str) -> str | None:
     """The noun that a phrase says: itself, or its last words, as "blue crate" is a crate; None for none."""
     nouns = _by_words()
-    said = lookup.words_of(phrase)
+    said = english.words_of(phrase)
     return next((nouns[tuple(said[k:])] for k in range(len(said)) if tuple(said[k:]) in nouns), None)
 
 
 @functools.cache
 def _by_words() -> dict[tuple[str, ...], str]:
-    return {tuple(lookup.words_of(word)): word for word in words()}
+    return {tuple(english.words_of(word)): word for word in words()}

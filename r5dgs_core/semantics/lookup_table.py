@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import errors
-from ..scene import lookup
+from ..scene import english, lookup
 from ..scene.meanings import Table, View
 from ..scene.scene import Scene, SceneObject
 from . import best_views, calibration, common_nouns, encoders
@@ -137,7 +137,7 @@ def _vocabulary(
 ) -> tuple[tuple[str, ...], np.ndarray]:
     """The words to store, each once, names first, and their embeddings."""
     named = [word for item in items for word in (item.name, *item.aliases)]
-    known = {tuple(lookup.words_of(noun)): row for row, noun in enumerate(common_nouns.words())}
+    known = {tuple(english.words_of(noun)): row for row, noun in enumerate(common_nouns.words())}
     chosen: dict[tuple[str, ...], str] = {}
     for word in (*named, *words, *common_nouns.words()):
         said = lookup.wishes(word)

@@ -295,3 +295,50 @@ def test_when_the_scene_file_is_gone_names_are_searched_and_that_is_said(blender
 def test_without_a_scene_the_operators_cannot_be_called(blender):
     for operator in (blender.ops.r5dgs.select_by_prompt, blender.ops.r5dgs.preview):
         assert not operator.poll()
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"),
+    [
+        ("everything", {1, 2, 3, 4, 5, 6}),
+        ("not the mug", {2, 3, 4, 5, 6}),
+        ("everything but the mug and fruit", {3, 5, 6}),
+        ("fruit but not the lemon", {2}),
+    ],
+)
+def test_everything_and_what_is_left_out_mean_what_they_say(blender, loaded, text, ids):
+    assert ask(blender, text) == {"FINISHED"} and selected_ids(blender) == ids
+
+
+def test_nothing_selects_nothing(blender, loaded):
+    ask(blender, "mug")
+    assert ask(blender, "nothing", "ADD") == {"FINISHED"} and selected_ids(blender) == {1}
+    assert ask(blender, "none") == {"FINISHED"} and selected_ids(blender) == set()
+
+
+@pytest.mark.parametrize("text", ["not the vaze", "everything but", "mug but not the vaze"])
+def test_leaving_out_what_is_unknown_is_an_error_that_selects_nothing(blender, loaded, text):
+    ask(blender, "globe")
+    with pytest.raises(RuntimeError, match="leaves out what is not there|expected what to leave out"):
+        ask(blender, text)
+    assert selected_ids(blender) == {6} and len(session(blender).matches) == 0
+    session(blender).prompt = text  # typed into the field, the panel says so
+    assert any("leave" in note.name for note in session(blender).notes)
+    with pytest.raises(RuntimeError, match="leaves out|to leave out"):
+        blender.ops.r5dgs.isolate(text=text)
+
+
+def test_of_two_scenes_one_knows_what_is_left_out(blender, loaded, tmp_path):
+    path = scene_file.write(scenes.make_scene(n=200, objects=2), tmp_path / "other.r5dgs")
+    blender.ops.r5dgs.load_scene(filepath=str(path))
+    blender.context.scene.r5dgs_words.all_scenes = True
+    ask(blender, "not the globe")
+    found = {(match.scene == loaded.name, match.object_id) for match in session(blender).matches}
+    assert found == {(True, number) for number in range(1, 6)} | {(False, 1), (False, 2)}
+
+
+def test_deleted_objects_are_no_part_of_everything(blender, loaded):
+    ask(blender, "lemon")
+    blender.ops.object.delete()
+    ask(blender, "everything")
+    assert selected_ids(blender) == {1, 2, 3, 5, 6} and len(session(blender).notes) == 0

@@ -1,0 +1,98 @@
+"""The logic of a prompt: everything, nothing, and what is left out ("everything but the ball", "not the vase")."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from .. import errors
+from . import english
+
+Phrase = tuple[str, list[str]]  # as it was said, and its words (`english.phrases`)
+
+_THINGS = r"(?:\s+(?:of\s+)?(?:the|these|those|them|it|my))?(?:\s+(?:objects?|things?|items?))?"
+_ALL = rf"(?:the\s+)?(?:everything|anything|all|every|each|any){_THINGS}"
+_NONE = rf"(?:nothing|none{_THINGS}|no\s+(?:objects?|things?))"
+_EVERYTHING = re.compile(_ALL, re.IGNORECASE)
+_NOTHING = re.compile(_NONE, re.IGNORECASE)
+# Words that leave out wherever they stand.
+_EXCEPT = re.compile(
+    r"(?:\b(?:but|and)\s+|[,;]\s*)?\bnot\b|\bexcept(?:ing)?\b(?:\s+for\b)?|\bexcluding\b|\bother\s+than\b|\bapart\s+from\b",
+    re.IGNORECASE,
+)
+# Words that do so only at the beginning, or after "everything": a "mug without a handle" is a mug.
+_BUT = re.compile(
+    rf"\s*(?:{_ALL}|{_NONE})?\s*(?P<but>\b(?:but|without|minus|besides)\b)|\s*(?:all|every|any)\b.*?(?P<late>\bbut\b)",
+    re.IGNORECASE | re.DOTALL,
+)
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """A prompt in its parts.
+
+    Attributes:
+        wanted: What is asked for beside ``everything``.
+        excluded: What is left out.
+        everything: True if all objects are asked for.
+    """
+
+    wanted: tuple[Phrase, ...] = ()
+    excluded: tuple[Phrase, ...] = ()
+    everything: bool = False
+
+
+def parse(text: str, names: Iterable[str] = ()) -> Prompt:
+    """Take a prompt apart.
+
+    Args:
+        text: The prompt.
+        names: Names of objects; a prompt that is one as it stands asks for that alone, even for "Not" or "all".
+
+    Raises:
+        ConfigError: Nothing follows the word that leaves out.
+    """
+    known = {_spelled(name) for name in names}
+    found = None if _spelled(text) in known else _first(text)
+    if found is None:
+        return _list(text, known)
+    left, word, right = text[: found[0]].strip(" ,;"), text[slice(*found)].strip(" ,;"), text[found[1] :].strip()
+    if not right:
+        raise errors.ConfigError(f"{text.strip()!r}: expected what to leave out after {word!r}")
+    if _spelled(right) not in known:
+        right = _EXCEPT.sub(" and ", right)  # "not the vase and not the ball" leaves out both
+    excluded = _list(right, known)
+    if _NOTHING.fullmatch(left):  # "nothing but the mug" is the mug
+        return excluded
+    if excluded.everything:
+        return Prompt()
+    kept = Prompt(everything=True) if not left or _EVERYTHING.fullmatch(left) else _list(left, known)
+    return Prompt(kept.wanted, excluded.wanted, kept.everything)
+
+
+def _list(text: str, names: set[str]) -> Prompt:
+    """A text without words that leave out: phrases, some of which may be names, "everything" or "nothing"."""
+    words = english.words_of(text)
+    if words and _spelled(text) in names:
+        return Prompt(wanted=((text.strip(), words),))
+    wanted, everything = [], False
+    for said, words in english.phrases(text):
+        named = _spelled(said) in names
+        if not named and _EVERYTHING.fullmatch(said):
+            everything = True
+        elif named or not _NOTHING.fullmatch(said):
+            wanted.append((said, words))
+    return Prompt(tuple(wanted), everything=everything)
+
+
+def _first(text: str) -> tuple[int, int] | None:
+    """Where the first word that leaves out begins and ends."""
+    always, but = _EXCEPT.search(text), _BUT.match(text)
+    spans = [always.span()] if always is not None else []
+    spans += [but.span("but" if but["but"] else "late")] if but is not None else []
+    return min(spans, default=None)
+
+
+def _spelled(name: str) -> str:
+    return " ".join(name.casefold().split())
