@@ -51,7 +51,7 @@ def singular(word: str) -> str:
 def phrases(text: str) -> list[tuple[str, list[str]]]:
     """Each thing that a text lists: as it was said, and its words without fillers and counts."""
     result = []
-    for part in _SPLIT.split(text):
+    for part in _SPLIT.split(" ".join(text.split())):  # the search below is quadratic in runs of spaces
         words = words_of(part)
         kept = [word for word in words if word not in _FILLER] or words
         while len(kept) > 1 and kept[0] in _COUNTS:

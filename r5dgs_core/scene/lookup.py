@@ -307,7 +307,8 @@ def _similarity(word: str, present: str) -> float:
         return 0.75 + 0.2 * len(word) / len(present)
     if len(word) >= 3 and word in present:
         return 0.6 + 0.2 * len(word) / len(present)
-    if min(len(word), len(present)) < 4:
+    shorter, longer = sorted((len(word), len(present)))
+    if shorter < 4 or 2 * shorter < _TYPO_RATIO * (shorter + longer):  # the ratio below cannot be larger than that
         return 0.0
     ratio = difflib.SequenceMatcher(None, word, present, autojunk=False).ratio()
     if sorted(word) == sorted(present):
@@ -331,19 +332,31 @@ def _nearness(word: str, other: str) -> float:
     excused = min(shorter // _LETTERS_PER_SLIP, _MOST_SLIPS)
     if longer - shorter > excused:
         return 0.0
-    slips = edit_distance(word, other)
+    slips = edit_distance(word, other, excused)
     return 1 - slips / longer if slips <= excused else 0.0
 
 
-def edit_distance(word: str, other: str) -> int:
-    """Least number of slips between two words: letters that are too many, missing, wrong, or two that are exchanged."""
-    before: list[int] = []
-    row = list(range(len(other) + 1))
+def edit_distance(word: str, other: str, most: int) -> int:
+    """Least number of slips between two words: letters that are too many, missing, wrong, or two that are exchanged.
+
+    Args:
+        word: One word.
+        other: The other word.
+        most: Limit of the slips that are counted; the work grows with this times the length of the words.
+
+    Returns:
+        The number, or ``most + 1`` if it is larger.
+    """
+    rows: list[dict[int, int]] = [{}, {j: j for j in range(min(len(other), most) + 1)}]
     for i, letter in enumerate(word, 1):
-        before, last, row = row, before, [i]
-        for j, wanted in enumerate(other, 1):
-            best = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (letter != wanted))
-            if i > 1 and j > 1 and letter == other[j - 2] and word[i - 2] == wanted:
-                best = min(best, last[j - 2] + 1)
-            row.append(best)
-    return row[-1]
+        last, before = rows
+        row: dict[int, int] = {}
+        for j in range(max(0, i - most), min(len(other), i + most) + 1):
+            best = i if j == 0 else min(row.get(j - 1, most), before.get(j, most)) + 1
+            if j > 0:
+                best = min(best, before.get(j - 1, most + 1) + (letter != other[j - 1]))
+            if i > 1 and j > 1 and letter == other[j - 2] and word[i - 2] == other[j - 1]:
+                best = min(best, last.get(j - 2, most) + 1)
+            row[j] = best
+        rows = [before, row]
+    return min(rows[1].get(len(other), most + 1), most + 1)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from .. import errors
 from . import english
 
+MOST_LETTERS = 1000  # of a prompt: the work for one grows with its length and with the number of names
 Phrase = tuple[str, list[str]]  # as it was said, and its words (`english.phrases`)
 
 _THINGS = r"(?:\s+(?:of\s+)?(?:the|these|those|them|it|my))?(?:\s+(?:objects?|things?|items?))?"
@@ -51,8 +52,12 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
         names: Names of objects; a prompt that is one as it stands asks for that alone, even for "Not" or "all".
 
     Raises:
-        ConfigError: Nothing follows the word that leaves out.
+        ConfigError: Nothing follows the word that leaves out, or the prompt is longer than `MOST_LETTERS`.
     """
+    if len(text) > MOST_LETTERS:
+        raise errors.ConfigError(
+            f"a prompt of {len(text)} letters: expected at most {MOST_LETTERS}; ask for fewer objects at a time"
+        )
     known = {_spelled(name) for name in names}
     found = None if _spelled(text) in known else _first(text)
     if found is None:

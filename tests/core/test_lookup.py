@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.scene import english, lookup
+from r5dgs_core import errors
+from r5dgs_core.scene import english, lookup, prompts
 from tests.scenes import make_scene
 
 MUG, APPLE, CAR, LEMON, BLOCK, GLOBE = range(1, 7)
@@ -193,19 +194,53 @@ def test_words_that_merely_share_letters_are_not_suggested(text):
     assert ("did you mean" in said) == (text in near) and ("the scene has" in said) == (text not in near)
 
 
+def edit_distance(a, b):
+    return lookup.edit_distance(a, b, most=99)
+
+
+@given(st.text("abc", max_size=8), st.text("abc", max_size=8), st.integers(0, 8))
+def test_slips_are_counted_up_to_a_limit(a, b, most):
+    assert lookup.edit_distance(a, b, most) == min(edit_distance(a, b), most + 1)
+
+
+@pytest.mark.parametrize("text", ["mug " * 300, "x" * 1001, " " * 500_000, "mug, " * 100_000])
+def test_a_prompt_that_is_too_long_is_refused_before_names_are_compared(scene, text, monkeypatch):
+    monkeypatch.setattr(lookup, "_match", None)
+    with pytest.raises(errors.ConfigError, match=rf"a prompt of {len(text)} letters: expected at most 1000"):
+        lookup.search(scene, text)
+
+
+def test_a_prompt_as_long_as_allowed_finds_what_it_names(scene):
+    text = ("mug" + " " * 400 + ", lemon").ljust(prompts.MOST_LETTERS)
+    assert [match.object_id for match in lookup.search(scene, text)] == [MUG, LEMON]
+
+
+def test_long_words_are_compared_letter_by_letter_in_a_narrow_band(monkeypatch):
+    class Letters(str):
+        looked_at = 0
+
+        def __getitem__(self, place):
+            Letters.looked_at += 1
+            return str.__getitem__(self, place)
+
+    name = Letters("ab" * 5000)
+    assert lookup.edit_distance(name[:-1], name, 3) == 1
+    assert Letters.looked_at < 60 * len(name)  # and not its square
+
+
 @given(st.text("abc", max_size=6), st.text("abc", max_size=6), st.text("abc", max_size=6))
 def test_edit_distance_counts_slips(a, b, c):
-    distance = lookup.edit_distance(a, b)
-    assert distance == lookup.edit_distance(b, a) and (distance == 0) == (a == b)
+    distance = edit_distance(a, b)
+    assert distance == edit_distance(b, a) and (distance == 0) == (a == b)
     assert abs(len(a) - len(b)) <= distance <= max(len(a), len(b))
-    assert lookup.edit_distance(c + a, c + b) <= distance
-    assert lookup.edit_distance(a, a[:1] + c + a[1:]) <= len(c)
+    assert edit_distance(c + a, c + b) <= distance
+    assert edit_distance(a, a[:1] + c + a[1:]) <= len(c)
 
 
 def test_each_slip_counts_one():
     for word in ("aple", "appple", "apble", "appel"):
-        assert lookup.edit_distance(word, "apple") == 1
-    assert lookup.edit_distance("elppa", "apple") == 4 and lookup.edit_distance("", "mug") == 3
+        assert edit_distance(word, "apple") == 1
+    assert edit_distance("elppa", "apple") == 4 and edit_distance("", "mug") == 3
 
 
 def test_two_of_a_kind_are_two_matches():
