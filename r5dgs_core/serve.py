@@ -83,7 +83,7 @@ class Warming:
         try:
             from .raster import compile as compilation
             from .raster import warming
-        except ImportError:  # whoever asks for a picture hears of it
+        except (ImportError, errors.ConfigError):  # whoever asks for a picture hears of it
             return
         try:
             with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):

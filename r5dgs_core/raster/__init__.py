@@ -1,5 +1,6 @@
 """Differentiable rasterizer of Gaussians, one signature: `cpu` (numba), `cuda` and `reference` (plain torch)."""
 
+from . import environment as environment  # first, as it checks what numba reads when it is imported
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 from .splatting import rasterize, rasterize_splats
 from .warming import warm_up

@@ -43,6 +43,7 @@ _INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 _SOURCES = ("raster/*.py", "model/spherical_harmonics.py", "train/losses.py", "train/posing.py")
 _OURS = re.compile("r5dgs-[0-9a-f]{12}")
 _KEPT_S = 28 * 24 * 3600.0
+_SYSTEM_USERS = (0, 65534)  # root, and what root's files belong to inside a container of the user
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -203,10 +204,16 @@ def _cache_folder(chosen: str) -> str | None:
         folder = base / f"r5dgs-{digest.hexdigest()[:12]}"
         is_new = not folder.exists()
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            danger = _danger(folder)
+            if danger is None:
+                tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
             tried.append(f"{base} ({error.strerror})")
+            continue
+        if danger is not None:  # machine code that others can replace is not loaded
+            log.warning("rasterizer: no compiled code is kept in %s, as %s; remedy: remove it", folder, danger)
+            tried.append(f"{base} (others can write there)")
             continue
         with contextlib.suppress(OSError):
             os.utime(folder)  # it is in use
@@ -218,6 +225,24 @@ def _cache_folder(chosen: str) -> str | None:
         "remedy: set NUMBA_CACHE_DIR to a folder that can be written",
         ", ".join(tried) or "none",
     )
+    return None
+
+
+def _danger(folder: Path) -> str | None:
+    """Return a reason why others than the user can put code into a folder, or None if only the user can."""
+    if not hasattr(os, "getuid"):  # Windows: folders inherit the rights of the user's profile
+        return None
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
+        return "it is a link or belongs to another user"
+    if status.st_mode & 0o022:
+        return "others can write there"
+    for parent in folder.resolve().parents:  # whoever can rename a folder can put another one into its place
+        status = parent.stat()
+        if status.st_uid not in (os.getuid(), *_SYSTEM_USERS):
+            return f"{parent} belongs to another user"
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            return f"others can write in {parent}"
     return None
 
 
@@ -269,8 +294,6 @@ def _own_temporary() -> Path | None:
             return Path(tempfile.gettempdir()) / "r5dgs"
         folder = Path(tempfile.gettempdir()) / f"r5dgs-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()
+        return None if _danger(folder) else folder
     except OSError:
         return None
-    own = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
-    return folder if own else None

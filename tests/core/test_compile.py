@@ -234,6 +234,40 @@ def test_a_temporary_folder_that_others_could_fill_is_not_used(tmp_path, monkeyp
     assert compilation._own_temporary() is None
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="owners of files are a POSIX matter")
+@pytest.mark.parametrize("kind", ["of another user", "writable by others", "a link", "below a folder of another user"])
+def test_compiled_code_that_others_can_replace_is_not_used(tmp_path, monkeypatch, caplog, kind):
+    chosen, own = tmp_path / "chosen", tmp_path / "own"
+    folder = Path(compilation._cache_folder(str(chosen)))
+    assert folder.parent == chosen and folder.stat().st_mode & 0o077 == 0
+    stranger = folder if kind == "of another user" else chosen if kind.startswith("below") else None
+    if kind == "writable by others":
+        folder.chmod(0o777)
+    elif kind == "a link":
+        folder.rename(tmp_path / "elsewhere")
+        folder.symlink_to(tmp_path / "elsewhere")
+
+    def owned(found, path):
+        return os.stat_result([*found[:4], 4711 if Path(path) == stranger else os.getuid(), *found[5:]])
+
+    monkeypatch.setattr(Path, "lstat", lambda path: owned(os.lstat(path), path))
+    monkeypatch.setattr(Path, "stat", lambda path, **_: owned(os.stat(path), path))
+    monkeypatch.setattr(compilation, "_user_cache", lambda: own)
+    compilation._cache_folder.cache_clear()
+    assert Path(compilation._cache_folder(str(chosen))).parent == own
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert str(folder) in told and "\n" not in told
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "abc", "100000", "2.5", "٣", "9" * 5000, " 2"])
+def test_a_number_of_threads_that_is_none_is_one_line(tmp_path, value):
+    code = "import sys; from r5dgs_core import cli; sys.exit(cli.main(['warm-up']))"
+    environment = {**os.environ, "NUMBA_NUM_THREADS": value, "PYTHONPATH": str(CORE.parent)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 3 and done.stdout == ""
+    assert done.stderr.startswith("r5dgs: NUMBA_NUM_THREADS=") and done.stderr.count("\n") == 1
+
+
 def test_without_any_place_nothing_is_kept_and_one_line_says_so(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(compilation, "_user_cache", lambda: blocked(tmp_path))
     monkeypatch.setattr(compilation, "_own_temporary", lambda: None)

@@ -1,0 +1,22 @@
+"""Checks of environment variables that numba reads; imported before numba, whose own errors are tracebacks."""
+
+from __future__ import annotations
+
+import os
+
+from ..errors import ConfigError
+
+MOST_THREADS = 1024
+
+
+def check_threads(value: str | None) -> None:
+    """Raise `ConfigError` for a value of NUMBA_NUM_THREADS that is no number of threads; None and "" are unset."""
+    if not value:
+        return
+    if not (value.isascii() and value.isdecimal() and len(value) < 9 and 1 <= int(value) <= MOST_THREADS):
+        raise ConfigError(
+            f"NUMBA_NUM_THREADS={value[:40]!r}: expected a whole number from 1 to {MOST_THREADS}; correct or unset it"
+        )
+
+
+check_threads(os.environ.get("NUMBA_NUM_THREADS"))
