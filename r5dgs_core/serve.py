@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from . import __version__, errors
+from . import __version__, errors, serve_points
 from . import serve_requests as asked
 from .scene import playback, quality, scene_file
 from .scene.cameras import Camera
@@ -46,7 +46,7 @@ from .semantics import encoders, query
 if TYPE_CHECKING:
     from .raster import scene_render
 
-PROTOCOL = 3
+PROTOCOL = 4
 NEEDED = ("torch", "numba")
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
@@ -106,7 +106,11 @@ class Server:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
         self._failed: dict[tuple[str, int, int], str] = {}  # the last file that could not be read, and why
+=======
+        self._points = serve_points.EditedPoints()
+>>>>>>> b4247cf (Extend scenes in the worker by points edited one by one)
         self._stage = None  # of the scenes, from the first picture on
+        self._staged: list[Scene] = []  # what the stage draws: the scenes, extended by edited points
         self._numbers: list[int] = []  # which of them each path of the last load is
         self._errors: list[quality.Quality] = []  # what is known of theirs
         self._players: dict[int, playback.Player] = {}  # of each scene, from the first time that is asked for
@@ -114,6 +118,7 @@ class Server:
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
+            "points": self._keep_points,
             "render": self._render,
             "query": self._query,
             "embed": self._embed,
@@ -157,6 +162,7 @@ class Server:
         scenes = [list(self._scenes.values())[number] for number in self._numbers]
         return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
 
+<<<<<<< HEAD
     def _read(self, stamp: tuple[str, int, int]) -> Scene:
         """Read a scene file; one that failed last is not read again until it changes, as viewports ask at each move."""
         if stamp not in self._failed:
@@ -168,13 +174,19 @@ class Server:
                 self._failed = {stamp: str(error)}
         raise errors.SceneFileError(self._failed[stamp])
 
+    def _keep_points(self, request: dict[str, Any]) -> Answer:
+        """Hold point edits, see `serve_points.EditedPoints.keep`."""
+        self._points.keep(request)
+        return {}, {}
+
     def _render(self, request: dict[str, Any]) -> Answer:
         """Rasterize the loaded scenes.
 
         ``camera``: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture. What is seen is
         either ``instances``, a list of ``scene start count matrix world tint t``: a range of a scene's Gaussians, the
         [4, 4] map of its bind state into that world, that of the scene's own world (with which its light turns; the
-        same where left out), factors on its colours, and the scene time that bends what has residuals; or ``t``,
+        same where left out), factors on its colours, and the scene time that bends what has residuals. Instead of
+        ``start count``, ``points`` names an edit that a ``points`` request handed over. Or what is seen is ``t``,
         playback of ``scene`` in its own world. ``sky``: null for black, or ``scene matrix``; with ``t``, that scene's
         where left out. ``near``: nearest depth that is drawn, the scenes' own where left out. ``distance``: how far
         before the camera depths count from. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for ``owners``:
@@ -191,7 +203,9 @@ class Server:
         started = time.perf_counter()
         instances = []
         if moved:
-            instances = [asked.instance_of(entry, self._numbers) for entry in asked.need(request, "instances", list)]
+            entries = asked.need(request, "instances", list)
+            scenes, places = self._points.extend(scenes, serve_points.wanted(entries, self._numbers))
+            instances = [serve_points.instance_of(entry, self._numbers, places) for entry in entries]
             output, ms_motion, count = self._instances(request, instances, scenes, camera, near)
         else:
             output, ms_motion, count = self._playback(request, scenes, camera, near)
@@ -240,8 +254,8 @@ class Server:
             sky = stage.Sky(
                 asked.number_of(sky, self._numbers), asked.matrix_of(sky.get("matrix"), 4, "the matrix of the sky")
             )
-        if self._stage is None:
-            self._stage = stage.Stage(scenes)
+        if self._stage is None or self._staged is not scenes:
+            self._stage, self._staged = stage.Stage(scenes), scenes
         output = self._stage.render(instances, camera, sky=sky, near=near, distance=asked.distance_of(request))
         return output, self._stage.ms_motion, sum(instance.count for instance in instances)
 

@@ -36,7 +36,8 @@ ALLOWED = {
     "train": {"motion", "scene", "data", "model", "raster", "folder_lock"},
     "report": {"motion", "scene", "data", "model", "raster", "semantics"},
     "serve_requests": {"scene", "raster"},
-    "serve": {"motion", "scene", "model", "raster", "semantics", "serve_requests"},
+    "serve_points": {"scene", "raster", "serve_requests"},
+    "serve": {"motion", "scene", "model", "raster", "semantics", "serve_points", "serve_requests"},
     "progress": set(),
     "demo": {
         *("commands", "motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"),

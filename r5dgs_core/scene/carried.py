@@ -115,7 +115,7 @@ def place(
     return carry(splats, matrix, factor)
 
 
-def bind_state(scene: Scene, rows: slice) -> Splats:
+def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
     """Rows of a scene as they are in its file, without shading."""
     identities = scene.identities
     return Splats(

@@ -25,8 +25,8 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
     Returns:
         Rows of the file in the new order, the arrays of the new scene, and whether all stayed where they were.
     """
-    placed = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
-    placed.sort(key=lambda entry: entry[:3])
+    ordered = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
+    ordered.sort(key=lambda entry: entry[:3])
     last, kept, untouched = len(scene.track_times) - 1, [], True
     names = ("means", "quats", "log_scales", "sh", "shading", "shading_rest")
     columns: dict[str, list[np.ndarray]] = {name: [getattr(scene, name)[:0]] for name in names if _has(scene, name)}
@@ -34,12 +34,12 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
         columns["shading_rest"] = [np.empty(0, np.float32)]
     residuals: list[tuple[np.ndarray, ...]] = []
     object_ids, motion_ids, filled = [], [], 0
-    for object_id, motion_id, start, piece in placed:
+    for object_id, motion_id, start, piece in ordered:
         rows = slice(start, start + piece.count)
         bind = np.asarray(piece.matrices[last], np.float64)
         moved = _displacement(scene, rows, bind) > TOLERANCE * scene.extent
         untouched &= not moved
-        values = _placed(scene, rows, bind if moved else None)
+        values = placed(scene, rows, bind if moved else None)
         if piece.tint is not None:
             values["sh"] = tints.tint_sh(values["sh"], piece.tint)
         for name, parts in columns.items():
@@ -79,15 +79,22 @@ def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
     return float(moved + size * np.linalg.norm(linear))
 
 
-def _placed(scene: Scene, rows: slice, bind: np.ndarray | None) -> dict[str, np.ndarray]:
-    """The arrays of rows that have been put elsewhere; those of the file where None."""
-    count = rows.stop - rows.start
-    rest = np.ones(count, np.float32) if scene.shading_rest is None else scene.shading_rest[rows]
+def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the arrays of rows that an affine map of the bind state carries.
+
+    Args:
+        scene: The scene.
+        rows: The rows. [n]
+        bind: The map; None leaves the arrays as they are. [4, 4]
+
+    Returns:
+        ``means quats log_scales sh``, and ``shading shading_rest`` if the scene has shading. [n, ...] each
+    """
     shading = None if scene.shading is None else scene.shading[rows]
-    if bind is None:
-        splats = carried.bind_state(scene, rows)
-    else:
-        splats = carried.carry(carried.bind_state(scene, rows), bind)
+    rest = posing.rest_factors(scene)[rows]
+    splats = carried.bind_state(scene, rows)
+    if bind is not None:
+        splats = carried.carry(splats, bind)
         if shading is not None and scene.light_direction is not None:
             turn = carried.nearest_rotation(bind[:3, :3])
             light = np.asarray(scene.light_direction, np.float64)
@@ -108,7 +115,16 @@ def _residuals(scene: Scene, rows: slice, shift: int, linear: np.ndarray | None)
     inside = (scene.residual_rows >= rows.start) & (scene.residual_rows < rows.stop)
     offsets, quats = scene.residual_offsets[inside], scene.residual_quats[inside]
     if linear is not None:
-        turn = rotations.rotmats_to_quats(carried.nearest_rotation(linear))
-        offsets = offsets @ linear.T
-        quats = rotations.multiply(rotations.multiply(turn, quats.astype(np.float64)), rotations.conjugate(turn))
+        offsets, quats = turned_residuals(offsets, quats, linear)
     return scene.residual_rows[inside] + shift, offsets, quats, scene.residual_log_scales[inside]
+
+
+def turned_residuals(
+    offsets: np.ndarray,  # [n, S, 3]
+    quats: np.ndarray,  # [n, S, 4]
+    linear: np.ndarray,  # [3, 3]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the offsets and rotations of residuals in a bind state that a linear map has carried. Shapes as given."""
+    turn = rotations.rotmats_to_quats(carried.nearest_rotation(linear))
+    turned = rotations.multiply(rotations.multiply(turn, quats.astype(np.float64)), rotations.conjugate(turn))
+    return offsets @ linear.T, turned
