@@ -2,6 +2,7 @@
 
 from . import (
     click,
+    cloud_points,
     engine,
     figures,
     handlers,
@@ -26,6 +27,7 @@ MODULES = (
     motion_physics,
     motion_pivot,
     motion_exact,
+    cloud_points,
     preferences,
     figures,
     engine,

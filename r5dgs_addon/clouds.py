@@ -1,5 +1,7 @@
 """Gaussians as attributes of a point cloud, under the names that Blender 5.3 draws as splats, and their material."""
 
+import hashlib
+
 import bpy
 import numpy as np
 
@@ -10,6 +12,10 @@ from . import compat
 # A colour attribute named exactly `color` renders black in Cycles, hence this name.
 DISPLAY_COLOR = "display_color"
 ROW = "gaussian"
+HARMONICS = "radiance:sh_"
+BIND = "bind_state:"  # prefix of the attributes that Exact Mode keeps of what it overwrites
+_FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
+_BLOCK = 2048
 # Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
 DISPLAY_SIGMAS = 1.2
 LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
@@ -48,18 +54,51 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     shown = srgb_to_linear(0.5 + harmonics.C0 * sh[:, 0].astype(np.float64))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
     radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
-    _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows])
-    _write(cloud, "radius", "FLOAT", "value", radii)
-    _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales))
-    _write(cloud, "rotation", "QUATERNION", "value", scene.quats[rows])
-    _write(cloud, "radiance:base", "FLOAT_COLOR", "color", base)
+    written = {
+        "position": _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows]),
+        "radius": _write(cloud, "radius", "FLOAT", "value", radii),
+        "scale": _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales)),
+        "rotation": _write(cloud, "rotation", "QUATERNION", "value", scene.quats[rows]),
+        "radiance:base": _write(cloud, "radiance:base", "FLOAT_COLOR", "color", base),
+        ROW: _write(cloud, ROW, "INT", "value", np.arange(rows.start, rows.stop), np.int32),
+    }
     for k, plane in enumerate(_planes(sh[:, 1 : (sh_degree + 1) ** 2])):
-        _write(cloud, f"radiance:sh_{k}", "FLOAT_VECTOR", "vector", plane)
+        written[f"{HARMONICS}{k}"] = _write(cloud, f"{HARMONICS}{k}", "FLOAT_VECTOR", "vector", plane)
+    cloud[_FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
     _write(cloud, "object_id", "INT", "value", scene.object_ids[rows], np.int32)
-    _write(cloud, ROW, "INT", "value", np.arange(rows.start, rows.stop), np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
     compat.make_gaussian_splat(cloud)
     cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
+
+
+def fingerprint(values: np.ndarray) -> str:
+    """Return a digest of an array's bytes that any edit changes; far quicker than a cryptographic one."""
+    data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+    cut = len(data) // (8 * _BLOCK) * 8 * _BLOCK
+    blocks = data[:cut].view(np.uint64).reshape(-1, _BLOCK)
+    digest = hashlib.blake2b(str(len(data)).encode(), digest_size=16)
+    for part in (blocks.sum(0, dtype=np.uint64), blocks.sum(1, dtype=np.uint64), data[cut:]):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def fingerprints(cloud: bpy.types.PointCloud) -> dict[str, str]:
+    """Return the fingerprints of the attributes that a point cloud was filled with, by name; none of older files."""
+    stored = cloud.get(_FINGERPRINTS)
+    return {} if stored is None else stored.to_dict()
+
+
+def attribute(cloud: bpy.types.PointCloud, name: str, kind: str) -> bpy.types.Attribute | None:
+    """Return an attribute of the points, or None if it is missing or of another type."""
+    found = cloud.attributes.get(name)
+    return found if found is not None and found.data_type == kind and found.domain == "POINT" else None
+
+
+def read(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.float32) -> np.ndarray:
+    """Return the values of an attribute. [n, width]"""
+    values = np.empty(len(source.data) * width, dtype)
+    source.data.foreach_get(field, values)
+    return values.reshape(-1, width)
 
 
 def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
@@ -126,6 +165,9 @@ def _planes(sh: np.ndarray) -> np.ndarray:
     return result
 
 
-def _write(cloud, name: str, kind: str, field: str, values: np.ndarray, dtype: type = np.float32) -> None:
+def _write(cloud, name: str, kind: str, field: str, values: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """Write an attribute, made if it is missing. Returns the values in the attribute's own type."""
     attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
-    attribute.data.foreach_set(field, np.ascontiguousarray(values, dtype).ravel())
+    values = np.ascontiguousarray(values, dtype)
+    attribute.data.foreach_set(field, values.ravel())
+    return values

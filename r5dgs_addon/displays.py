@@ -1,7 +1,8 @@
 """What stands for Gaussians in viewports that do not draw splats: points, or an ellipsoid for each by geometry nodes.
 
 Points are quick at any number. Ellipsoids show size, direction and opacity as they are, at a price; they are
-instances that a modifier of the point cloud makes, so the points and their attributes stay as they were.
+instances that a modifier of the point cloud makes. The modifier passes the points on with a radius of 0, so that the
+evaluated cloud still has them.
 """
 
 import bpy
@@ -15,6 +16,7 @@ ITEMS = (
 )
 MODIFIER = "R5DGS Ellipsoids"
 SIGMAS = 1.5  # half axes of an ellipsoid, in standard deviations
+JOIN = "GeometryNodeJoinGeometry"
 SUBDIVISIONS = 2  # of the icosphere: 80 faces
 
 
@@ -29,9 +31,12 @@ def show(collection: bpy.types.Collection, display: str) -> None:
     present = [(cloud, cloud.modifiers.get(MODIFIER)) for cloud in every]
     used = {found.node_group for _, found in present if found is not None and found.node_group is not None}
     if display == ELLIPSOIDS:
-        tree = next(iter(used), None) or _tree(clouds.instance_material(MODIFIER))
+        current = [found.node_group for cloud, found in present if found is not None and not hides_points(cloud)]
+        tree = next(filter(None, current), None) or _tree(clouds.instance_material(MODIFIER))
         for cloud, found in present:
             (found or cloud.modifiers.new(MODIFIER, "NODES")).node_group = tree
+        for old in used - {tree}:
+            _forget(old)
     else:
         for cloud, found in present:
             if found is not None:
@@ -39,6 +44,13 @@ def show(collection: bpy.types.Collection, display: str) -> None:
         for tree in used:
             _forget(tree)
     collection.r5dgs.display = display
+
+
+def hides_points(cloud: bpy.types.Object) -> bool:
+    """Whether a cloud has ellipsoids of a version that did not pass the points on."""
+    found = cloud.modifiers.get(MODIFIER)
+    tree = None if found is None else found.node_group
+    return tree is not None and not any(node.bl_idname == JOIN for node in tree.nodes)
 
 
 def _forget(tree: bpy.types.NodeTree) -> None:
@@ -57,7 +69,7 @@ def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
     tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
     for in_out in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
-    entry, sphere, painted, scale, rotation, instances, leave = (
+    entry, sphere, painted, scale, rotation, instances, hidden, join, leave = (
         tree.nodes.new(kind)
         for kind in (
             "NodeGroupInput",
@@ -66,10 +78,14 @@ def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
             "GeometryNodeInputNamedAttribute",
             "GeometryNodeInputNamedAttribute",
             "GeometryNodeInstanceOnPoints",
+            "GeometryNodeSetPointRadius",
+            JOIN,
             "NodeGroupOutput",
         )
     )
-    for column, nodes in enumerate(((entry, sphere, scale, rotation), (painted,), (instances,), (leave,))):
+    for column, nodes in enumerate(
+        ((entry, sphere, scale, rotation), (painted,), (instances, hidden), (join,), (leave,))
+    ):
         for row, node in enumerate(nodes):
             node.location = (220 * column, -180 * row)
     sphere.inputs["Radius"].default_value = SIGMAS
@@ -84,5 +100,9 @@ def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
     for node, socket in ((scale, "Scale"), (rotation, "Rotation")):
         output = next(out for out in node.outputs if out.enabled and out.name == "Attribute")
         tree.links.new(output, instances.inputs[socket])
-    tree.links.new(instances.outputs["Instances"], leave.inputs[0])
+    hidden.inputs["Radius"].default_value = 0.0
+    tree.links.new(entry.outputs[0], hidden.inputs[0])
+    for made in (instances, hidden):
+        tree.links.new(made.outputs[0], join.inputs[0])
+    tree.links.new(join.outputs[0], leave.inputs[0])
     return tree

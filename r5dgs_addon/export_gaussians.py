@@ -7,10 +7,10 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras, carried, ply, scene_file
+from ..r5dgs_core.scene import cameras, carried, ply, point_edits, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
-from . import amounts, export_frames, look, picture, visible
+from . import amounts, cloud_points, export_frames, look, picture, visible
 from .running import Outcome, Step, Steps
 
 AXES = (
@@ -104,28 +104,39 @@ def splats_of(
     Returns:
         The Gaussians, and the names of the clouds that are in them.
     """
-    _, found = visible.instances(context.evaluated_depsgraph_get())
-    parts, names, from_blender = [], [], set()
+    depsgraph = context.evaluated_depsgraph_get()
+    _, found = visible.instances(depsgraph)
+    parts, names = [], []
     for one in found:
         if wanted is not None and one.object not in wanted and one.parent not in wanted:
             continue
         scene, turn = sources.scene(one.collection), world_to(axes, one.world)
         matrix, names = turn @ one.matrix, [*names, one.object.name]
-        if scene is not None and one.start + one.count <= len(scene.means):
-            tint = None if one.tint == look.NONE else np.array(one.tint)
-            bend = (
-                None if one.t is None else carried.bend_of(sources.bending(one.collection), one.t, one.start, one.count)
-            )
-            parts.append(
-                carried.place(scene, one.start, one.count, matrix, world=turn @ one.world, tint=tint, bend=bend)
-            )
-        elif (one.object, one.parent) not in from_blender:  # all its stretches of rows at once
-            from_blender.add((one.object, one.parent))
-            points = from_points(one.object.data, one.object.r5dgs.object_id)
+        for note in cloud_points.of(one.object, depsgraph, one.collection.r5dgs.gaussians).notes:
+            sources.note(note)
+        if scene is not None and one.object.r5dgs.start + one.object.r5dgs.count <= len(scene.means):
+            parts.append(_placed(scene, one, matrix, turn, sources))
+        else:
+            points = from_points(cloud_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)
             parts.append(carried.carry(points, matrix, np.array(one.tint)))
         if parts[-1].sh.shape[1] > 1 and not carried.is_similarity(matrix[:3, :3]):
             sources.note(f"{names[-1]}: scaled unevenly; how its colors change with the direction is a best fit")
     return carried.join(parts), names
+
+
+def _placed(scene: Scene, one: visible.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources) -> ply.Splats:
+    """The Gaussians of a visible cloud, by its scene file. matrix, turn [4, 4]"""
+    start, count, bending = one.start, one.count, None
+    if one.edit is not None:
+        whole = scene
+        scene, place = point_edits.apply(scene, one.edit.points)
+        start, count, matrix = place.start, place.count, matrix @ place.matrix
+        bending = None if scene is whole else Residuals(scene)
+    bend = None
+    if one.t is not None:
+        bend = carried.bend_of(bending or sources.bending(one.collection), one.t, start, count)
+    tint = None if one.tint == look.NONE else np.array(one.tint)
+    return carried.place(scene, start, count, matrix, world=turn @ one.world, tint=tint, bend=bend)
 
 
 def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:

@@ -7,9 +7,9 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras, edited, scene_file
+from ..r5dgs_core.scene import cameras, edited, point_edits, scene_file
 from ..r5dgs_core.scene.scene import Scene, SceneObject
-from . import amounts, export_frames, look, motion_physics, objects, picture, table, timeline, visible
+from . import amounts, cloud_points, export_frames, look, motion_physics, objects, picture, table, timeline, visible
 from .running import Outcome, Step, Steps
 
 TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
@@ -21,7 +21,10 @@ _STILL = 1e-6  # how far from the identity a parent may be that turns nothing
 
 @dataclass
 class _Member:
-    """A cloud while the frames go by. matrices [4, 4] each; pivot [3] and parent [3, 3] at t_max."""
+    """A cloud while the frames go by. matrices [4, 4] each; pivot [3], parent [3, 3] and points at t_max.
+
+    ``keys`` has the different states of its points that were seen: several if modifiers animate them.
+    """
 
     cloud: bpy.types.Object
     anchor: bpy.types.Object | None
@@ -29,6 +32,8 @@ class _Member:
     matrices: list[np.ndarray] = field(default_factory=list)
     pivot: np.ndarray | None = None
     parent: np.ndarray | None = None
+    points: cloud_points.Found = field(default_factory=cloud_points.Found)
+    keys: set[str] = field(default_factory=set)
 
 
 def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Path, *, exact: bool = False) -> Steps:
@@ -64,8 +69,12 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
             yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
             _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
     yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
-    pieces = [piece for member in members for piece in _pieces(member, source)]
-    result, notes = edited.edit(source, pieces, when, _table(collection, source, members, names))
+    changed = [member for member in members if member.points.edit is not None]
+    extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
+    placed = {id(member): place for member, place in zip(changed, places, strict=True)}
+    pieces = [piece for member in members for piece in _pieces(member, extended, placed.get(id(member)))]
+    result, notes = edited.edit(extended, pieces, when, _table(collection, source, members, names))
+    notes += _lost_points(members, source, extended)
     yield Step(
         len(when) + 1, len(when) + 2, f"packing {amounts.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
     )
@@ -80,6 +89,17 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
         notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
     named = sum(item.id > 0 for item in result.objects)
     return Outcome(f"{path.name}: {amounts.of(len(result.means), 'Gaussian')}, {amounts.of(named, 'object')}", notes)
+
+
+def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:
+    """What the file does not hold of edited points, as sentences."""
+    notes = [note for member in members for note in member.points.notes]
+    animated = [member.cloud.name for member in members if len(member.keys) > 1]
+    if animated:
+        notes.append(f"{', '.join(animated)}: points that modifiers animate are written as they are at t_max")
+    lost = [name for name in ("dynamics", "canonical_means") if getattr(extended, name) is None]
+    notes += [f"'{name}' of edited points is left out" for name in lost if getattr(source, name) is not None]
+    return notes
 
 
 def _refuse_sources(path: Path) -> None:
@@ -164,6 +184,11 @@ def _look(
     depsgraph, back = _go_to(context, collection, frame)
     for member in members:
         member.matrices.append(back @ _matrix(member.cloud, depsgraph))
+        found = cloud_points.of(member.cloud, depsgraph, collection.r5dgs.gaussians)
+        if found.edit is None or not found.edit.bent:
+            member.keys.add("" if found.edit is None else found.edit.key)
+        if bind:
+            member.points = found
         if bind and member.anchor is not None:
             member.pivot = (back @ _matrix(member.anchor, depsgraph))[:3, 3]
             parent = member.anchor.parent
@@ -176,10 +201,19 @@ def _matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray
     return np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
 
 
-def _pieces(member: _Member, source: Scene) -> list[edited.Piece]:
-    """A cloud as what the core writes: each stretch of its rows that was not deleted."""
+def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> list[edited.Piece]:
+    """A cloud as what the core writes; nothing if nothing is left of it.
+
+    Args:
+        member: The cloud.
+        source: The scene, extended by edited points.
+        place: Where its points are there, if they were edited.
+    """
     cloud, anchor, matrices = member.cloud, member.anchor, np.array(member.matrices)
     bind = matrices[len(source.track_times) - 1]
+    start, count = cloud.r5dgs.start, cloud.r5dgs.count
+    if place is not None:
+        start, count, matrices = place.start, place.count, matrices @ place.matrix
     if visible.flat([bind])[0]:  # scaled to nothing: nothing is left of it
         return []
     remembers = anchor is not None and motion_physics.has_motion(anchor)
@@ -200,7 +234,6 @@ def _pieces(member: _Member, source: Scene) -> list[edited.Piece]:
             allowed=TOLERANCE * source.extent + KEY_SHARE * keys,
             tint=look.tint(cloud) if look.is_tinted(cloud) else None,
         )
-        for start, count in visible.rows_of(cloud)
     ]
 
 

@@ -19,7 +19,7 @@ from ..r5dgs_core.scene import residuals, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from . import clouds, objects, picture, remembered, timeline
 
-BIND = "bind_state:"  # prefix of the attributes that keep what is overwritten
+BIND = clouds.BIND
 PARTS = (
     ("position", "FLOAT_VECTOR", "vector", 3),
     ("rotation", "QUATERNION", "value", 4),

@@ -99,7 +99,9 @@ def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tup
         "want": list(want),
     }
     paths = [str(scene_path(collection)) for collection in seen.scenes]
-    return [("loading the scenes", "load", {"paths": paths}), ("rendering", "render", picture)]
+    edits = tuple(dict.fromkeys(one.edit for one in seen.instances if one.edit is not None))
+    edited = [("handing over edited points", "points", {"points": edits})] if edits else []
+    return [("loading the scenes", "load", {"paths": paths}), *edited, ("rendering", "render", picture)]
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:

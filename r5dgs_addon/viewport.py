@@ -62,12 +62,12 @@ class Wish:
 
     def requests(self, smaller: int) -> list[tuple[str, str, dict[str, Any]]]:
         """The worker's requests for the picture, smaller by a factor."""
-        load, (doing, command, arguments) = self.steps
+        *before, (doing, command, arguments) = self.steps
         if smaller == FULL:
             return self.steps
         size = (max(self.camera.width // smaller, 1), max(self.camera.height // smaller, 1))
         view = views.View(cameras.resize(self.camera, *size))
-        return [load, (doing, command, {**arguments, "camera": view.request()})]
+        return [*before, (doing, command, {**arguments, "camera": view.request()})]
 
 
 class Port:

@@ -12,8 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..r5dgs_core import errors
-from . import clouds, objects, timeline
+from . import cloud_points, clouds, objects, timeline
 
 FLAT = 1e-6  # smallest scale of a map over its largest
 
@@ -24,8 +23,8 @@ class Instance:
 
     Attributes:
         scene: Number of its collection among the scenes.
-        start: First row in the scene file.
-        count: Number of rows.
+        start: First row in the scene file; of an edited cloud, of what it was loaded with.
+        count: Number of points.
         matrix: Bind state to Blender's world. [4, 4]
         world: The scene's world to Blender's. [4, 4]
         tint: Factors on red, green and blue.
@@ -33,6 +32,7 @@ class Instance:
         object: The cloud; of an instance, the one that is instanced.
         collection: The loaded scene.
         parent: The object that makes the instance, or None.
+        edit: The points, if they are not those of the scene file.
     """
 
     scene: int
@@ -45,16 +45,16 @@ class Instance:
     collection: bpy.types.Collection
     parent: bpy.types.Object | None = None
     t: float | None = None
+    edit: cloud_points.Edit | None = None
 
     def request(self) -> dict[str, Any]:
         """What the worker reads."""
-        entry = {
+        entry: dict[str, Any] = {
             "scene": self.scene,
-            "start": self.start,
-            "count": self.count,
             "matrix": self.matrix.tolist(),
             "world": self.world.tolist(),
         }
+        entry |= {"start": self.start, "count": self.count} if self.edit is None else {"points": self.edit.key}
         if self.tint != (1.0, 1.0, 1.0):
             entry["tint"] = list(self.tint)
         if self.t is not None:
@@ -92,8 +92,13 @@ def instances(
             world = matrix @ np.linalg.solve(own, world)
         tint, number = tuple(obj.r5dgs_look.tint), scenes.index(collection)
         t = timeline.of_collection(collection).time(frame) if collection.r5dgs_exact.enabled else None
-        for start, count in rows_of(obj):
-            found.append(Instance(number, start, count, matrix, world, tint, obj, collection, parent, t))
+        edit = cloud_points.of(obj, depsgraph, collection.r5dgs.gaussians).edit
+        count = obj.r5dgs.count if edit is None else len(edit.points.rows)
+        t = None if edit is not None and edit.bent else t
+        if count:
+            found.append(
+                Instance(number, obj.r5dgs.start, count, matrix, world, tint, obj, collection, parent, t, edit)
+            )
     return tuple(scenes), tuple(found)
 
 
@@ -115,30 +120,6 @@ def flat(matrices: list[np.ndarray]) -> np.ndarray:
     return scales[:, 2] <= FLAT * scales[:, 0]
 
 
-def rows_of(obj: bpy.types.Object) -> list[tuple[int, int]]:
-    """Rows of the scene file that a cloud's points are, as stretches of first row and number.
-
-    Raises:
-        ConfigError: Points were deleted or added, and they do not say which rows they are.
-    """
-    start, count, points = obj.r5dgs.start, obj.r5dgs.count, len(obj.data.points)
-    if points == count:
-        return [(start, count)]
-    attribute = obj.data.attributes.get(clouds.ROW)
-    if attribute is None or attribute.domain != "POINT" or attribute.data_type != "INT":
-        raise errors.ConfigError(
-            f"{obj.name}: expected its {count} points, found {points}, which do not say which Gaussians they are; undo "
-            "that change, or load the scene again"
-        )
-    rows = np.empty(points, np.int32)
-    attribute.data.foreach_get("value", rows)
-    if (np.diff(rows) <= 0).any():  # sorting takes a second for a million points, and viewports ask at every drawing
-        rows = np.unique(rows)
-    rows = rows[(rows >= start) & (rows < start + count)]
-    cuts = np.flatnonzero(np.diff(rows) != 1) + 1
-    return [(int(part[0]), len(part)) for part in np.split(rows, cuts) if len(part)]
-
-
 def points(found: tuple[Instance, ...]) -> Callable[[], np.ndarray]:
     """A function that gives the corners of boxes around visible clouds, Blender's world. [P, 3] float64
 
@@ -148,23 +129,26 @@ def points(found: tuple[Instance, ...]) -> Callable[[], np.ndarray]:
     def corners() -> np.ndarray:
         boxes, result = {}, [np.zeros((0, 3))]
         for one in found:
-            data = one.object.data
-            if data not in boxes:
-                boxes[data] = _box(data)
-            result.append(boxes[data] @ one.matrix[:3, :3].T + one.matrix[:3, 3])
+            moved = None if one.edit is None else one.edit.points.means
+            key = one.object.data if moved is None or one.edit is None else one.edit.key
+            if key not in boxes:
+                boxes[key] = _box(_positions(one.object.data) if moved is None else moved)
+            result.append(boxes[key] @ one.matrix[:3, :3].T + one.matrix[:3, 3])
         return np.concatenate(result)
 
     return corners
 
 
-def _box(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Corners of the box around a cloud. [8, 3]"""
-    positions = np.zeros(3 * len(cloud.points), np.float32)
-    if "position" in cloud.attributes:
-        cloud.attributes["position"].data.foreach_get("vector", positions)
+def _positions(cloud: bpy.types.PointCloud) -> np.ndarray:
+    attribute = clouds.attribute(cloud, "position", "FLOAT_VECTOR")
+    return np.zeros((0, 3), np.float32) if attribute is None else clouds.read(attribute, "vector", 3)
+
+
+def _box(positions: np.ndarray) -> np.ndarray:
+    """Corners of the box around points. [8, 3]"""
     if len(positions) == 0:
         return np.zeros((0, 3))
-    ends = [(column.min(), column.max()) for column in positions.reshape(-1, 3).T]
+    ends = [(column.min(), column.max()) for column in positions.T]
     return np.array(list(itertools.product(*ends)), np.float64)
 
 

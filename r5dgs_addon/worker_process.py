@@ -8,6 +8,7 @@ The Python may be a wrapper script whose child does the work and keeps the pipes
 ended, and a pipe is closed only by the thread that uses it: closing it elsewhere would wait for that thread's lock.
 """
 
+import base64
 import collections
 import contextlib
 import json
@@ -17,15 +18,18 @@ import queue
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..r5dgs_core import errors
 from . import preferences, pythons
 from .process_group import ProcessGroup
+
+if TYPE_CHECKING:
+    from . import cloud_points
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = preferences.ENVIRONMENT
@@ -51,6 +55,7 @@ class Worker:
         self.python = python
         self.hello: dict[str, Any] = {}
         self.notice = ""  # what pictures wait for, where it is not their own making
+        self._held: set[str] = set()  # keys of the point edits that the worker holds
         self._number = 0
         self._answers: queue.Queue = queue.Queue()
         self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
@@ -119,7 +124,8 @@ class Worker:
         Args:
             command: Name of the request.
             timeout_s: Seconds to wait; the worker is stopped when they have passed.
-            **arguments: The request's arguments, JSON values.
+            **arguments: The request's arguments, JSON values; for ``points``, ``points`` is a tuple of
+                `cloud_points.Edit`, of which those that the worker already holds are not sent again.
 
         Returns:
             The result, and its arrays by name.
@@ -128,6 +134,8 @@ class Worker:
             R5dgsError: What the worker reports, by its own class.
             BackendError: The worker died or did not answer in time.
         """
+        if command == "points":
+            arguments = self._hand_over(arguments["points"])
         self._number += 1
         line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
         try:
@@ -153,6 +161,8 @@ class Worker:
                 break
         if not header.get("ok"):
             raise _error_of(header)
+        if command == "points":
+            self._held = set(arguments["keep"])
         return header.get("result", {}), arrays
 
     def close(self) -> None:
@@ -170,6 +180,15 @@ class Worker:
             finally:
                 self._writing.release()
         self._answers.put(None)
+
+    def _hand_over(self, edits: Iterable["cloud_points.Edit"]) -> dict[str, Any]:
+        """The arguments of a ``points`` request."""
+        new = {
+            edit.key: {name: base64.b64encode(values.data).decode() for name, values in edit.arrays().items()}
+            for edit in edits
+            if edit.key not in self._held
+        }
+        return {"keep": [edit.key for edit in edits], "new": new}
 
     def _death(self) -> errors.BackendError:
         self.close()

@@ -106,9 +106,7 @@ class Server:
         self._warming = warming
         self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
         self._failed: dict[tuple[str, int, int], str] = {}  # the last file that could not be read, and why
-=======
         self._points = serve_points.EditedPoints()
->>>>>>> b4247cf (Extend scenes in the worker by points edited one by one)
         self._stage = None  # of the scenes, from the first picture on
         self._staged: list[Scene] = []  # what the stage draws: the scenes, extended by edited points
         self._numbers: list[int] = []  # which of them each path of the last load is
@@ -162,7 +160,6 @@ class Server:
         scenes = [list(self._scenes.values())[number] for number in self._numbers]
         return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
 
-<<<<<<< HEAD
     def _read(self, stamp: tuple[str, int, int]) -> Scene:
         """Read a scene file; one that failed last is not read again until it changes, as viewports ask at each move."""
         if stamp not in self._failed:

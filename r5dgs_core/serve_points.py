@@ -35,8 +35,8 @@ class EditedPoints:
     def keep(self, request: dict[str, Any]) -> None:
         """Hold the edits of ``keep``, a list of keys, and forget all others.
 
-        ``new`` has those that the worker does not hold yet: by key an object of base64 strings, ``rows`` (int32) and any
-        of ``means quats scales base sh`` (float32).
+        ``new`` has those that the worker does not hold yet: by key an object of base64 strings, ``rows`` (int32) and
+        any of ``means quats scales base sh`` (float32).
 
         Raises:
             ConfigError: A key is neither held nor new, or an edit cannot be read.

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import amounts, displays, objects, timeline, trust
+from .. import amounts, cloud_points, displays, objects, timeline, trust
 from . import sidebar
 
 
@@ -33,6 +33,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
         else:
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
+        for note in cloud_points.notes(collection):
+            layout.label(text=note, icon="ERROR")
         row = layout.row(align=True)
         for value, name, _ in displays.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value

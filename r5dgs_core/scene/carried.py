@@ -192,19 +192,18 @@ def is_similarity(linear: np.ndarray) -> bool:
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
-    """The rotation nearest to a linear map, without mirror. [..., 3, 3] -> [..., 3, 3]"""
+    """Return the rotation nearest to a linear map; a mirror is undone along the first axis before the map.
+
+    [..., 3, 3] -> [..., 3, 3]
+    """
     u, _, vt = np.linalg.svd(linear)
-    return _unmirrored(u, vt)
+    result = u @ vt
+    result[..., :, 0] *= np.sign(np.linalg.det(result))[..., None]
+    return result
 
 
 def _even(singular: np.ndarray) -> bool:
     return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
-
-
-def _unmirrored(u: np.ndarray, vt: np.ndarray) -> np.ndarray:
-    u = u.copy()
-    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return u @ vt
 
 
 def map_shapes(
@@ -217,7 +216,7 @@ def map_shapes(
     """Write the shapes of ellipsoids under a linear map, exact for any, to the last two, which are float32."""
     u, singular, vt = np.linalg.svd(linear)
     if _even(singular) and np.linalg.det(linear) > 0:
-        posing.turn_quats(quats, rotations.rotmats_to_quats(_unmirrored(u, vt)), new_quats)
+        posing.turn_quats(quats, rotations.rotmats_to_quats(u @ vt), new_quats)
         np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
         return
     axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])

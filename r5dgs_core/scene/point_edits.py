@@ -74,23 +74,36 @@ def extend(scene: Scene, edits: Sequence[PointEdit]) -> tuple[Scene, list[Place]
 
     Returns:
         The scene with the edited points behind its own, and the place of each edit. Object ids of the result are not
-        sorted. An edit that leaves consecutive rows as they are, but for an affine map, needs no new points.
+        sorted.
 
     Raises:
         ValueError: A row is not in the scene, or an array has the wrong length or holds values that are not finite.
     """
     places, parts, filled = [], [], len(scene.means)
     for edit in edits:
-        _check(scene, edit)
-        matrix, part = _edited(scene, edit)
-        rows = np.asarray(edit.rows, np.int64)
-        if part is None and _consecutive(rows):
-            places.append(Place(int(rows[0]), len(rows), matrix))
-            continue
-        parts.append(_selected(scene, rows) if part is None else part)
-        places.append(Place(filled, len(rows), matrix))
-        filled += len(rows)
+        part, place = apply(scene, edit)
+        if part is not scene:
+            parts.append(part)
+            place = replace(place, start=filled)
+            filled += place.count
+        places.append(place)
     return (_appended(scene, parts) if parts else scene), places
+
+
+def apply(scene: Scene, edit: PointEdit) -> tuple[Scene, Place]:
+    """Return a scene of the points of one edit, and their place in it.
+
+    An edit that leaves consecutive rows as they are, but for an affine map, gives the scene itself.
+
+    Raises:
+        ValueError: As `extend`.
+    """
+    _check(scene, edit)
+    rows = np.asarray(edit.rows, np.int64)
+    matrix, part = _edited(scene, rows, edit)
+    if part is None and _consecutive(rows):
+        return scene, Place(int(rows[0]), len(rows), matrix)
+    return _selected(scene, rows) if part is None else part, Place(0, len(rows), matrix)
 
 
 def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -171,9 +184,8 @@ def _check(scene: Scene, edit: PointEdit) -> None:
             raise ValueError(f"points: expected finite '{name}' of shape {wanted}, found {values.shape}")
 
 
-def _edited(scene: Scene, edit: PointEdit) -> tuple[np.ndarray, Scene | None]:
+def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray, Scene | None]:
     """The map of an edit, and its points before that map; None for those of the scene."""
-    rows = np.asarray(edit.rows, np.int64)
     part = _selected(scene, rows)
     shapes = _given_shapes(part, edit)
     looks = _given_looks(part, edit)
@@ -188,9 +200,9 @@ def _edited(scene: Scene, edit: PointEdit) -> tuple[np.ndarray, Scene | None]:
         changed = means is not None
     if means is not None:
         part = replace(part, means=np.ascontiguousarray(means, np.float32))
-    if shapes or looks or changed:
-        return matrix, replace(part, **shapes, **looks)
-    return matrix, None
+    if shapes or changed:  # what was learned of their own motion holds for the centres that they had
+        part = replace(part, dynamics=None, canonical_means=None)
+    return matrix, replace(part, **shapes, **looks) if shapes or looks or changed else None
 
 
 def _given_shapes(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
@@ -314,11 +326,10 @@ def _selected(scene: Scene, rows: np.ndarray) -> Scene:
 
 def _appended(scene: Scene, parts: Sequence[Scene]) -> Scene:
     """A scene with the points of others behind its own."""
-    every = [scene, *parts]
-    arrays = {}
+    every, arrays = [scene, *parts], {}
     for name in _PER_POINT:
-        if getattr(scene, name) is not None:
-            arrays[name] = np.concatenate([getattr(one, name) for one in every])
+        columns = [getattr(one, name) for one in every]
+        arrays[name] = None if any(column is None for column in columns) else np.concatenate(columns)
     if any(one.shading_rest is not None for one in every):
         rests = (np.ones(len(one.means), np.float32) if one.shading_rest is None else one.shading_rest for one in every)
         arrays["shading_rest"] = np.concatenate(list(rests))

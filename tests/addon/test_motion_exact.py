@@ -31,7 +31,8 @@ def scene(scene_path):
 
 def listeners():
     handlers = importlib.import_module("bpy").app.handlers
-    return [f.__name__ for f in handlers.frame_change_pre + handlers.frame_change_post if "r5dgs" in f.__module__]
+    every = handlers.frame_change_pre + handlers.frame_change_post
+    return [f.__name__ for f in every if f.__module__.endswith("motion_exact")]
 
 
 def stored(cloud, name, field, width):

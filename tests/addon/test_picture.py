@@ -238,8 +238,22 @@ def without(bpy, old, rows, named=True):
     compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
     clouds = importlib.import_module("r5dgs.r5dgs_addon.clouds")
     (cloud,) = compat.new_point_clouds([len(rows)])
-    if named:
-        cloud.attributes.new(clouds.ROW, "INT", "POINT").data.foreach_set("value", rows.astype(np.int32))
+    fields = {
+        "FLOAT": ("value", 1),
+        "FLOAT_VECTOR": ("vector", 3),
+        "FLOAT_COLOR": ("color", 4),
+        "QUATERNION": ("value", 4),
+    }
+    own = clouds.read(clouds.attribute(old, clouds.ROW, "INT"), "value", 1, np.int32)[:, 0]
+    kept = np.isin(own, rows) if named else np.arange(len(own)) < len(rows)
+    for one in old.attributes:
+        field, width, dtype = (
+            *fields.get(one.data_type, ("value", 1)),
+            np.int32 if one.data_type == "INT" else np.float32,
+        )
+        if named or one.name != clouds.ROW:
+            made = cloud.attributes.get(one.name) or cloud.attributes.new(one.name, one.data_type, "POINT")
+            made.data.foreach_set(field, clouds.read(one, field, width, dtype)[kept].ravel())
     return cloud
 
 

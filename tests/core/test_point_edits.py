@@ -47,19 +47,21 @@ def mapped(points, matrix):
     return (points @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
 
 
-def drawn(extended, place, matrix=np.eye(4), t=None):
+def drawn(extended, place, t=None):
     """What is exported of an edit."""
     bend = None if t is None else carried.bend_of(Residuals(extended), t, place.start, place.count)
-    return carried.place(extended, place.start, place.count, matrix @ place.matrix, bend=bend)
+    return carried.place(extended, place.start, place.count, place.matrix, bend=bend)
+
+
+def covariances(splats):
+    turns = rotations.quats_to_rotmats(splats.quats.astype(np.float64))
+    return turns * np.exp(2 * splats.log_scales)[:, None] @ np.swapaxes(turns, -1, -2)
 
 
 def assert_same(actual, expected, atol=2e-5):
     for name in ("means", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_allclose(getattr(actual, name), getattr(expected, name), atol=atol, err_msg=name)
-    shapes = [
-        rotations.quats_to_rotmats(s.quats.astype(np.float64)) * np.exp(2 * s.log_scales)[:, None] for s in (actual, expected)
-    ]
-    np.testing.assert_allclose(*shapes, atol=atol)
+    np.testing.assert_allclose(covariances(actual), covariances(expected), atol=atol)
 
 
 def test_an_edit_that_changes_nothing_is_the_scenes_own_rows(scene):

@@ -52,8 +52,8 @@ def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
     edit = scattered(scene, np.arange(20, 90, 2))
     whole = {"scene": 0, "start": 100, "count": 50, "matrix": EYE}
     extended, (place,) = point_edits.extend(scene, [edit])
-    instances = [scene_render.Instance(100, 50, np.eye(4)), scene_render.Instance(place.start, place.count, place.matrix)]
-    pose = scene_render.pose_instances(extended, instances)
+    rows = ((100, 50, np.eye(4)), (place.start, place.count, place.matrix))
+    pose = scene_render.pose_instances(extended, [scene_render.Instance(*one) for one in rows])
     expected = scene_render.render_frame(scene, pose, CAMERA, background=None).color.numpy()
     *_, (header, arrays) = talk(load(path), points("a", a=edit), picture(whole, entry("a")))
     assert header["ok"], header
