@@ -1,8 +1,8 @@
 """Points of clouds as Blender evaluates them: after edits of their data and after modifiers.
 
-A cloud remembers fingerprints of the attributes that it was loaded with. Attributes that still have theirs are those of
-the scene file; only the others are read and handed on. Fingerprints of a cloud are compared again after its geometry was
-updated, after loading, undo and redo, and when a render begins.
+A cloud stores fingerprints of the attributes that it was loaded with. Attributes that still have theirs are those of
+the scene file; only the others are handed on. A cloud is compared again after an update of its geometry, after loading,
+undo and redo, and when a render begins; one with modifiers also at each frame of a render.
 """
 
 import hashlib

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import engine, engine_color, worker
+from .. import engine, engine_color, render_notes, worker
 
 
 class _OfEngine:
@@ -35,6 +35,8 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
             box.label(text="Colors do not come out as trained:", icon="ERROR")
             box.label(text=", ".join(objections))
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
+        for note in render_notes.of(scene):
+            layout.label(text=note, icon="INFO")
         settings = scene.r5dgs_render
         column = layout.column()
         column.prop(settings, "as_trained")

@@ -3,8 +3,9 @@
 An edit names a row of the scene for each point. `extend` appends the edited points to the scene, so that whatever
 handles ranges of a scene's rows handles them, too.
 
-An affine map that moves most points of an edit (Blender's *Apply Transform*, *Transform Geometry*) is found by comparing
-centres and returned beside the points. Shapes, harmonics and shading then follow it, though only centres were given.
+An affine map that moves most points of an edit (Blender's *Apply Transform*, *Transform Geometry*) is found by
+comparing centres and returned beside the points. Shapes, harmonics and shading then follow it, though only centres were
+given.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import carried, edited_gaussians
+from . import edited_gaussians
 from .scene import Scene
 
 ROUNDING = 2e-6  # of the largest coordinate: what centres may be off that a map explains
@@ -173,7 +174,7 @@ def _explained(matrix: np.ndarray, a: np.ndarray, b: np.ndarray, allowed: float)
 
 def _check(scene: Scene, edit: PointEdit) -> None:
     rows = np.asarray(edit.rows)
-    if rows.ndim != 1 or len(rows) and not (0 <= rows.min() and rows.max() < len(scene.means)):
+    if rows.ndim != 1 or len(rows) and not (rows.min() >= 0 and rows.max() < len(scene.means)):
         raise ValueError(f"points: expected rows of the scene's {len(scene.means)} Gaussians")
     for name, shape in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("base", (4,)), ("sh", (-1, 3))):
         values = getattr(edit, name)

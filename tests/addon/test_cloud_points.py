@@ -5,6 +5,7 @@ import importlib
 import numpy as np
 import pytest
 
+from r5dgs_core.data import images
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import carried, ply, scene_file
 from tests import scenes
@@ -110,6 +111,13 @@ def doubled(tree, source, target):
     for made in (source, node.outputs[0], *(one.outputs[0] for one in new)):
         tree.links.new(made, join.inputs[0])
     tree.links.new(join.outputs[0], target)
+
+
+def swaying(tree, source, target):
+    """Set Position by the frame."""
+    time, scaled = tree.nodes.new("GeometryNodeInputSceneTime"), tree.nodes.new("ShaderNodeCombineXYZ")
+    tree.links.new(time.outputs["Frame"], scaled.inputs[0])
+    tree.links.new(chain(tree, source, ("GeometryNodeSetPosition", {"Offset": scaled.outputs[0]})), target)
 
 
 def viewport(bpy, obj):
@@ -259,11 +267,6 @@ def test_edited_attributes_reshape_recolour_and_fade(blender, mug, rendered, tmp
 
 
 def test_an_animated_modifier_is_followed_frame_by_frame(blender, mug, visible):
-    def swaying(tree, source, target):
-        time, scaled = tree.nodes.new("GeometryNodeInputSceneTime"), tree.nodes.new("ShaderNodeCombineXYZ")
-        tree.links.new(time.outputs["Frame"], scaled.inputs[0])
-        tree.links.new(chain(tree, source, ("GeometryNodeSetPosition", {"Offset": scaled.outputs[0]})), target)
-
     nodes(blender, mug, swaying)
     shifts = []
     for frame, sub in ((40, 0.0), (40, 0.5), (41, 0.0)):
@@ -369,11 +372,55 @@ def test_apply_transform_leaves_the_numbers_of_the_edited_scene(blender, scene, 
 
 
 def test_points_that_nodes_animate_are_said_to_be_written_as_they_end(blender, mug, tmp_path, capfd):
-    def swaying(tree, source, target):
-        time, scaled = tree.nodes.new("GeometryNodeInputSceneTime"), tree.nodes.new("ShaderNodeCombineXYZ")
-        tree.links.new(time.outputs["Frame"], scaled.inputs[0])
-        tree.links.new(chain(tree, source, ("GeometryNodeSetPosition", {"Offset": scaled.outputs[0]})), target)
-
     nodes(blender, mug, swaying)
     blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "a.r5dgs"))
     assert "mug: points that modifiers animate" in capfd.readouterr().out
+
+
+@pytest.fixture
+def engine(blender, rendered, monkeypatch):
+    monkeypatch.delenv("R5DGS_PYTHON", raising=False)
+    blender.ops.r5dgs.use_engine()
+    return rendered
+
+
+def render(bpy, folder, name="out", **arguments):
+    """What F12 saves, as 8 bits per channel, / 255. [H, W, 3]"""
+    settings = bpy.context.scene.render
+    settings.filepath, settings.dither_intensity = str(folder / name), 0.0
+    settings.image_settings.file_format, settings.image_settings.color_mode = "PNG", "RGB"
+    assert bpy.ops.render.render(**(arguments or {"write_still": True})) == {"FINISHED"}
+    return images.read(settings.filepath + ".png") if not arguments else None
+
+
+@pytest.mark.parametrize("build", (bent, halved))
+def test_f12_is_the_preview_of_the_evaluated_cloud(blender, mug, engine, tmp_path, build):
+    blender.context.scene.r5dgs_render.sky = False
+    before = render(blender, tmp_path, "before")
+    nodes(blender, mug, build)
+    after = render(blender, tmp_path, "after")
+    assert psnr(before, after) < 40 and psnr(after, np.clip(engine()[0], 0, 1)) > 45
+
+
+def test_f12_sees_points_that_a_script_changes_without_telling_blender(blender, mug, engine, tmp_path):
+    before = render(blender, tmp_path, "before")
+    points = np.empty(3 * mug.r5dgs.count, np.float32)
+    mug.data.attributes["position"].data.foreach_get("vector", points)
+    mug.data.attributes["position"].data.foreach_set("vector", points + np.float32(0.3))
+    assert psnr(before, render(blender, tmp_path, "after")) < 40
+
+
+def test_an_animation_follows_nodes_and_names_what_it_leaves_out_once(blender, loaded, mug, engine, tmp_path, capfd):
+    for obj in loaded.all_objects:  # what rests
+        obj.animation_data_clear()
+    scene = blender.context.scene
+    nodes(blender, mug, swaying)
+    scene.frame_start, scene.frame_end = 1, 3
+    scene.render.use_motion_blur = scene.camera.data.dof.use_dof = True
+    mug.data.points[0].radius = 2.0
+    render(blender, tmp_path, "frame_", animation=True)
+    first, second, third = (images.read(tmp_path / f"frame_000{frame}.png") for frame in (1, 2, 3))
+    assert psnr(first, second) < 40 and psnr(second, third) < 40
+    said = capfd.readouterr().out
+    for note in ("Depth of field is not rendered", "Motion blur is not rendered", "the radius of points"):
+        assert said.count(note) == 1

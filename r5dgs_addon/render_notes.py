@@ -1,0 +1,43 @@
+"""What a render leaves out: named in the render's report, once per render, and in the render properties."""
+
+import bpy
+from bpy.app.handlers import persistent
+
+from . import cloud_points, objects
+
+_reported: set[str] = set()  # since the render began; an animation is one render
+
+
+def of(scene: bpy.types.Scene) -> list[str]:
+    """What the engine does not render of a Blender scene, as sentences without a period."""
+    notes = []
+    if scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof:
+        notes.append("Depth of field is not rendered")
+    if scene.render.use_motion_blur:
+        notes.append("Motion blur is not rendered")
+    inside = set(scene.collection.children_recursive)
+    return notes + [note for one in objects.scene_collections() if one in inside for note in cloud_points.notes(one)]
+
+
+def report(engine: bpy.types.RenderEngine, notes: list[str]) -> None:
+    """Report sentences as warnings, each once per render."""
+    for note in notes:
+        if note not in _reported:
+            _reported.add(note)
+            engine.report({"WARNING"}, f"R5DGS: {note}")
+
+
+@persistent
+def _begin(*_):
+    _reported.clear()
+
+
+def register():
+    """Listen to the beginning of renders."""
+    bpy.app.handlers.render_init.append(_begin)
+
+
+def unregister():
+    """Undo `register`."""
+    if _begin in bpy.app.handlers.render_init:
+        bpy.app.handlers.render_init.remove(_begin)
