@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,10 +40,13 @@ def new_folder(directory: Path) -> Iterator[Path]:
     """A temporary folder beside ``directory`` that takes its name at the end; after an error nothing is left of it."""
     directory = directory.absolute()
     _check_free(directory)
-    temporary = directory.with_name(f".{directory.name}.partial-{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
+    temporary = directory.with_name(f".{directory.name}.{secrets.token_hex(8)}.partial")
     try:
-        temporary.mkdir(parents=True)
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()  # a folder of this process alone, as the name is new
+    except OSError as error:
+        raise errors.DatasetError(f"{directory}: cannot write the data set: {error}") from error
+    try:
         yield temporary
         _check_free(directory)
         if directory.exists():

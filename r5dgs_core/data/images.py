@@ -6,13 +6,13 @@ convention and go through the sRGB curve on reading.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 
 from .. import errors
+from ..scene import files
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
@@ -120,21 +120,18 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("png:compressionLevel", COMPRESSION_LEVEL)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.png")
     try:
-        target = oiio.ImageOutput.create(str(temporary))
-        if target is None:
-            raise errors.DatasetError(f"{path}: cannot write the image ({oiio.geterror().strip()})")
-        good = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
-        problem = target.geterror()  # a full disk is told here alone
-        if not good or problem or not target.close():
-            problem = " ".join(problem.split()) or "no reason given"
-            raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
-        os.replace(temporary, path)
+        with files.replacing_by_name(path) as temporary:
+            target = oiio.ImageOutput.create(str(temporary))
+            if target is None:
+                raise errors.DatasetError(f"{path}: cannot write the image ({oiio.geterror().strip()})")
+            good = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
+            problem = target.geterror()  # a full disk is told here alone
+            if not good or problem or not target.close():
+                problem = " ".join(problem.split()) or "no reason given"
+                raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot write the image ({error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:

@@ -29,9 +29,10 @@ def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[
         OSError: It cannot be written; the caller says what that means.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    temporary = _temporary(path, ".part")
+    created = open(temporary, "xb")  # noqa: SIM115  # exclusive: what others put there is neither written nor removed
     try:
-        with open(temporary, "xb") as stream:
+        with created as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
@@ -41,6 +42,27 @@ def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[
     finally:
         temporary.unlink(missing_ok=True)
     _sync_folder(path.parent)
+
+
+@contextmanager
+def replacing_by_name(path: str | Path) -> Iterator[Path]:
+    """As `replacing`, for libraries that open files themselves: the name of an empty file with the suffix of ``path``.
+
+    Raises:
+        OSError: The file cannot be made or moved to its place.
+    """
+    path = Path(path)
+    temporary = _temporary(path, path.suffix)
+    open(temporary, "xb").close()
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _temporary(path: Path, suffix: str) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(8)}{suffix}")
 
 
 def write(path: str | Path, content: bytes) -> None:

@@ -43,6 +43,47 @@ def test_until_the_block_ends_the_old_content_is_there(tmp_path):
     assert path.read_bytes() == b"new" and files.leftovers(path) == []
 
 
+def test_a_library_that_opens_files_itself_gets_an_empty_file_of_the_same_kind(tmp_path):
+    path = tmp_path / "a.png"
+    files.write(path, b"old")
+    with files.replacing_by_name(path) as temporary:
+        assert temporary.suffix == ".png" and temporary.read_bytes() == b"" and path.read_bytes() == b"old"
+        temporary.write_bytes(b"new")
+    assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["a.png"]
+    with pytest.raises(KeyError), files.replacing_by_name(path) as temporary:
+        raise KeyError
+    assert path.read_bytes() == b"new" and os.listdir(tmp_path) == ["a.png"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+@pytest.mark.parametrize("write", ["content", "name"])
+def test_a_link_in_the_place_of_a_temporary_file_is_not_written_through(tmp_path, monkeypatch, write):
+    monkeypatch.setattr(files.secrets, "token_hex", lambda _: "12ab")
+    precious = tmp_path / "precious"
+    precious.write_bytes(b"kept")
+    for suffix in (".part", ".png"):
+        (tmp_path / f".a.png.12ab{suffix}").symlink_to(precious)
+    with pytest.raises(FileExistsError):
+        if write == "content":
+            files.write(tmp_path / "a.png", b"new")
+        else:
+            with files.replacing_by_name(tmp_path / "a.png"):
+                pass
+    assert precious.read_bytes() == b"kept" and not (tmp_path / "a.png").exists()
+
+
+def test_new_files_have_the_permissions_that_the_user_chose(tmp_path):
+    before = os.umask(0o027)
+    try:
+        files.write(tmp_path / "a.bin", b"")
+        with files.replacing_by_name(tmp_path / "b.png"):
+            pass
+    finally:
+        os.umask(before)
+    modes = {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert modes == {0o640} or os.name != "posix"
+
+
 def test_only_a_files_own_leftovers_are_found(tmp_path):
     for name in (".a.bin.12ab.part", ".b.bin.12ab.part", "a.bin.part", ".a.bin.part"):
         (tmp_path / name).touch()
