@@ -1,32 +1,33 @@
-"""Use R5DGS Engine: choose the render engine, and colour management that gives the colours back as trained."""
+"""Use R5DGS Engine: choose the render engine, and report how exactly the scene's view shows the colours as trained."""
 
 import bpy
-from bpy.props import BoolProperty
 
-from ..r5dgs_addon import engine, engine_color
+from ..r5dgs_addon import engine, engine_color, engine_loss
+
+REMEDY = "'Show Colors as Trained' in the render properties sets Standard, which shows all"
 
 
 class R5DGS_OT_use_engine(bpy.types.Operator):
-    """Render with the engine R5DGS, and set the view transform to Standard, which shows all colors as trained"""
+    """Render with the engine R5DGS. The view transform stays: the engine inverts it for Gaussians"""
 
     bl_idname = "r5dgs.use_engine"
     bl_label = "Use R5DGS Engine"
     bl_options = {"REGISTER", "UNDO"}
 
-    keep_view: BoolProperty(
-        name="Keep View Transform",
-        description="Leave AgX or what else is set to what is rendered beside; the engine inverts it for Gaussians, "
-        "except colors that are too saturated for it",
-        default=False,
-    )
-
     def execute(self, context):
-        context.scene.render.engine = engine.ENGINE
-        replaced = []
-        if not self.keep_view:
-            replaced = engine_color.differences(context.scene)
-            engine_color.show_as_trained(context.scene)
-        self.report({"INFO"}, f"Engine R5DGS{'; replaced ' + ', '.join(replaced) if replaced else ''}")
+        scene = context.scene
+        scene.render.engine = engine.ENGINE
+        loss = engine_loss.measure(scene)
+        objections = engine_color.objections(scene)
+        view = scene.view_settings.view_transform
+        if objections:
+            self.report({"WARNING"}, f"Engine R5DGS; colors are not as trained with {', '.join(objections)}; {REMEDY}")
+        elif loss is None:
+            self.report({"INFO"}, "Engine R5DGS")
+        elif loss.psnr < engine_loss.ENOUGH_DB:
+            self.report({"WARNING"}, f"Engine R5DGS; {view} is inverted, {engine_loss.note(loss)}; {REMEDY}")
+        else:
+            self.report({"INFO"}, f"Engine R5DGS; {view} is inverted: {engine_loss.note(loss)}")
         return {"FINISHED"}
 
 

@@ -14,6 +14,7 @@ from . import (
     compat,
     engine_color,
     engine_cryptomatte,
+    engine_loss,
     engine_passes,
     engine_settings,
     engine_stereo,
@@ -159,5 +160,6 @@ def unregister():
     for panel in compat.panels_of_all_engines():
         panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.utils.unregister_class(R5DGS_RenderEngine)
+    engine_loss.unregister()
     engine_view.unregister()
     engine_settings.unregister()

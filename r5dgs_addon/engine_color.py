@@ -14,7 +14,7 @@ from ..r5dgs_core.scene import view_inverse
 from . import compat, engine_settings, engine_view
 
 STANDARD = "Standard"
-FAIR = 1.5  # colours that are farther off, of 255 steps, do not pass for those that were trained
+FAIR = view_inverse.VISIBLE / view_inverse.STEP
 WIDE = 0.9  # a view that reaches less of the table leaves saturated colours pale
 POOR = 25.0  # a view with such an inverse (*False Color*) has none worth the name
 

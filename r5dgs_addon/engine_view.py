@@ -184,6 +184,24 @@ def _make(management: Management) -> None:
     _inverses[management] = made
 
 
+def loss(
+    management: Management,
+    inverse: view_inverse.Inverse,
+    display: np.ndarray,  # [N, 3]
+    weights: np.ndarray,  # [N]
+) -> view_inverse.Loss | None:
+    """`view_inverse.loss` of a view, from colours that Blender displays; None if it cannot, as on a full disk."""
+    try:
+        sampler = _Sampler(management)
+        try:
+            return view_inverse.loss(sampler.displayed, inverse, display, weights)
+        finally:
+            sampler.close()
+    except (OSError, RuntimeError) as error:
+        _log.warning("R5DGS: the loss under the view %s is not known: %s", management.transform, error)
+        return None
+
+
 class _Sampler:
     """Has Blender display colours: it saves images through a scene of their own."""
 

@@ -3,7 +3,7 @@
 import bpy
 
 from .. import engine, figures, live_preview, worker, worker_check
-from . import sidebar
+from . import render, sidebar
 
 
 class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
@@ -30,6 +30,8 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
             layout.label(text="The scene has no camera", icon="INFO")
         if context.scene.render.engine != engine.ENGINE:
             layout.operator("r5dgs.use_engine", icon="SCENE")
+        else:
+            render.draw_loss(layout, context.scene)
         worker_check.draw(layout, context)
 
 

@@ -2,7 +2,17 @@
 
 import bpy
 
-from .. import engine, engine_color, render_notes, worker
+from .. import engine, engine_color, engine_loss, render_notes, worker
+
+
+def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """Draw the loss of the scenes' colours under the view, once it is measured."""
+    loss = engine_loss.known(scene)
+    if loss is not None:
+        poor, text = loss.psnr < engine_loss.ENOUGH_DB, engine_loss.note(loss)
+        layout.label(text=text[0].upper() + text[1:], icon="ERROR" if poor else "BLANK1")
+        if poor:
+            layout.operator("r5dgs.show_colors_as_trained", icon="COLOR")
 
 
 class _OfEngine:
@@ -43,6 +53,7 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         inverse = engine_color.inverse(scene)
         if inverse is not None and not objections:
             column.label(text=f"{scene.view_settings.view_transform} is inverted for Gaussians", icon="CHECKMARK")
+            draw_loss(column, scene)
             if inverse.reach < engine_color.WIDE:
                 column.label(text="Very saturated colors stay paler")
         column.prop(settings, "sky")

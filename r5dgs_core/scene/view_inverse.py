@@ -23,6 +23,7 @@ BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as whi
 MOST = 16.0  # times as bright is what the softest looks display as white
 SIZE = 33  # nodes of the grid along each channel
 STEP = 1 / 255  # of a display, in which errors are told
+VISIBLE = 1.5 * STEP  # colours that are farther off are another colour
 SOLVED = 0.5 * STEP  # nodes that are displayed this near to what is wanted are within the view's reach
 
 _CODES = 65536  # of the curves: display colours are rounded to so many, far finer than files keep them
@@ -67,6 +68,37 @@ class Inverse:
         """Where in the grid display colours lie, in nodes. [N, 3]"""
         index = (np.clip(display, 0, 1) * (_CODES - 1) + 0.5).astype(np.intp)
         return np.stack([curve[index[:, channel]] for channel, curve in enumerate(self.curves)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """How far display colours come out of a view that is inverted.
+
+    Attributes:
+        psnr: In dB, of colours that are rounded to 255 steps afterwards: at most 59.
+        unreached: Share of the colours that are off by more than `VISIBLE`.
+    """
+
+    psnr: float
+    unreached: float
+
+
+def loss(forward: Forward, made: Inverse, display: np.ndarray, weights: np.ndarray) -> Loss:
+    """Measure how far display colours come out.
+
+    Args:
+        forward: Displays scene-linear colours.
+        made: Its inverse.
+        display: The colours that are wanted. [N, 3]
+        weights: How much each counts. [N]
+
+    Returns:
+        The loss.
+    """
+    wanted = np.asarray(display, np.float64)
+    off = np.asarray(forward(made.scene_linear(wanted)), np.float64) - wanted
+    squared = np.average(np.square(off).mean(axis=-1), weights=weights) + STEP**2 / 12  # that of rounding
+    return Loss(-10 * float(np.log10(squared)), float(np.average(np.abs(off).max(axis=-1) > VISIBLE, weights=weights)))
 
 
 def invert(forward: Forward, scale: float = 1.0) -> Inverse:

@@ -14,7 +14,7 @@ import pytest
 from r5dgs_core.data import images
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback, scene_file
-from tests import scenes
+from tests import layouts, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
@@ -43,6 +43,7 @@ def loaded(blender, scene, tmp_path, monkeypatch):
     view.matrix_world = Matrix((world @ cameras.cam_world_to_opengl(camera.T_cam_world)).tolist())
     blender.context.scene.camera = view
     blender.ops.r5dgs.use_engine()
+    blender.ops.r5dgs.show_colors_as_trained()
     settings = blender.context.scene.render
     settings.resolution_x, settings.resolution_y, settings.resolution_percentage = camera.width, camera.height, 100
     settings.dither_intensity = 0.0
@@ -274,7 +275,6 @@ def test_colour_management_that_changes_colours_is_named_and_put_right(blender, 
     view.look = "AgX - Punchy"
     found = color.objections(blend_scene)
     assert found == ["view transform AgX", "look AgX - Punchy", "exposure 0.5", "gamma 1.2", "curves"]
-    layouts = importlib.import_module("tests.layouts")
     panels = importlib.import_module("r5dgs.r5dgs_addon.panels.render")
     said = layouts.draw(blender, *panels.CLASSES)
     assert ", ".join(found) in said and "r5dgs.show_colors_as_trained" in said and "use_pass_z" in said
@@ -299,11 +299,35 @@ def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, vi
     reached = np.ptp(expected, axis=-1) < 0.3 if view == "AgX" else np.full(near.shape, True)
     assert reached.mean() > 0.2 and np.median(near[reached]) <= 1 and np.percentile(near[reached], 95) < 3
     assert color.objections(blender.context.scene) == []
-    layouts = importlib.import_module("tests.layouts")
     said = layouts.draw(blender, *importlib.import_module("r5dgs.r5dgs_addon.panels.render").CLASSES)
     assert f"{view} is inverted for Gaussians" in said and ("stay paler" in "".join(said)) == (view == "AgX")
     blender.context.scene.r5dgs_render.as_trained = False
     assert np.abs(render_png(blender, tmp_path, "changed") - expected).mean() > 5 * np.abs(saved - expected).mean()
+
+
+def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, loaded, scene, tmp_path, capfd):
+    loss = importlib.import_module("r5dgs.r5dgs_addon.engine_loss")
+    view, found = blender.context.scene.view_settings, {}
+    for name in ("AgX", "Filmic", "Standard"):
+        view.view_transform, view.exposure = name, 0.25 if name == "AgX" else 0.0
+        blender.context.scene.render.engine = "CYCLES"
+        capfd.readouterr()
+        assert blender.ops.r5dgs.use_engine() == {"FINISHED"}
+        assert (view.view_transform, blender.context.scene.render.engine) == (name, "R5DGS")
+        assert view.exposure == (0.25 if name == "AgX" else 0.0)
+        said, found[name] = capfd.readouterr().out, loss.measure(blender.context.scene)
+        if name == "Standard":
+            assert found[name] is None and said.strip() == "Info: Engine R5DGS"
+            continue
+        assert loss.note(found[name]) in said
+        assert ("Warning" in said and "Show Colors as Trained" in said) == (found[name].psnr < loss.ENOUGH_DB)
+        shown = layouts.draw(blender, blender.types.R5DGS_PT_render, blender.types.R5DGS_PT_preview)
+        assert any(loss.note(found[name])[1:] in line for line in shown)
+    assert found["AgX"].psnr < loss.ENOUGH_DB < 50 < found["Filmic"].psnr  # these random colours are saturated
+    assert found["Filmic"].unreached < 0.01 < 0.05 < found["AgX"].unreached
+    view.view_transform = "False Color"
+    blender.ops.r5dgs.use_engine()
+    assert "colors are not as trained with view transform False Color" in capfd.readouterr().out
 
 
 def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene, tmp_path):

@@ -35,6 +35,7 @@ def merged(blender, tmp_path, monkeypatch):
     scene = scenes.make_scene(n=600, objects=3, seed=4)
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
     blender.ops.r5dgs.use_engine()
+    blender.ops.r5dgs.show_colors_as_trained()
     gaussians.frame_set(46)
     gaussians.camera.location, gaussians.camera.rotation_euler = (0, -5, 1), (1.4, 0, 0)
     gaussians.view_layers[0].use_pass_z = True

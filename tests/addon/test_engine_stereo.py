@@ -20,6 +20,7 @@ def stereo(blender, tmp_path, monkeypatch):
     scene = scenes.make_scene(n=600, objects=3, seed=4)
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
     blender.ops.r5dgs.use_engine()
+    blender.ops.r5dgs.show_colors_as_trained()
     shown = blender.context.scene
     shown.frame_set(46)
     camera = shown.camera

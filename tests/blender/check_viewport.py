@@ -34,6 +34,7 @@ def checks(path: str):
     with bpy.context.temp_override(window=window, area=area, region=region):
         bpy.ops.r5dgs.load_scene(filepath=path)
         bpy.ops.r5dgs.use_engine()
+        bpy.ops.r5dgs.show_colors_as_trained()
     scene = window.scene
     scene.render.dither_intensity = 0
     scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 320, 240, 100

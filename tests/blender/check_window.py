@@ -9,6 +9,7 @@ named below, of which some may be asked for. Ends with exit code 1 where one fai
 
 import contextlib
 import inspect
+import os
 import sys
 import tempfile
 import time
@@ -132,6 +133,7 @@ def rendering(path: Path, folder: Path):
     scene = w.main_window().scene
     with w.inside():
         bpy.ops.r5dgs.use_engine()
+        bpy.ops.r5dgs.show_colors_as_trained()
     render, ended = scene.render, []
     bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancelled"))
     bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
@@ -174,12 +176,56 @@ def previewing(path: Path, folder: Path):
         assert tuple(bpy.data.images["R5DGS Preview"].size) == (320, 240)
 
 
+WRAPPERS = {
+    "runs the worker as a child": '"{python}" "$@"\nexit $?\n',
+    "ignores SIGTERM": 'trap "" TERM\n"{python}" "$@"\nexit $?\n',
+    "never starts": "sleep 600\nexit 0\n",
+}
+
+
+def stopping(path: Path, folder: Path):
+    """Esc ends a preview at once if Worker Python is a wrapper script, and no process is left."""
+    render, worker, area = w.main_window().scene.render, w.service("worker"), w.area_of("VIEW_3D")
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 6000, 4500, 100
+    chosen, python = os.environ.get("R5DGS_PYTHON"), w.service("preferences").worker_python()
+    for number, (what, lines) in enumerate(WRAPPERS.items()):
+        script = folder / f"wrapper{number}"
+        script.write_text("#!/bin/sh\n" + lines.format(python=python))
+        script.chmod(0o755)
+        os.environ["R5DGS_PYTHON"] = str(script)
+        yield from w.hover(w.region_of(area))
+        with w.inside():
+            bpy.ops.r5dgs.preview("INVOKE_DEFAULT")
+        phase = "starting" if what == "never starts" else "rendering"
+        yield from w.wait(lambda: any(phase in job.doing for job in worker._jobs), what)  # noqa: B023
+        yield 1.0
+        leader = worker._worker.pid
+        began = time.monotonic()
+        yield from w.press("Escape")
+        yield from w.wait(nothing_runs, what)
+        print(f"a wrapper that {what}: free {time.monotonic() - began:.2f} s after Esc", flush=True)
+        yield from w.wait(lambda: not processes_of(leader), f"{what}: {processes_of(leader)}")  # noqa: B023
+    os.environ.pop("R5DGS_PYTHON")
+    os.environ.update({"R5DGS_PYTHON": chosen} if chosen else {})
+
+
+def processes_of(group: int) -> list[str]:
+    """Processes of a group that are not zombies, as /proc lists them."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, _, member = stat.read_text().rpartition(")")[2].split()[:3]
+            found += [stat.parent.name] if int(member) == group and state != "Z" else []
+    return found
+
+
 def looking(path: Path, folder: Path):
     """A border that is drawn with Ctrl+B cuts F12 and not the Rendered viewport; the eyes of a stereo render differ."""
     scene, area = w.main_window().scene, w.area_of("VIEW_3D")
     region, space, render = w.region_of(area), area.spaces[0], scene.render
     with w.inside():
         bpy.ops.r5dgs.use_engine()
+        bpy.ops.r5dgs.show_colors_as_trained()
     render.resolution_x, render.resolution_y, render.resolution_percentage = 320, 240, 100
     space.region_3d.view_perspective, space.shading.type = "CAMERA", "RENDERED"
     yield from w.hover(region)
@@ -282,6 +328,7 @@ def merging(path: Path, folder: Path):
     gaussians, meshes = w.main_window().scene, bpy.data.scenes.new("meshes")
     with w.inside():
         bpy.ops.r5dgs.use_engine()
+        bpy.ops.r5dgs.show_colors_as_trained()
     camera = gaussians.camera
     meshes.collection.objects.link(camera)
     meshes.camera = camera
@@ -344,7 +391,7 @@ def combine_by_depth(first: bpy.types.Scene, second: bpy.types.Scene) -> None:
     tree.links.new(combine.outputs[0], output)
 
 
-CHECKS = (browsing, typing, clicking, rendering, previewing, looking, exporting, capturing, merging)
+CHECKS = (browsing, typing, clicking, rendering, previewing, stopping, looking, exporting, capturing, merging)
 
 
 def checks(path: Path, chosen: list):

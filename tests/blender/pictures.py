@@ -155,6 +155,7 @@ def viewport(window: Window):
     with window.inside():
         bpy.ops.r5dgs.set_display(display="POINTS")
         bpy.ops.r5dgs.use_engine()
+        bpy.ops.r5dgs.show_colors_as_trained()
     window.area("VIEW_3D").spaces.active.shading.type = "RENDERED"
     yield 60.0  # the rasterizer may have to be compiled first
 

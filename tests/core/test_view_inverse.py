@@ -116,3 +116,16 @@ def test_pictures_keep_their_shape_and_colours_out_of_range_are_clamped(of):
     found = of(film).scene_linear(picture)
     assert found.shape == picture.shape and found.dtype == np.float32
     np.testing.assert_array_equal(found[0, 0], found[0, 1])
+
+
+def test_the_loss_of_colours_counts_them_by_weight_and_ends_where_rounding_does(of):
+    reached = mixed(seen(spread=0.2))
+    lost = np.tile([[1.0, 0.0, 0.0]], (len(reached), 1))
+    wanted, even = np.concatenate([reached, lost]), np.ones(2 * len(reached))
+    light = np.repeat([1.0, 0.0], len(reached))
+    fine = view_inverse.loss(mixed, of(mixed), wanted, light)
+    half = view_inverse.loss(mixed, of(mixed), wanted, even)
+    assert 50 < fine.psnr < 58.93 and fine.unreached < 0.01
+    assert half.psnr < fine.psnr - 5 and half.unreached == pytest.approx(0.5, abs=0.01)
+    exact = view_inverse.loss(gamma, of(gamma), np.random.default_rng(2).random((3000, 3)), np.ones(3000))
+    assert exact.psnr > 55 and exact.unreached == 0
