@@ -32,7 +32,7 @@ def steps(
         folder: Made where it does not exist.
         which: Of `WHICH`.
         format: Of `FORMATS`.
-        axes: Of `export_gaussians.AXES`.
+        axes: Of `export_gaussians.AXES`; "FILE" gives cameras of the data set's world.
         every: The scene's frame range instead of the current frame.
         step: Frames from one view to the next.
 
@@ -44,6 +44,9 @@ def steps(
     collection = objects.active_collection(context)
     if axes == "FILE" and collection is None:
         raise errors.ConfigError("export: expected a loaded scene for the axes 'Scene File', found none; choose others")
+    origin = objects.origin(collection)
+    if origin.any() and axes != "FILE":
+        notes.append(export_gaussians.relative_note(origin, "the axes 'Scene File' give cameras of that world"))
     frames, folders = export_frames.frames_of(scene, every, step), _folders(scene)
     with export_frames.frame_kept(scene):
         for number, frame in enumerate(frames):
@@ -53,7 +56,8 @@ def steps(
             world = np.eye(4) if collection is None else visible.world_of(collection, depsgraph)
             for camera in _cameras(scene, which, notes):
                 name = image_name(frame) if which == "ACTIVE" else f"images/{folders[camera]}/{frame:04d}.png"
-                found.append(View(name, in_axes(depsgraph, camera, axes, world), t))
+                own = in_axes(depsgraph, camera, axes, world)
+                found.append(View(name, cameras.moved(own, origin) if axes == "FILE" else own, t))
     if not found:
         raise errors.ConfigError(f"{scene.name}: expected a camera, found none; add one to the scene")
     try:

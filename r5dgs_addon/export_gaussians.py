@@ -10,7 +10,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, point_edits, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
-from . import amounts, cloud_points, export_frames, look, picture, visible
+from . import amounts, cloud_points, export_frames, look, objects, picture, visible
 from .running import Outcome, Step, Steps
 
 AXES = (
@@ -31,9 +31,11 @@ class Sources:
 
     Attributes:
         notes: What has to be said about it, each once.
+        origins: Points that the positions of the scenes are measured from.
     """
 
     notes: list[str] = field(default_factory=list)
+    origins: set[tuple[float, ...]] = field(default_factory=set)
     _scenes: dict[int, Scene | None] = field(default_factory=dict)
     _bending: dict[int, Residuals] = field(default_factory=dict)
 
@@ -111,6 +113,7 @@ def splats_of(
         if wanted is not None and one.object not in wanted and one.parent not in wanted:
             continue
         scene, turn = sources.scene(one.collection), world_to(axes, one.world)
+        sources.origins.add(tuple(objects.origin(one.collection).tolist()))
         matrix, names = turn @ one.matrix, [*names, one.object.name]
         for note in cloud_points.of(one.object, depsgraph, one.collection.r5dgs.gaussians).notes:
             sources.note(note)
@@ -204,9 +207,24 @@ def ply_steps(
                     "export: expected a visible object of a loaded scene" + (", selected" if wanted is not None else "")
                     + ", found none; select or show one first"
                 )  # fmt: skip
-            ply.write(splats, target, plain=plain)
+            ply.write(splats, target, plain=plain, origin=_shared_origin(sources) if axes == "FILE" else None)
             most, clouds = max(most, len(splats.means)), clouds | set(names)
+    for origin in sorted(sources.origins):
+        if any(origin):
+            sources.note(
+                relative_note(np.array(origin), "PLY files hold 32-bit numbers, which would lose detail there")
+            )
     if not clouds:
         sources.note("No frame shows anything to export; the files are empty")
     files = amounts.of(len(frames), "file") if every else path.name
     return Outcome(f"{files}: {amounts.of(most, 'Gaussian')} of {amounts.of(len(clouds), 'cloud')}", sources.notes)
+
+
+def relative_note(origin: np.ndarray, more: str) -> str:
+    """A note that exported positions are relative to the origin of a scene. [3]"""
+    return f"Positions are relative to {objects.origin_text(origin)} of the data set's world; {more}"
+
+
+def _shared_origin(sources: Sources) -> np.ndarray | None:
+    """The origin of all exported scenes; None if they differ."""
+    return np.array(next(iter(sources.origins))) if len(sources.origins) == 1 else None

@@ -6,6 +6,7 @@ cloud's parent inverse, so that the point cloud holds the file's own coordinates
 """
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,9 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras
 from ..r5dgs_core.scene.scene import MotionGroup, Scene
 from . import clouds, compat, displays, handlers, keyframes, motion_physics, table, timeline
+
+ORIGIN = "r5dgs_origin"  # custom property of the root: other properties of Blender hold float32
+SMALLEST = 1e-4  # size of a scene; Blender's curves take steps below 1.2e-7 for none
 
 
 @dataclass(frozen=True)
@@ -95,12 +99,19 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         The collection ``R5DGS <name>``.
 
     Raises:
-        SceneFileError: The scene has no Gaussians.
+        SceneFileError: The scene has no Gaussians, or is too small for Blender's curves.
         ConfigError: Extrapolation would end too far.
     """
     if len(scene.means) == 0:
         raise errors.SceneFileError(
             f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
+        )
+    size = max(scene.extent, float(np.exp(scene.log_scales.max())))
+    if size < SMALLEST:
+        factor = 10.0 ** -math.floor(math.log10(size))
+        raise errors.SceneFileError(
+            f"{path}: expected a scene of {SMALLEST:g} units or more, as Blender's animation has no finer steps than "
+            f"1e-7, found {size:.3g}; multiply the positions of the data set's cameras by {factor:g} and train again"
         )
     times = timeline.Times.of(scene, options.frame_zero, options.t_end)
     timeline.check_end(path.name, times)
@@ -190,6 +201,24 @@ def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Obj
     return [obj for obj in collection.all_objects if obj.r5dgs.role in roles]
 
 
+def origin(collection: bpy.types.Collection | None) -> np.ndarray:
+    """The point of the data set's world from which a loaded scene's positions are measured. [3] float64
+
+    Zero near the world's origin, without a scene, and after the root or its property was removed.
+    """
+    root = None if collection is None else collection.r5dgs.root
+    try:
+        found = np.array(root[ORIGIN], np.float64) if root is not None and ORIGIN in root else np.zeros(3)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    return found if found.shape == (3,) and np.isfinite(found).all() else np.zeros(3)
+
+
+def origin_text(origin: np.ndarray) -> str:
+    """An origin for messages and labels, such as "(5000002, -3500000, 1500002)"."""
+    return f"({', '.join(f'{value:.15g}' for value in origin)})"
+
+
 def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bpy.types.Object:
     root = bpy.data.objects.new(table.fit(f"{scene.name} root"), None)
     root.r5dgs.role = "ROOT"
@@ -197,6 +226,9 @@ def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bp
     root.empty_display_size = 0.1 * scene.extent
     root.rotation_mode = "QUATERNION"
     root.rotation_quaternion = Matrix(cameras.WORLD_TO_BLENDER[convention].tolist()).to_quaternion()
+    if scene.origin.any():
+        root[ORIGIN] = scene.origin.tolist()
+        root.id_properties_ui(ORIGIN).update(description="Point of the data set's world that is shown at the root")
     collection.objects.link(root)
     return root
 

@@ -29,6 +29,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             icon="OUTLINER_COLLECTION",
         )
         column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
+        if (origin := objects.origin(collection)).any():
+            column.label(text=f"Relative to {objects.origin_text(origin)}", icon="EMPTY_AXIS")
         if t > times.t_max + 1e-6:
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
         else:

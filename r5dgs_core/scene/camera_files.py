@@ -83,7 +83,9 @@ def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
             lenses[lens] = len(lenses) + 1
             camera_lines.append(f"{lenses[lens]} PINHOLE " + " ".join(repr(value) for value in lens))
         quat = rotations.rotmats_to_quats(camera.T_cam_world[:3, :3])
-        pose = " ".join(repr(float(value)) for value in (*quat, *camera.T_cam_world[:3, 3]))
+        center = cameras.cam_world_to_opengl(camera.T_cam_world)[:3, 3]
+        shift = -rotations.quats_to_rotmats(quat) @ center  # by the rotation that is read again, as `center` may be far
+        pose = " ".join(repr(float(value)) for value in (*quat, *shift))
         image_lines.append(f"{number} {pose} {lenses[lens]} {_image_name(view)}\n")
     _write_lines(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] (fx fy cx cy)", camera_lines)
     _write_lines(folder / "images.txt", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points", image_lines)

@@ -62,13 +62,14 @@ class Splats:
     object_ids: np.ndarray | None = None
 
 
-def write(splats: Splats, path: str | Path, *, plain: bool = False) -> Path:
+def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.ndarray | None = None) -> Path:
     """Write binary little endian, atomically.
 
     Args:
         splats: The Gaussians.
         path: Where to.
         plain: Leave identities and ids out, for viewers that refuse columns they do not know.
+        origin: Point of the world that the centres are relative to, for a comment of the header; zero if None. [3]
 
     Returns:
         The path written.
@@ -80,6 +81,8 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False) -> Path:
         data[name] = values
     kinds = {"<f4": "float", "<i4": "int"}
     header = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default"]
+    if origin is not None and np.any(origin):
+        header.append("comment origin " + " ".join(repr(float(value)) for value in origin))
     header += [f"element vertex {len(data)}", *(f"property {kinds[kind]} {name}" for name, kind, _ in columns)]
     try:
         with files.replacing(path) as stream:
