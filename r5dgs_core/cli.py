@@ -1,5 +1,5 @@
-"""The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, objects, lookup,
-query, name, config, warm-up.
+"""The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, check, objects,
+lookup, query, name, config, warm-up.
 
 `command_line` has the arguments, `commands` and its neighbours do the work, `exit_status` has the exit statuses.
 """
@@ -132,6 +132,12 @@ def _bench(args: argparse.Namespace) -> None:
     )
 
 
+def _check(args: argparse.Namespace) -> ExitStatus | None:
+    from . import commands_check
+
+    return None if commands_check.run_check(args.target, as_json=args.json) else ExitStatus.NEGATIVE
+
+
 def _info(args: argparse.Namespace) -> None:
     from . import commands_info
 
@@ -194,6 +200,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], ExitStatus | None]] = {
     "report": _report,
     "bench": _bench,
     "info": _info,
+    "check": _check,
     "objects": _objects,
     "lookup": _lookup,
     "query": _query,

@@ -245,6 +245,20 @@ def _info(commands: Any) -> None:
     p.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
+def _check(commands: Any) -> None:
+    p = _command(
+        commands,
+        "check",
+        "list all faults of a data set, scene file or run",
+        "List all faults of a data set, run folder, .r5dgs, .ply or .toml file, each with its remedy, errors first.\n"
+        "Ends with status 1 if there are errors.",
+        "DATA",
+        "check.md",
+    )
+    p.add_argument("target", type=Path, metavar="DATA|RUN|FILE", help="what to check")
+    p.add_argument("--json", action="store_true", help="print JSON")
+
+
 def _objects(commands: Any) -> None:
     p = _command(
         commands,
@@ -347,5 +361,5 @@ def _warm_up(commands: Any) -> None:
 
 _COMMANDS = (
     *(_demo, _train, _masks, _associate, _bake, _import, _evaluate, _report, _bench),
-    *(_info, _objects, _lookup, _query, _name, _config, _warm_up),
+    *(_info, _check, _objects, _lookup, _query, _name, _config, _warm_up),
 )

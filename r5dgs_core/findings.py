@@ -59,12 +59,12 @@ class Finding:
 
 
 @contextlib.contextmanager
-def coded(code: str) -> Iterator[None]:
-    """Give errors of a block a code unless they have one."""
+def coded(code: str, *, instead: bool = False) -> Iterator[None]:
+    """Give errors of a block a code: those without one, or all of them with ``instead``."""
     try:
         yield
     except errors.R5dgsError as error:
-        error.code = error.code or code
+        error.code = code if instead else error.code or code
         raise
 
 

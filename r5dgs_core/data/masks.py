@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import errors
+from .. import errors, findings
 from . import images
 
 UNKNOWN = 65535
@@ -42,7 +42,7 @@ def read(path: Path, colors: Mapping[int, int] | None = None, unknown: int = UNK
     """
     path = Path(path)
     if colors:
-        return _colors_to_ids(path, images.read_png(path), colors)
+        return _colors_to_ids(path, _read_png(path), colors)
     ids = _read_indices(path) if _holds_indices(path) else _read_gray(path)
     ids[ids == unknown] = UNKNOWN
     return ids
@@ -66,8 +66,13 @@ def write(path: Path, ids: np.ndarray) -> None:
     images.write_png(path, ids.astype(np.uint8 if high < 256 else np.uint16))
 
 
+def _read_png(path: Path) -> np.ndarray:
+    with findings.coded("D17", instead=True):
+        return images.read_png(path)
+
+
 def _read_gray(path: Path) -> np.ndarray:
-    pixels = images.read_png(path)
+    pixels = _read_png(path)
     if pixels.shape[2] >= 3 and not _is_gray(pixels):
         raise errors.DatasetError(
             f"{path}: expected one channel of object ids, found colours; convert the mask to one channel or a palette",
@@ -97,7 +102,7 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
     gray, colored = [], Path()
     for path in map(Path, paths):
         header = _png_header(path)
-        pixels = None if header is not None and header[3] in _ONE_CHANNEL else images.read_png(path)
+        pixels = None if header is not None and header[3] in _ONE_CHANNEL else _read_png(path)
         if pixels is None or pixels.shape[2] < 3 or _is_gray(pixels):
             gray.append(path)
         else:
@@ -106,7 +111,7 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
     if not found:
         return {}
     for path in gray:
-        shown = set(np.unique(_pack(path, images.read_png(path))).tolist())
+        shown = set(np.unique(_pack(path, _read_png(path))).tolist())
         if foreign := shown - found - {0}:
             color = min(foreign)
             raise errors.DatasetError(

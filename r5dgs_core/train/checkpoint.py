@@ -249,12 +249,12 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
     if newest_file(folder) is None:
         raise CheckpointError(f"{path}: no checkpoint yet; go on with 'r5dgs train ... --resume'")
     try:
-        return _read(path)
+        return read(path)
     except CheckpointError as error:
         if isinstance(error.__cause__, PermissionError):  # the file may be whole
             raise
         try:
-            state = _read(previous)
+            state = read(previous)
         except CheckpointError as other:
             also = f"; {other}" if previous.exists() else ""
             raise CheckpointError(f"{error}{also}; train again with --overwrite") from error
@@ -267,7 +267,7 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
     return state
 
 
-def _read(path: Path) -> Checkpoint:
+def read(path: Path) -> Checkpoint:
     """Read one checkpoint file. Raises CheckpointError without a remedy."""
     try:
         return Checkpoint(**checkpoint_content.check(checkpoint_file.read(path)))

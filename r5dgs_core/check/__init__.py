@@ -1,0 +1,67 @@
+"""`r5dgs check`: all faults of a data set, scene file, run folder, PLY file or configuration.
+
+The rules are those of the readers, which here go on after a fault (`findings.Collector`), and warnings about what is
+read but probably not meant.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .. import errors, findings, input_paths
+from ..findings import Collector, Finding
+from .codes import CODES
+
+
+def check(path: Path) -> list[Finding]:
+    """Return all faults of a file or folder, errors first.
+
+    Args:
+        path: A data set, run folder, scene file, PLY file or TOML configuration.
+
+    Raises:
+        ConfigError: There is nothing at the path, or nothing that can be checked.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise errors.ConfigError(f"{path}: expected a file or folder, found nothing; check the path")
+        found = _check_folder(path) if path.is_dir() else _check_file(path)
+    except OSError as error:
+        raise errors.ConfigError(f"{path}: cannot be read ({error})") from error
+    return sorted(found, key=lambda finding: finding.severity != findings.ERROR)
+
+
+def _check_folder(path: Path) -> list[Finding]:
+    if (path / input_paths.RUN_FILE).exists():
+        from . import run
+
+        return run.check(path)
+    from . import data
+
+    return data.check(path)
+
+
+def _check_file(path: Path) -> list[Finding]:
+    suffix = path.suffix.lower()
+    if suffix == input_paths.SCENE_SUFFIX:
+        from . import scene
+
+        return scene.check(path)
+    if suffix == ".ply":
+        from ..scene import ply
+
+        collect = Collector(CODES, "P01")
+        with collect():
+            ply.read(path)
+        return collect.findings
+    if suffix == ".toml":
+        from ..train import config
+
+        collect = Collector(CODES, "C01")
+        with collect():
+            config.load(path)
+        return collect.findings
+    raise errors.ConfigError(
+        f"{path}: expected a data set, run folder, .r5dgs, .ply or .toml file, found another kind of file"
+    )

@@ -1,0 +1,157 @@
+"""Faults of a data set: those of the reader, damaged images and masks, and what looks like a mistake."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ..data import colmap, dataset, images, masks
+from ..data.dataset import Dataset, View
+from ..findings import Collector, Finding, coded
+from .codes import CODES
+from .names import shown
+
+FEWEST_CAMERAS, FEWEST_IMAGES = 3, 3
+LEAST_SPACE = 1 << 30  # bytes
+_PARALLEL = 1e-6  # of the axes of all cameras: they meet nowhere
+_LISTED = 5  # names in one finding
+
+
+def check(root: Path) -> list[Finding]:
+    """Return all faults of a data set folder."""
+    collect = Collector(CODES, "D00")
+    found: Dataset | None = None
+    with collect():
+        found = dataset.read(root, guard=collect)
+    if shutil.disk_usage(root).free < LEAST_SPACE:
+        collect.add("D53", f"{root}: expected at least 1 GB of free disk space, found less")
+    if found is None:
+        return collect.findings
+    _check_splits(found, collect)
+    _check_times(found, collect)
+    _check_cameras(found, collect)
+    _check_names(found, collect)
+    _check_images(found, collect)
+    _check_masks(found, collect)
+    return collect.findings
+
+
+def _views(found: Dataset) -> list[View]:
+    return [view for split in dataset.SPLITS for view in found.views(split)]
+
+
+def _some(names: list[str]) -> str:
+    listed = ", ".join(map(shown, names[:_LISTED]))
+    return listed if len(names) <= _LISTED else f"{listed} and {len(names) - _LISTED} more"
+
+
+def _check_splits(found: Dataset, collect: Collector) -> None:
+    splits: dict[Path, set[str]] = defaultdict(set)
+    for view in _views(found):
+        splits[view.image_path].add(view.split)
+    for path, names in splits.items():
+        if len(names) > 1:
+            collect.add("D40", f"{path}: expected in one split, found in {' and '.join(sorted(names))}")
+    folder = found.root / colmap.IMAGES
+    if not (found.root / dataset.input_paths.CAMERAS_FILE).exists():
+        present = {path for path in folder.rglob("*") if path.suffix.lower() in images.SUFFIXES}
+        left_out = sorted(path.relative_to(folder).as_posix() for path in present - set(splits))
+        if left_out:
+            collect.add("D54", f"{folder}: {len(left_out)} of {len(present)} images are not used: {_some(left_out)}")
+
+
+def _check_times(found: Dataset, collect: Collector) -> None:
+    first, last = float(found.times[0]), found.t_max
+    if first == last:
+        collect.add("D43", f"{found.root}: all training images are of the time {first:g}")
+    for view in found.val:
+        if not first <= view.t <= last:
+            collect.add("D41", f"{view.image_path}: time {view.t:g}, expected {first:g} to {last:g}")
+    for view in found.test:
+        if view.t <= last:
+            collect.add("D42", f"{view.image_path}: time {view.t:g}, expected later than {last:g}")
+    for split in dataset.SPLITS:
+        path = found.root / f"transforms_{split}.json"
+        if path.exists() and b'"time"' not in path.read_bytes():
+            collect.add("D44", f"{path}: no frame has a 'time'")
+        times = defaultdict(list)
+        for view in found.views(split):
+            times[view.camera.name].append(view.t)
+        unsorted = [camera for camera, t in times.items() if (np.diff(t) < 0).any()]
+        if unsorted:
+            collect.add("D45", f"{path}: times go back within the frames of {_some(unsorted)}")
+
+
+def _check_cameras(found: Dataset, collect: Collector) -> None:
+    cameras = list({view.camera.name: view.camera for view in found.train}.values())
+    if len(cameras) < FEWEST_CAMERAS or len(found.train) < FEWEST_IMAGES:
+        collect.add(
+            "D47",
+            f"{found.root}: expected at least {FEWEST_CAMERAS} places of cameras and {FEWEST_IMAGES} training images, "
+            f"found {len(cameras)} and {len(found.train)}",
+        )
+    if len(cameras) < 2:
+        return
+    centers = np.stack([camera.center for camera in cameras])
+    axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(0)
+    if np.linalg.eigvalsh(total)[0] < _PARALLEL * len(cameras):
+        return
+    middle = np.linalg.solve(total, (across @ centers[:, :, None])[..., 0].sum(0))  # nearest to all optical axes
+    away = [
+        camera.name for camera, depth in zip(cameras, ((middle - centers) * axes).sum(-1), strict=True) if depth < 0
+    ]
+    if away:
+        collect.add("D46", f"{found.root}: {len(away)} of {len(cameras)} cameras look away: {_some(away)}")
+
+
+def _check_names(found: Dataset, collect: Collector) -> None:
+    words = [view.name for view in _views(found)] + [camera.name for camera in found.cameras]
+    words += [*found.object_names.values(), *(word for some in found.object_aliases.values() for word in some)]
+    for word in dict.fromkeys(words):
+        if not word.isprintable():
+            collect.add("D52", f"{found.root}: the name {shown(word)!r} holds control characters")
+
+
+def _check_images(found: Dataset, collect: Collector) -> None:
+    same: dict[bytes, View] = {}
+    for view in {view.image_path: view for view in _views(found)}.values():
+        with collect(), coded("D12"):
+            images.read(view.image_path)
+            digest = hashlib.sha256(view.image_path.read_bytes()).digest()
+            other = same.setdefault(digest, view)
+            if other.camera.name != view.camera.name:
+                collect.add("D51", f"{view.image_path}: the same file as {other.image_path}, from another camera")
+
+
+def _check_masks(found: Dataset, collect: Collector) -> None:
+    without = [view.name for view in found.train if view.mask_path is None]
+    if 0 < len(without) < len(found.train):
+        collect.add("D48", f"{found.mask_folder}: {len(without)} training images have no mask: {_some(without)}")
+    seen: dict[int, set[str]] = defaultdict(set)
+    complete = True
+    for view in _views(found):
+        loaded = None
+        with collect(), coded("D17"):
+            loaded = dataset.load_mask(view)
+        complete = complete and (loaded is not None or view.mask_path is None)
+        if loaded is not None:
+            for object_id in np.unique(loaded):
+                seen[int(object_id)].add(view.name)
+    ids = sorted(set(seen) - {0, masks.UNKNOWN})
+    folder = found.mask_folder or found.root / dataset.MASKS
+    unnamed = [object_id for object_id in ids if object_id not in found.object_names]
+    if found.object_names and unnamed:
+        collect.add("D49", f"{folder}: ids without a name: {_some([str(each) for each in unnamed])}")
+    total = sum(view.mask_path is not None for view in _views(found))
+    lone = [object_id for object_id in ids if len(seen[object_id]) == 1 and total > 1]
+    for object_id in lone:
+        collect.add("D50", f"{folder}: id {object_id} occurs in {next(iter(seen[object_id]))} alone")
+    absent = [name for object_id, name in found.object_names.items() if object_id not in seen]
+    if seen and complete and absent:
+        collect.add("D55", f"{folder}: expected pixels of {_some(absent)}, found none")

@@ -1,0 +1,72 @@
+"""Faults of a scene file: those of the reader, and what looks like a mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..findings import Collector, Finding
+from ..motion import keyframes, models
+from ..scene import scene_file
+from ..scene.scene import Scene
+from .codes import CODES
+from .names import shown
+
+LAST_FRAME = 1_048_574  # of Blender
+_AHEAD = 1 / 3  # of the observed span: as far as Blender extrapolates by default
+_SEEN = 1 / 255  # least opacity that is drawn
+_FEW_SEEN = 0.05
+_MOST_STEPS = 1 << 16  # of integration, for a look at a motion
+
+
+def check(path: Path) -> list[Finding]:
+    """Return all faults of a scene file."""
+    collect = Collector(CODES, "S01")
+    scene: Scene | None = None
+    with collect():
+        scene = scene_file.read(path)
+    if scene is None:
+        return collect.findings
+    if len(scene.means) == 0:
+        collect.add("S02", f"{path}: expected Gaussians, found none")
+    for item in scene.objects:
+        if item.count == 0 and item.id > 0:
+            collect.add("S10", f"{path}: object {item.id} ({shown(item.name)}) has no Gaussians")
+        for word in (item.name, *item.aliases):
+            if not word.strip() or not word.isprintable():
+                collect.add("S12", f"{path}: object {item.id}: the name '{shown(word)}' is empty or not printable")
+    _check_gaussians(scene, path, collect)
+    _check_motion(scene, path, collect)
+    return collect.findings
+
+
+def _check_gaussians(scene: Scene, path: Path, collect: Collector) -> None:
+    if len(scene.means) == 0:
+        return
+    with np.errstate(over="ignore"):
+        large = int((np.exp(scene.log_scales.astype(np.float64)).max(-1) > scene.extent).sum())
+        seen = float((1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64))) >= _SEEN).mean())
+    if large:
+        collect.add("S11", f"{path}: {large} of {len(scene.means)} Gaussians are larger than the scene")
+    if seen < _FEW_SEEN:
+        collect.add("S16", f"{path}: only {100 * seen:.1f} % of the Gaussians can be seen")
+
+
+def _check_motion(scene: Scene, path: Path, collect: Collector) -> None:
+    start = float(scene.track_times[0])
+    end = max(scene.t_max + _AHEAD * (scene.t_max - start), 1.0)
+    last = max(abs(t) * scene.frames_per_unit for t in (start, end))
+    if last > LAST_FRAME:
+        collect.add("S15", f"{path}: expected frames up to {LAST_FRAME:,}, found {last:.4g}")
+    taus = np.linspace(0.0, end - scene.t_max, 17)
+    for group in scene.groups:
+        place = f"{path}: motion group {group.id}"
+        with np.errstate(all="ignore"):
+            quats, moved, spins, _ = models.curve(group.model, taus, _MOST_STEPS)
+        if not (np.isfinite(quats).all() and np.isfinite(moved).all()):
+            collect.add("S13", f"{place}: not finite between t_max and {end:g}")
+        elif float(np.linalg.norm(spins, axis=-1).max()) / scene.frames_per_unit > keyframes.MAX_FRAME_TURN_RAD:
+            collect.add(
+                "S14", f"{place}: turns by more than {np.degrees(keyframes.MAX_FRAME_TURN_RAD):.0f} degrees per frame"
+            )
