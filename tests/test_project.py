@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 import r5dgs_core
-from r5dgs_core import cli
+from r5dgs_core import command_line
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -86,7 +86,7 @@ def test_every_dependency_is_imported_by_the_core():
 def test_the_commands_of_the_readme_exist():
     text = (ROOT / "README.md").read_text()
     commands = set(re.findall(r"^ {4}(?:.*&& )?r5dgs (\w+)", text, re.MULTILINE))
-    known = set(next(a for a in cli.parser()._actions if a.dest == "command").choices)
+    known = set(next(a for a in command_line.parser()._actions if a.dest == "command").choices)
     assert {"demo", "train", "bake", "evaluate"} <= commands <= known
 
 
