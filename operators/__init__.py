@@ -16,6 +16,7 @@ from . import (
     export_ply,
     export_scene,
     extrapolate_until,
+    fit_timeline,
     isolate,
     live_preview,
     load_scene,
@@ -41,6 +42,7 @@ from . import (
 MODULES = (
     load_scene,
     allow_scene_file,
+    fit_timeline,
     set_display,
     select_by_prompt,
     simplify_keys,

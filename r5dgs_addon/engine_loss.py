@@ -18,7 +18,7 @@ _CELL = 0.02  # of the extent of what is loaded
 _DELAY_S = 0.1
 
 _Key = tuple[engine_view.Management, tuple[tuple[int, int], ...]]
-_known: dict[_Key, view_inverse.Loss] = {}
+_known: dict[_Key, view_inverse.Loss | None] = {}  # None if it could not be measured
 
 
 def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
@@ -34,8 +34,6 @@ def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
     if key not in _known:
         displays, weights = _colors(collections)
         found = engine_view.loss(engine_view.of(scene), inverse, displays, weights) if len(weights) else None
-        if found is None:
-            return None
         while len(_known) >= engine_view.KEPT:
             del _known[next(iter(_known))]
         _known[key] = found
@@ -47,10 +45,10 @@ def known(scene: bpy.types.Scene) -> view_inverse.Loss | None:
     collections = _collections(scene)
     if not collections or engine_color.inverse(scene) is None:
         return None
-    found = _known.get(_key(scene, collections))
-    if found is None and not bpy.app.timers.is_registered(_measure_shown):
+    key = _key(scene, collections)
+    if key not in _known and not bpy.app.timers.is_registered(_measure_shown):
         bpy.app.timers.register(_measure_shown, first_interval=_DELAY_S)
-    return found
+    return _known.get(key)
 
 
 def note(loss: view_inverse.Loss) -> str:
@@ -65,8 +63,7 @@ def _measure_shown() -> None:
 
 
 def _collections(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    inside = set(scene.collection.children_recursive)
-    return [collection for collection in objects.scene_collections() if collection in inside]
+    return list(objects.shown(scene))
 
 
 def _key(scene: bpy.types.Scene, collections: list[bpy.types.Collection]) -> _Key:

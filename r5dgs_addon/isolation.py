@@ -28,8 +28,8 @@ def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
         for obj in objects.members(collection, "CLOUD", "ANCHOR"):
             item = (collection, obj.r5dgs.object_id)
             hide = item not in wanted
-            if hide and obj.r5dgs.role == "CLOUD":
-                hidden.add(item)
+            if hide and obj.r5dgs.role == "CLOUD" and (obj in shown_here or obj.library is None):
+                hidden.add(item)  # else it is instanced from a library, and cannot be hidden by itself
             before = (obj.hide_get(view_layer=layer), obj.hide_render)
             after = (hide if obj in shown_here else before[0], _may_render(obj, hide))
             if before != after:

@@ -179,16 +179,47 @@ def scene_collections() -> list[bpy.types.Collection]:
     return [collection for collection in bpy.data.collections if collection.r5dgs.is_scene]
 
 
+def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.Object]]:
+    """Loaded scenes in a Blender scene.
+
+    Returns:
+        The objects that instance each of them; none for a scene whose own objects are in the Blender scene, which come
+        first.
+    """
+    inside = set(scene.collection.children_recursive)
+    loaded = scene_collections()
+    result: dict[bpy.types.Collection, list[bpy.types.Object]] = {one: [] for one in loaded if one in inside}
+    outside = set(loaded) - inside
+    if outside:  # else the objects need not be looked through
+        for obj in scene.collection.all_objects:
+            for collection in _instanced(obj):
+                if collection in outside:
+                    result.setdefault(collection, []).append(obj)
+    return result
+
+
+def _instanced(obj: bpy.types.Object) -> set[bpy.types.Collection]:
+    """Collections that an object instances, also through instances in them."""
+    found: set[bpy.types.Collection] = set()
+    waiting = [obj]
+    while waiting:
+        instancer = waiting.pop()
+        collection = instancer.instance_collection if instancer.instance_type == "COLLECTION" else None
+        if collection is not None and collection not in found:
+            found.update((collection, *collection.children_recursive))
+            waiting.extend(collection.all_objects)
+    return found
+
+
 def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """The loaded scene that the active object belongs to, else the first one in the active Blender scene."""
-    inside = set(context.scene.collection.children_recursive)
-    candidates = [collection for collection in scene_collections() if collection in inside]
+    """The loaded scene that the active object belongs to or instances, else the first one in the Blender scene."""
+    candidates = shown(context.scene)
     active = context.view_layer.objects.active
     if active is not None:
-        for collection in candidates:
-            if active.name in collection.all_objects and collection.all_objects[active.name] == active:
+        for collection, instancers in candidates.items():
+            if active in instancers or collection.all_objects.get(active.name) == active:
                 return collection
-    return candidates[0] if candidates else None
+    return next(iter(candidates), None)
 
 
 def is_own(collection: bpy.types.Collection) -> bool:

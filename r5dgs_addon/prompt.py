@@ -12,7 +12,7 @@ import bpy
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import lookup, scene_file
-from . import phrases, picture, remembered, selection, table, windows
+from . import objects, phrases, picture, remembered, selection, table, windows
 
 HISTORY = 12  # prompts kept
 ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
@@ -112,10 +112,20 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         notes += [f"Nothing matches {' and '.join(map(repr, void))}"] if void else []
     if deleted:
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
+    notes += _instances({match.scene for match in matches})
     matches.sort(key=lambda match: -round(match.score, 6))
     meant = [] if matches or not text.strip() else list(dict.fromkeys(lookup.suggest(known, text)))
     nothing = bool(loaded) and all(lookup.is_nothing(table.labels(each), text) for each in loaded)
     return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)), nothing=nothing)
+
+
+def _instances(found: set[bpy.types.Collection]) -> list[str]:
+    """Notes on scenes that are instanced: their objects are found, and cannot be selected one by one."""
+    instanced = {one: empties for one, empties in objects.shown(bpy.context.scene).items() if one in found and empties}
+    return [
+        f"{one.name} is an instance: Select takes {' and '.join(empty.name for empty in empties)} as a whole"
+        for one, empties in instanced.items()
+    ]
 
 
 def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:

@@ -16,12 +16,11 @@ def obstacle(context: bpy.types.Context) -> str:
 
 
 def scenes(context: bpy.types.Context) -> list[bpy.types.Collection]:
-    """The loaded scenes in the active Blender scene, the active one first."""
+    """The loaded scenes in the active Blender scene, the active one first, instanced ones among them."""
     active = objects.active_collection(context)
     if active is None:
         return []
-    inside = set(context.scene.collection.children_recursive)
-    return [active] + [found for found in objects.scene_collections() if found in inside and found != active]
+    return [active] + [found for found in objects.shown(context.scene) if found != active]
 
 
 def find(context: bpy.types.Context, scene: str, object_id: int) -> Wanted | None:
@@ -67,6 +66,8 @@ def selected(context: bpy.types.Context) -> list[Wanted]:
 def select(context: bpy.types.Context, wanted: list[Wanted], mode: str) -> list[str]:
     """Change the selection by the clouds and anchors of some objects; the first one's anchor becomes active.
 
+    Objects of an instanced scene cannot be selected: what instances it is instead.
+
     Args:
         context: Its view layer's selection is changed.
         wanted: Objects, best first.
@@ -78,10 +79,12 @@ def select(context: bpy.types.Context, wanted: list[Wanted], mode: str) -> list[
     if mode == "SET":
         for chosen in context.selected_objects:
             chosen.select_set(False)
-    missed, best = [], None
+    missed, best, instanced = [], None, objects.shown(context.scene)
     for collection in dict.fromkeys(collection for collection, _ in wanted):
-        for obj in objects.members(collection, "CLOUD", "ANCHOR"):
-            item = (collection, obj.r5dgs.object_id)
+        instancers = instanced.get(collection)
+        for obj in instancers or objects.members(collection, "CLOUD", "ANCHOR"):
+            first = next(one for one in wanted if one[0] == collection)
+            item = first if instancers else (collection, obj.r5dgs.object_id)
             if item not in wanted:
                 continue
             if not obj.visible_get(view_layer=context.view_layer):

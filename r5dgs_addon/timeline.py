@@ -88,13 +88,30 @@ def check_end(name: str, times: Times) -> None:
 
 def fit(scene: bpy.types.Scene, times: Times) -> None:
     """Set a Blender scene's frame range to the scene's times and mark t_max."""
-    scene.frame_start = max(math.floor(times.frame(times.t_start) + 1e-6), 0)
+    scene.frame_start = _start(times)
     fit_end(scene, times)
+    if not _is_marked(scene, times):
+        scene.timeline_markers.new(MARKER, frame=round(times.frame(times.t_max)))
+
+
+def fits(scene: bpy.types.Scene, times: Times) -> bool:
+    """True if `fit` would change nothing."""
+    return (scene.frame_start, scene.frame_end) == (_start(times), _end(scene, times)) and _is_marked(scene, times)
+
+
+def _is_marked(scene: bpy.types.Scene, times: Times) -> bool:
     frame = round(times.frame(times.t_max))
-    if not any(marker.name == MARKER and marker.frame == frame for marker in scene.timeline_markers):
-        scene.timeline_markers.new(MARKER, frame=frame)
+    return any(marker.name == MARKER and marker.frame == frame for marker in scene.timeline_markers)
+
+
+def _start(times: Times) -> int:
+    return max(math.floor(times.frame(times.t_start) + 1e-6), 0)
+
+
+def _end(scene: bpy.types.Scene, times: Times) -> int:
+    return max(math.ceil(times.frame(times.t_end) - 1e-4), scene.frame_start)
 
 
 def fit_end(scene: bpy.types.Scene, times: Times) -> None:
     """Set the last frame of a Blender scene to the last one that has keys."""
-    scene.frame_end = max(math.ceil(times.frame(times.t_end) - 1e-4), scene.frame_start)
+    scene.frame_end = _end(scene, times)

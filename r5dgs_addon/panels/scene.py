@@ -37,6 +37,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
         for note in cloud_points.notes(collection):
             layout.label(text=note, icon="ERROR")
+        if not timeline.fits(context.scene, times):
+            layout.operator("r5dgs.fit_timeline", icon="TIME")
         row = layout.row(align=True)
         for value, name, _ in displays.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value

@@ -153,6 +153,77 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
     assert motions.addon("picture").scene_path(again).resolve() == scene_path.resolve()
 
 
+def linked_as_instance(bpy, blend):
+    """File > Link, which instances the collection by an empty; both."""
+    name = next(iter(names_in(bpy, blend)))
+    bpy.ops.wm.link(filepath=f"{blend}/Collection/{name}", directory=f"{blend}/Collection/", filename=name)
+    (empty,) = (obj for obj in bpy.context.scene.objects if obj.instance_type == "COLLECTION")
+    return empty.instance_collection, empty
+
+
+def names_in(bpy, blend):
+    with bpy.data.libraries.load(str(blend), link=True) as (source, _):
+        return [name for name in source.collections if name.startswith("R5DGS")]
+
+
+def test_a_prompt_finds_an_instanced_scene_and_selects_what_instances_it(blender, library, scene_path):
+    collection, empty = linked_as_instance(blender, library)
+    assert collection.library is not None and collection not in blender.context.scene.collection.children_recursive
+    empty.select_set(False)
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    assert blender.context.selected_objects == [empty] == [blender.context.view_layer.objects.active]
+    session = blender.context.window_manager.r5dgs_words
+    assert [match.name for match in session.matches] == ["mug"]
+    assert [note.name for note in session.notes] == [
+        f"{collection.name} is an instance: Select takes {empty.name} as a whole"
+    ]
+    assert blender.ops.r5dgs.select_object(object_id=1, mode="SUBTRACT") == {"FINISHED"} and not empty.select_get()
+    assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
+    empty.hide_set(True)
+    assert blender.ops.r5dgs.select_by_prompt(text="everything") == {"FINISHED"}
+    assert not blender.context.selected_objects
+
+
+def test_an_instance_in_an_instance_is_found_too(blender, library):
+    collection, empty = linked_as_instance(blender, library)
+    inner = blender.data.collections.new("inner")
+    blender.context.scene.collection.objects.unlink(empty)
+    inner.objects.link(empty)
+    outer = blender.data.objects.new("outer", None)
+    outer.instance_type, outer.instance_collection = "COLLECTION", inner
+    blender.context.scene.collection.objects.link(outer)
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    assert blender.context.selected_objects == [outer]
+
+
+def test_an_override_is_selected_by_words(blender, library):
+    linked = bring(blender, library, link=True)
+    override = linked.override_hierarchy_create(
+        blender.context.scene, blender.context.view_layer, do_fully_editable=True
+    )
+    if linked in blender.context.scene.collection.children[:]:
+        blender.context.scene.collection.children.unlink(linked)
+    blender.context.view_layer.update()
+    assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
+    assert {obj.name for obj in blender.context.selected_objects} == {"mug", "mug anchor"}
+    assert all(override.all_objects.get(obj.name) == obj for obj in blender.context.selected_objects)
+
+
+@pytest.mark.parametrize("how", ["append", "link", "instance"])
+def test_a_scene_that_was_brought_offers_its_frames_and_marker(blender, library, how):
+    if how == "instance":
+        collection, _ = linked_as_instance(blender, library)
+    else:
+        collection = bring(blender, library, link=how == "link")
+    shown = blender.context.scene
+    assert "r5dgs.fit_timeline" in draw_panels(blender) and len(shown.timeline_markers) == 0
+    assert blender.ops.r5dgs.fit_timeline() == {"FINISHED"}
+    times = motions.addon("timeline").of_collection(collection)
+    assert (shown.frame_start, shown.frame_end) == (1, round(times.frame(times.t_end)))
+    assert [marker.frame for marker in shown.timeline_markers] == [round(times.frame(times.t_max))]
+    assert "r5dgs.fit_timeline" not in draw_panels(blender)
+
+
 # --- several scenes, odd places ---
 
 

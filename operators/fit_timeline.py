@@ -1,0 +1,23 @@
+"""Fit Timeline: the frame range and the marker of a scene that was appended or linked."""
+
+import bpy
+
+from ..r5dgs_addon import actions, objects, timeline
+
+
+class R5DGS_OT_fit_timeline(actions.NeedsScene, bpy.types.Operator):
+    """Set the frame range to that of the loaded scene, and mark its last observed time"""
+
+    bl_idname = "r5dgs.fit_timeline"
+    bl_label = "Fit Timeline"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        times = timeline.of_collection(objects.active_collection(context))
+        timeline.fit(context.scene, times)
+        frames = f"{context.scene.frame_start} to {context.scene.frame_end}"
+        self.report({"INFO"}, f"Frames {frames}, observed until {round(times.frame(times.t_max))}")
+        return {"FINISHED"}
+
+
+CLASSES = (R5DGS_OT_fit_timeline,)
