@@ -25,8 +25,8 @@ def check(path: Path) -> list[Finding]:
     collect = Collector(CODES, "S01")
     scene: Scene | None = None
     with collect():
-        scene = scene_file.read(path)
-    if scene is None:
+        scene = scene_file.read(path, collect)
+    if scene is None or collect.findings:  # warnings need numbers that can be relied on
         return collect.findings
     if len(scene.means) == 0:
         collect.add("S02", f"{path}: expected Gaussians, found none")

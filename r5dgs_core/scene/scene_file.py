@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .. import errors, strict_json
+from .. import errors, findings, strict_json
 from . import features, files, meanings, playback, scene_json, validation
 from .archive import Archive, Header, most_content
 from .scene import Scene
@@ -107,11 +107,16 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
     return path
 
 
-def read(path: str | Path) -> Scene:
-    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected."""
+def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
+    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected.
+
+    Args:
+        path: The file.
+        guard: As of `validation.check`.
+    """
     with Archive(Path(path)) as archive:
         scene = _read_zip(archive)
-    validation.check(scene, str(path))
+    validation.check(scene, str(path), guard)
     return scene
 
 

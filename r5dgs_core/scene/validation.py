@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from .. import errors
+from .. import errors, findings
 from ..motion.models import MotionModel
 from . import cameras
 from .meanings import Table
@@ -92,8 +92,14 @@ _DTYPES = {
 }
 
 
-def check(scene: Scene, place: str) -> None:
-    """Raise `SceneFileError` naming ``place``, the member and what was expected where the scene is inconsistent."""
+def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> None:
+    """Raise `SceneFileError` naming ``place``, the member and what was expected where the scene is inconsistent.
+
+    Args:
+        scene: The scene.
+        place: For messages.
+        guard: Entered around each array, object, motion group and camera, for callers that want all faults.
+    """
     for name in (*_DTYPES, *EMBEDDINGS):
         array = getattr(scene, name)
         if array is not None and not isinstance(array, np.ndarray):
@@ -105,32 +111,41 @@ def check(scene: Scene, place: str) -> None:
         if name in arrays and dtype is not None and arrays[name].dtype != dtype:
             _fail(place, name, f"dtype {np.dtype(dtype)}", arrays[name].dtype)
     for name, limit in _LIMITS.items():
-        if name in arrays:
-            low = _LEAST_LOG_SCALE if "log_scales" in name else None
-            _check_range(place, name, arrays[name], limit, low)
-    check_meanings({name: getattr(scene, name) for name in EMBEDDINGS}, scene.lookup, place)
+        with guard():
+            if name in arrays:
+                low = _LEAST_LOG_SCALE if "log_scales" in name else None
+                _check_range(place, name, arrays[name], limit, low)
+    with guard():
+        check_meanings({name: getattr(scene, name) for name in EMBEDDINGS}, scene.lookup, place)
+    with guard():
+        _check_ids(scene, place)
+    for rule in (_check_residuals, _check_units, _check_times):
+        with guard():
+            rule(scene, place)
+    _check_objects(scene, place, guard)
+    object_ids = {item.id for item in scene.objects}
+    for row, group in enumerate(scene.groups):
+        with guard():
+            _check_group(scene, place, row, group, object_ids)
+    for camera in scene.cameras:
+        with guard():
+            try:
+                cameras.check(camera)
+            except (TypeError, ValueError) as error:
+                raise errors.SceneFileError(f"{place}: {error}") from error
+
+
+def _check_ids(scene: Scene, place: str) -> None:
     if (scene.classifier_weight is None) != (scene.classifier_bias is None):
         _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
     groups = len(scene.groups)
     stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
     if len(stray):
         _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
-    _check_residuals(scene, place)
-    _check_units(scene, place)
-    _check_times(scene, place)
-    _check_objects(scene, place)
     if not scene.groups:
         _fail(place, "groups", "group 0, which is pinned", "none")
-    object_ids = {item.id for item in scene.objects}
-    for row, group in enumerate(scene.groups):
-        _check_group(scene, place, row, group, object_ids)
     if scene.world_convention not in cameras.WORLD_TO_BLENDER:
         _fail(place, "world_convention", f"one of {sorted(cameras.WORLD_TO_BLENDER)}", repr(scene.world_convention))
-    for camera in scene.cameras:
-        try:
-            cameras.check(camera)
-        except (TypeError, ValueError) as error:
-            raise errors.SceneFileError(f"{place}: {error}") from error
 
 
 def check_shapes(
@@ -327,13 +342,27 @@ def _check_times(scene: Scene, place: str) -> None:
         )
 
 
-def _check_objects(scene: Scene, place: str) -> None:
-    ids = [item.id for item in scene.objects]
-    if 0 not in ids or ids != sorted(set(ids)) or ids[0] < -1 or ids[-1] > _MOST_ID:
-        _fail(place, "objects", f"increasing ids from -1 or 0 to {_MOST_ID}, with 0, the background", ids[:5])
-    names = [item.name for item in scene.objects]
-    if len(set(names)) != len(names):
-        _fail(place, "objects", "unique names", f"{Counter(names).most_common(1)[0][0]!r} twice")
+def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
+    with guard():
+        ids = [item.id for item in scene.objects]
+        if 0 not in ids or ids != sorted(set(ids)) or ids[0] < -1 or ids[-1] > _MOST_ID:
+            _fail(place, "objects", f"increasing ids from -1 or 0 to {_MOST_ID}, with 0, the background", ids[:5])
+    with guard():
+        names = [item.name for item in scene.objects]
+        if len(set(names)) != len(names):
+            _fail(place, "objects", "unique names", f"{Counter(names).most_common(1)[0][0]!r} twice")
+    with guard():
+        _check_ranges(scene, place)
+    for item in scene.objects:
+        with guard():
+            if not all(0 <= channel <= 1 for channel in item.color):
+                _fail(place, f"object {item.name!r}", "a color of numbers from 0 to 1", item.color)
+            rows = scene.motion_ids[item.start : item.start + item.count]
+            if any(later[2] <= earlier[2] for earlier, later in pairwise(runs(rows))):
+                _fail(place, f"motion_ids of object {item.name!r}", "increasing ids within the object", "another order")
+
+
+def _check_ranges(scene: Scene, place: str) -> None:
     position = 0
     for item in scene.objects:
         if item.start != position or item.count < 0 or item.start + item.count > len(scene.object_ids):
@@ -344,12 +373,6 @@ def _check_objects(scene: Scene, place: str) -> None:
         position += item.count
     if position != len(scene.object_ids):
         _fail(place, "objects", f"ranges that cover {len(scene.object_ids)} Gaussians", f"{position} covered")
-    for item in scene.objects:
-        if not all(0 <= channel <= 1 for channel in item.color):
-            _fail(place, f"object {item.name!r}", "a color of numbers from 0 to 1", item.color)
-        rows = scene.motion_ids[item.start : item.start + item.count]
-        if any(later[2] <= earlier[2] for earlier, later in pairwise(runs(rows))):
-            _fail(place, f"motion_ids of object {item.name!r}", "increasing ids within the object", "another order")
 
 
 def _check_group(scene: Scene, place: str, row: int, group: MotionGroup, object_ids: set[int]) -> None:

@@ -545,3 +545,20 @@ def test_data_sets_and_scenes_are_checked_without_torch(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr + done.stdout
+
+
+def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
+    scene = scenes.make_scene(n=60, objects=3)
+    groups = [dataclasses.replace(g, role="ghost" if g.id in (1, 2) else g.role) for g in scene.groups]
+    means = scene.means.copy()
+    means[3] = np.nan
+    broken = dataclasses.replace(scene, means=means, quats=3 * scene.quats, groups=tuple(groups), frames_per_unit=-1.0)
+    monkeypatch.setattr(scene_file.validation, "check", lambda *_: None)
+    path = scene_file.write(broken, tmp_path / "s.r5dgs", exact=True)
+    monkeypatch.undo()
+    found = check.check(path)
+    assert {finding.code for finding in found} == {"S01"}
+    for part in ("means", "quats", "motion group 1", "motion group 2", "frames_per_unit"):
+        assert any(finding.problem.startswith(part) for finding in found), part
+    with pytest.raises(errors.SceneFileError, match="means"):
+        scene_file.read(path)
