@@ -175,12 +175,13 @@ def run_evaluate(
     from .train import checkpoint
 
     use_threads(threads)
-    scene, dataset = open_target(target, data)
-    assert dataset is not None
     default = target / checkpoint.EVALUATION_FILE if target.is_dir() else target.with_suffix(".evaluation.json")
-    for mode in modes:
-        check_mode(mode, scene, target)
     with make(progress_kind) as progress:
+        progress({"event": "prepare", "text": "the scene"})
+        scene, dataset = open_target(target, data)
+        assert dataset is not None
+        for mode in modes:
+            check_mode(mode, scene, target)
         result = evaluate.evaluate(
             scene,
             dataset,
@@ -304,11 +305,12 @@ def run_report(
     from .report import error_time, report_rows, report_table
 
     use_threads(threads)
-    scene, dataset = open_target(target, data)
-    if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
-        given = " ".join(tasks)
-        raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")
     with make(progress_kind) as progress:
+        progress({"event": "prepare", "text": "the scene"})
+        scene, dataset = open_target(target, data)
+        if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
+            given = " ".join(tasks)
+            raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")
         result = error_time.measure(
             scene,
             dataset,

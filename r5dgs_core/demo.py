@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from . import commands, errors, folder_lock, strict_json
+from .time_left import Phase
 
 NAME = "tabletop"
+AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # what follows training; costs as measured
 
 
 def bundled_data() -> Path:
@@ -58,6 +60,7 @@ def run_demo(
     commands.use_threads(threads)
     go_on = shlex.join(["r5dgs", "demo", "--out", str(out), "--resume"])
     with make(progress_kind) as progress:
+        progress.estimate.add(*AFTER)
         trained = run.train(
             data,
             out,
@@ -72,6 +75,7 @@ def run_demo(
             dataset = datasets.read(data)
             scene = bake.bake(trained, dataset)
             scene_path = scene_file.write(scene, out / "demo.r5dgs")
+            progress.estimate.finish("bake")
             result = evaluate.evaluate(
                 scene,
                 dataset,

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from .time_left import Timed
+
 Event = dict[str, Any]
 Progress = Callable[[Event], None]
 PLAIN_EVERY_S = 10.0
@@ -16,21 +18,21 @@ LABELS = {"step": "train", "identity": "identities"}  # of the bars; others are 
 
 
 @contextmanager
-def make(kind: str) -> Iterator[Progress]:
-    """A function that shows events.
+def make(kind: str) -> Iterator[Timed]:
+    """Yield a function that shows events, counted ones with the seconds that are left.
 
     Args:
         kind: "auto" (rich in a terminal, else a plain line per phase and every ten seconds), "json" or "none".
     """
     if kind == "json":
-        yield lambda event: print(json.dumps(event), flush=True)
+        yield Timed(lambda event: print(json.dumps(event), flush=True))
     elif kind == "none":
-        yield lambda event: None
+        yield Timed(lambda event: None)
     elif sys.stdout.isatty():
         with _rich() as show:
-            yield show
+            yield Timed(show)
     else:
-        yield _plain()
+        yield Timed(_plain())
 
 
 @contextmanager

@@ -17,11 +17,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Which rooms of the core a room may import, itself and `GROUND` aside: motion <- scene <- (data, raster, model) <-
 # train; report stands on baked scenes, so it needs no trainer; the command line may use everything.
-GROUND = {"errors", "findings", "input_paths", "strict_json"}  # may be imported by all
+GROUND = {"errors", "findings", "input_paths", "strict_json", "time_left"}  # may be imported by all
 ALLOWED = {
     "errors": set(),
     "findings": set(),
     "strict_json": set(),
+    "time_left": set(),
     "input_paths": set(),
     "exit_status": set(),
     "user_settings": set(),

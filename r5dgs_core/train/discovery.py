@@ -33,6 +33,7 @@ GAIN = 2.0  # by how much worse they are drawn where it rests, dB
 OPAQUE = 0.3  # fainter Gaussians do not say what moves
 TOLERANCE = 0.02  # distance from a rigid motion that points which hardly travel may have, normalised units
 SPECK = 0.1  # smaller pieces of a mask are dropped, as a share of its largest piece
+NAME = "discovery"  # of its events
 CAP = 12000  # Gaussians of the short run
 
 
@@ -44,7 +45,7 @@ def find(
     Args:
         dataset: The data set.
         config: Configuration of the run that the masks are for.
-        progress: Called with an event when it begins and when it ends.
+        progress: Called with an event when it begins, now and then, and when it ends.
 
     Returns:
         Ids per pixel, 0 for what rests [H, W], for each training view; None where `needs.discovery`
@@ -62,6 +63,9 @@ def find(
         return None
     while not trainer.done:
         trainer.step()
+        if trainer.iteration % config.train.log_every == 0 or trainer.done:
+            total = trainer.config.train.iterations
+            progress({"event": NAME, "done": trainer.iteration, "total": total, "unit": "steps"})
     labels = parts(trainer, config)
     count = int(labels.max(initial=-1)) + 1
     progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})

@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 MARGIN = 2  # pixels around a mask that count to its object: what bends crosses its edge
 HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
 MIN_PIXELS = 50  # on these together, below which nothing is said of a body
+TRIAL = "trial"  # name of its events
 SEED_STEP = 2  # the trial draws from a generator of its own
 PREFIX = "residual."
 GAINS = checkpoint_content.RESIDUAL_GAINS
@@ -102,10 +103,13 @@ def _try(trainer: Trainer) -> tuple[ResidualField, np.ndarray]:
         return field, unknown
     state = trainer.state()
     trainer.restore(dataclasses.replace(state, tensors=state.tensors | tensors_of(field)))
-    trainer.queue = [used[k % len(used)] for k in range(trial_steps(config))]
+    steps = trial_steps(config)
+    trainer.queue = [used[k % len(used)] for k in range(steps)]
     try:
-        for _ in range(trial_steps(config)):
+        for step in range(1, steps + 1):
             trainer.step()
+            if step % config.train.log_every == 0 or step == steps:
+                trainer.progress({"event": TRIAL, "done": step, "total": steps, "unit": "steps"})
     except TrainingError as error:
         log.warning("residuals cannot be tried, all bodies stay rigid: %s", error)
         return field, unknown

@@ -20,6 +20,7 @@ from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..raster import warm_up
 from ..scene import files
+from ..time_left import Phase, Timed
 from . import (
     checkpoint,
     checkpoint_content,
@@ -30,6 +31,7 @@ from . import (
     needs,
     probing,
     representation,
+    residual,
     stopping,
 )
 from .config import Config
@@ -40,6 +42,9 @@ from .views import TrainView
 log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
+# Costs of steps relative to those of training, as measured on the kitchen: what the estimate of the time begins with.
+DISCOVERY_COST = 1.9
+TRIAL_COST = 2.5  # with the comparison of the bodies after it
 
 
 def train(
@@ -61,7 +66,8 @@ def train(
         resume: Go on from the last checkpoint; where training is finished, nothing is done.
         overwrite: Begin again where the folder holds a run; its files stay until the first step can be taken.
         go_on: The command that resumes this run, for messages; by default that of ``r5dgs train``.
-        progress: Called with a dictionary per event (docs/training.md).
+        progress: Called with a dictionary per event (docs/training.md). Of a `Timed`, the estimate of the time left
+            also counts the phases that the caller has added.
 
     Returns:
         The run.
@@ -77,7 +83,8 @@ def train(
             if stack.enter_context(folder_lock.hold(folder)):  # what is half-written is of processes that are dead
                 checkpoint.remove_leftovers(folder)
 
-        return _train(dataset_root, folder, config, resume, overwrite, go_on, progress or (lambda event: None), claim)
+        timed = progress if isinstance(progress, Timed) else Timed(progress or (lambda event: None))
+        return _train(dataset_root, folder, config, resume, overwrite, go_on, timed, claim)
 
 
 def _train(
@@ -87,7 +94,7 @@ def _train(
     resume: bool,
     overwrite: bool,
     go_on: str | None,
-    progress: Progress,
+    progress: Timed,
     claim: Callable[[], None],
 ) -> checkpoint.Run:
     """As `train`; ``claim`` locks the folder."""
@@ -134,8 +141,9 @@ def _train(
     with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
         warm_up()
+        found = _found_masks(dataset, run.config, state, progress)
         progress({"event": "prepare", "text": "images, objects, background"})
-        trainer = Trainer(dataset, run.config, _found_masks(dataset, run.config, state, progress))
+        trainer = Trainer(dataset, run.config, found, progress)
         probe = _probe(trainer)
     if replaces:
         run = checkpoint.create_run(folder, dataset, config)
@@ -144,6 +152,7 @@ def _train(
         began -= state.seconds
     _clean_up(folder, trainer.iteration)
     pictures = curves.Curves(run.folder)
+    _plan(trainer, progress)
     _optimise(trainer, run, began, go_on, progress, probe, pictures)
     with stopping.at_once(f"stopped after the last step, with labels still to be made; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
@@ -153,7 +162,7 @@ def _train(
 
 
 def _found_masks(
-    dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: Progress
+    dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: Timed
 ) -> list[np.ndarray] | None:
     """Masks of what moves where the data set has none: those that the run began with, or found now."""
     if state is None:
@@ -161,9 +170,24 @@ def _found_masks(
             return None
         from . import discovery  # with the networks of its short run, which others do without
 
+        progress.estimate.add(Phase(discovery.NAME, config.discovery.iterations, DISCOVERY_COST))
+        progress.estimate.add(Phase("step", config.train.iterations))
         return discovery.find(dataset, config, progress)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
     return mask_stack.unpack(state.tensors[mask_stack.NAME], sizes) if mask_stack.NAME in state.tensors else None
+
+
+def _plan(trainer: Trainer, progress: Timed) -> None:
+    """Add what training does from here on to the estimate of the time that is left."""
+    config, estimate = trainer.config, progress.estimate
+    estimate.finish("discovery")  # `discovery.NAME`, without its networks
+    estimate.add(Phase("step", config.train.iterations))
+    estimate.at("step", trainer.iteration)
+    decision = residual.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
+    tried = trainer.motion.name == representation.TRACKS and len(trainer.times) > 1
+    if tried and decision is not None and decision > trainer.iteration:
+        estimate.add(Phase(residual.TRIAL, residual.trial_steps(config), TRIAL_COST))
+    estimate.add(Phase("identity", _identity_steps(trainer)))
 
 
 def _probe(trainer: Trainer) -> probing.Probe | None:
@@ -179,35 +203,30 @@ def _optimise(
     run: checkpoint.Run,
     began: float,
     go_on: str,
-    progress: Progress,
+    progress: Timed,
     probe: probing.Probe | None,
     pictures: curves.Curves,
 ) -> None:
     """Take all steps that are left, with a line in the log and a checkpoint now and then."""
     section = trainer.config.train
-    last, last_time = trainer.iteration, time.monotonic()
     path = run.folder / checkpoint.LOG_FILE
-    after = _identity_steps(trainer)
     with stopping.collected() as asked, _open_log(path) as stream:
         while not trainer.done:
             trainer.step()
             look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
             if trainer.iteration % section.log_every == 0 or trainer.done or look:
-                now = time.monotonic()
-                rate = (now - last_time) / max(1, trainer.iteration - last)
                 event = {
                     "event": "step",
                     "iteration": trainer.iteration,
                     "loss": trainer.running_loss,
                     "gaussians": len(trainer.gaussians),
-                    "seconds": now - began,
-                    "seconds_left": rate * (section.iterations - trainer.iteration + after),
+                    "seconds": time.monotonic() - began,
                 }
+                event = progress.timed(event)
                 if look and probe is not None:
                     event["val_psnr"] = probe.psnr()
                 _append(path, stream, event)
                 progress(event)
-                last, last_time = trainer.iteration, time.monotonic()
             stop = bool(asked)
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
                 _save(trainer, run, began, finished=False)
@@ -265,7 +284,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     return event if isinstance(event, dict) and isinstance(event.get("iteration"), int) else None
 
 
-def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progress) -> None:
+def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed) -> None:
     """Labels and identity encodings on the finished geometry, then the last checkpoint."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
     group_classes = trainer.motion.group_classes(trainer.motion.tensors())
@@ -280,16 +299,14 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Progr
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})
         votes = identity.votes(trainer.views, pose, classes, len(fallback))
         extra["labels"] = identity.elect(votes, fallback)
-        steps, started = _identity_steps(trainer), time.monotonic()
+        steps = _identity_steps(trainer)
         if trainer.identity is not None:
             extra |= trainer.identity.outcome(trainer.gaussians)
         elif steps > 0:
 
             def report(step: int, loss: float) -> None:
                 if step % trainer.config.train.log_every == 0 or step == steps:
-                    left = (time.monotonic() - started) / step * (steps - step)
-                    event = {"event": "identity", "iteration": step, "iterations": steps, "loss": loss}
-                    progress({**event, "seconds_left": left})
+                    progress({"event": "identity", "iteration": step, "iterations": steps, "loss": loss})
 
             # A generator of its own: a run resumed here draws what an unbroken one draws.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)

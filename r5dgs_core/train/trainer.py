@@ -10,7 +10,8 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -59,12 +60,20 @@ class Trainer:
         dataset: The data set.
         config: The run's configuration.
         found: Masks that were found for the training views where the data set has none; they serve the start alone.
+        progress: Called with an event while a step takes long, as the one that tries residuals.
 
     Raises:
         DatasetError: The training split is empty or cannot be read.
     """
 
-    def __init__(self, dataset: Dataset, config: Config, found: Sequence[np.ndarray] | None = None):
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: Config,
+        found: Sequence[np.ndarray] | None = None,
+        progress: Callable[[dict[str, Any]], None] = lambda event: None,
+    ):
+        self.progress = progress
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
         self.config = config = needs.resolve(config)

@@ -21,6 +21,7 @@ from r5dgs_core.exit_status import ExitStatus
 from r5dgs_core.raster import compile as compilation
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import files, modes, scene_file
+from r5dgs_core.time_left import Timed
 from r5dgs_core.train import checkpoint, presets
 from tests import datasets as tiny_datasets
 from tests.command_line import complaint
@@ -242,7 +243,10 @@ def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, t
 def test_evaluate_counts_its_images(made, tmp_path, capsys):
     assert cli.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json"), "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(e["event"], e["done"], e["total"]) for e in events] == [("evaluate", k, 6) for k in range(1, 7)]
+    first, *counted = events
+    assert first == {"event": "prepare", "text": "the scene"}
+    assert [(e["event"], e["done"], e["total"]) for e in counted] == [("evaluate", k, 6) for k in range(1, 7)]
+    assert all(e["seconds_left"] >= 0 for e in counted[1:]) and counted[-1]["seconds_left"] == 0
 
 
 @pytest.fixture
@@ -259,7 +263,13 @@ def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made,
         assert cli.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
         events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
         kinds = list(dict.fromkeys(event["event"] for event in events))
-        assert kinds == ["start", "prepare", "step", "identity", "trained", "bake", "evaluate", "sheet", "written"]
+        assert kinds == [
+            *("start", "prepare", "trial", "step", "identity", "trained", "bake", "evaluate", "sheet", "written"),
+        ]
+        counted = [event for event in events if "done" in event or "loss" in event]
+        assert all(event["seconds_left"] >= 0 for event in counted[1:]), "one estimate over all phases"
+        assert all(event["seconds_left"] > 0 for event in counted[1:] if event["event"] in ("step", "identity"))
+        assert counted[-1]["event"] == "evaluate" and counted[-1]["seconds_left"] < 5
         assert all((out / name).stat().st_size > 0 for name in ("demo.r5dgs", "evaluation.json", "contact_sheet.png"))
     line = complaint(capsys, *small_demo, "--out", out, "--resume", status=ExitStatus.USAGE)
     assert "leave out --preset, --config, --set, --iterations" in line
@@ -274,7 +284,7 @@ def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, cap
 
     @contextlib.contextmanager
     def stopping(kind):
-        yield lambda event: signal.raise_signal(signal.SIGINT) if moment.items() <= event.items() else None
+        yield Timed(lambda event: signal.raise_signal(signal.SIGINT) if moment.items() <= event.items() else None)
 
     with monkeypatch.context() as patch:
         patch.setattr(progress, "make", stopping)
