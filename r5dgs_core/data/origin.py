@@ -11,9 +11,10 @@ import math
 import numpy as np
 
 from .. import errors
+from ..scene import cameras
 
 FAR = 256.0  # distance from the world's origin, in spreads of the cameras, up to which that is the origin
-SMALLEST, LARGEST = 1e-25, 1e25  # units between cameras; beyond them products of lengths leave float32
+SMALLEST, LARGEST = 1e-25, 1e13  # units between cameras; scenes hold coordinates up to `cameras.FARTHEST`
 RESOLUTION = 1e-6  # of the spread; float64 has to resolve that where the cameras are
 LONE = 4.0  # spread of cameras that all stand at one place, as `train.normalization` takes it
 
@@ -35,15 +36,20 @@ def find(
         DatasetError: The cameras are so far away that float64 cannot tell where they stand.
     """
     largest = float(np.abs(centers).max())
+    if largest > cameras.FARTHEST:
+        raise errors.DatasetError(
+            f"{place}: expected cameras within {cameras.FARTHEST:g} units of the world's origin, found {largest:.3g}. "
+            "Remedy: subtract a constant from all positions in the camera files, or scale all positions"
+        )
     middle = np.median(centers, axis=0)
     away = float(np.abs(middle).max())
-    distances = np.linalg.norm(centers - middle, axis=1) if largest <= LARGEST else np.full(1, np.inf)
+    distances = np.linalg.norm(centers - middle, axis=1)
     distances = distances[distances > 4 * np.spacing(away)]
     spread = float(np.median(distances)) if len(distances) else LONE
     if not SMALLEST <= spread <= LARGEST:
         raise errors.DatasetError(
-            f"{place}: expected cameras that stand {SMALLEST:g} to {LARGEST:g} units apart, found {spread:.3g} units "
-            f"(positions up to {largest:.3g}). Remedy: scale all positions in the camera files to another unit"
+            f"{place}: expected cameras that stand {SMALLEST:g} to {LARGEST:g} units apart, found {spread:.3g}. "
+            "Remedy: scale all positions in the camera files to another unit"
         )
     if away <= FAR * spread:
         return np.zeros(3)

@@ -117,6 +117,7 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
     with Archive(Path(path)) as archive:
         scene = _read_zip(archive)
     validation.check(scene, str(path), guard)
+    _warn_of_lost_detail(scene, path)
     return scene
 
 
@@ -185,6 +186,23 @@ def info(scene: Scene) -> dict[str, Any]:
         "lookup": None if scene.lookup is None else f"{scene.lookup.encoder.kind} {scene.lookup.encoder.name}",
         "needs": list(scene.needs),
     }
+
+
+def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
+    """Warn of a scene that was baked far from its world's origin, without the feature `origin`."""
+    some = slice(None, None, max(1, len(scene.means) // 1000))
+    if len(scene.means) < 2:
+        return
+    step = float(np.spacing(np.abs(np.median(scene.means[some], axis=0)).max()))
+    size = float(np.exp(np.median(scene.log_scales[some].astype(np.float64))))
+    if step > 0.2 * size:
+        _log.warning(
+            "%s: lies so far from the origin that its Gaussians of %.2g units are placed to %.2g units only. "
+            "Bake its run again with this release for sharp pictures",
+            path,
+            size,
+            step,
+        )
 
 
 def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:

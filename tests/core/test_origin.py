@@ -55,7 +55,9 @@ def test_far_scenes_get_an_origin_among_their_cameras_that_is_short_to_write(sca
 def test_cameras_that_float64_cannot_tell_apart_are_refused(tmp_path):
     with pytest.raises(errors.DatasetError, match=r"data: .*not even 64-bit numbers.*subtract a constant"):
         datasets.read(made(tmp_path / "data", 1.0, (1e12, 0.0, 0.0)).root)
-    for scale in (1e-40, 1e40, 1e300):
+    with pytest.raises(errors.DatasetError, match="within 1e"):
+        origin.find(1e10 * RING + 2e15, "here")
+    for scale in (1e-40, 1e14, 1e40, 1e300):
         with pytest.raises(errors.DatasetError, match="scale all positions"):
             origin.find(scale * RING, "here")
 
@@ -130,7 +132,7 @@ def test_training_gives_the_same_pictures_in_any_world(tiny, tmp_path, scale, sh
             assert psnr(one, other) > 40  # rounding decides a few draws otherwise
 
 
-def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_in(baked, tiny, tmp_path):
+def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_in(baked, tiny, tmp_path, caplog):
     data = made(tmp_path / "data", 1.0, 0.2 * FAR)
     older = dataclasses.replace(
         baked,
@@ -142,10 +144,17 @@ def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_i
     with zipfile.ZipFile(path) as archive:
         assert json.loads(archive.read("scene.json"))["format_version"] == 1
     scene, found = commands.open_target(path, data.root)
+    assert "Bake its run again" in caplog.text
     assert found is not None and not found.origin.any()
     view = found.val[0]
     expected = drawn(baked, datasets.read(tiny.root).val[:1])[0]
     assert psnr(drawn(scene, [view])[0], expected) > 20
+
+
+def test_scenes_near_the_origin_are_read_without_a_warning(baked, tmp_path, caplog):
+    scene_file.read(scene_file.write(baked, tmp_path / "near.r5dgs"))
+    scene_file.read(scene_file.write(dataclasses.replace(baked, origin=FAR), tmp_path / "far.r5dgs"))
+    assert not caplog.records
 
 
 def test_info_prints_an_origin_where_there_is_one(baked):
