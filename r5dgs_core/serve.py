@@ -136,10 +136,7 @@ class Server:
         Raises:
             R5dgsError: The request asks for what cannot be had.
         """
-        command = request.get("command")
-        if command not in self._commands:
-            raise errors.ConfigError(f"worker: unknown command {command!r}; known are {', '.join(self._commands)}")
-        return self._commands[command](request)
+        return self._commands[asked.command_of(request)](request)
 
     def _hello(self, _: dict[str, Any]) -> Answer:
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
@@ -195,7 +192,9 @@ class Server:
         camera = asked.camera_of(asked.need(request, "camera", dict))
         moved = "instances" in request
         want = asked.wanted(request, ("alpha", "depth", "owners" if moved else "ids"))
-        near = asked.near_of(request)
+        near, coverage = asked.near_of(request), asked.coverage_of(request)
+        t = 0.0 if moved else asked.time_of(request)
+        asked.check_size(camera, 0, 0 if coverage is None else coverage[1])
         scene_render = self._rasterizer()
         started = time.perf_counter()
         instances = []
@@ -203,25 +202,36 @@ class Server:
             entries = asked.need(request, "instances", list)
             scenes, places = self._points.extend(scenes, serve_points.wanted(entries, self._numbers))
             instances = [serve_points.instance_of(entry, self._numbers, places) for entry in entries]
-            output, ms_motion, count = self._instances(request, instances, scenes, camera, near)
-        else:
-            output, ms_motion, count = self._playback(request, scenes, camera, near)
+            asked.check_rows(instances, [len(scene.means) for scene in scenes])
+            shown = sum(instance.count for instance in instances)
+            asked.check_size(camera, shown, 0 if coverage is None else coverage[1])
+        try:
+            if moved:
+                output, ms_motion, count = self._instances(request, instances, scenes, camera, near)
+            else:
+                output, ms_motion, count = self._playback(request, t, scenes, camera, near)
+            covered = {} if coverage is None else self._coverage(*coverage, instances, camera, near)
+        except (ValueError, OverflowError, FloatingPointError) as error:  # of Gaussians that are out of range there
+            raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
         for name in want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
-        if moved and request.get("coverage") is not None:
-            arrays |= self._coverage(request, instances, camera, near)
+        arrays |= covered
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}
         return result, arrays
 
     def _coverage(
-        self, request: dict[str, Any], instances: list[scene_render.Instance], camera: Camera, near: float | None
+        self,
+        groups: list[int],
+        ranks: int,
+        instances: list[scene_render.Instance],
+        camera: Camera,
+        near: float | None,
     ) -> dict[str, np.ndarray]:
         """Which groups of instances share each pixel, and how much of it each has."""
         assert self._stage is not None  # the picture was drawn just now
-        groups, ranks = asked.coverage_of(request)
         found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
         return {"coverage_groups": found, "coverage": shares}
 
@@ -244,23 +254,18 @@ class Server:
     ):
         from .raster import stage
 
-        sky = request.get("sky")
-        if sky is not None:
-            if not isinstance(sky, dict):
-                raise errors.ConfigError(f"worker: 'sky' has to be null or scene and matrix, found {sky!r}")
-            sky = stage.Sky(
-                asked.number_of(sky, self._numbers), asked.matrix_of(sky.get("matrix"), 4, "the matrix of the sky")
-            )
+        behind = asked.sky_of(request, self._numbers)
+        sky = None if behind is None else stage.Sky(*behind)
         if self._stage is None or self._staged is not scenes:
             self._stage, self._staged = stage.Stage(scenes), scenes
         output = self._stage.render(instances, camera, sky=sky, near=near, distance=asked.distance_of(request))
         return output, self._stage.ms_motion, sum(instance.count for instance in instances)
 
-    def _playback(self, request: dict[str, Any], scenes: list[Scene], camera: Camera, near: float | None):
+    def _playback(self, request: dict[str, Any], t: float, scenes: list[Scene], camera: Camera, near: float | None):
         from .raster import RasterSettings, scene_render
 
         started = time.perf_counter()
-        number, t = asked.number_of(request, self._numbers), float(asked.need(request, "t", (int, float)))
+        number = asked.number_of(request, self._numbers)
         scene = scenes[number]
         if number not in self._players:
             self._players[number] = playback.Player(scene)
@@ -308,9 +313,7 @@ class Server:
 
     def _embed(self, request: dict[str, Any]) -> Answer:
         """``texts``: embeddings of phrases by an ``encoder`` as in ``query``, and what that is."""
-        texts = asked.need(request, "texts", list)
-        if not all(isinstance(text, str) for text in texts):
-            raise errors.ConfigError(f"worker: 'embed' needs texts, found {texts!r}")
+        texts = asked.texts_of(request)
         encoder = self._opened(request)
         card = encoder.card
         known = {"kind": card.kind, "name": card.name, "digest": card.digest, "dimension": card.dimension}
@@ -318,7 +321,7 @@ class Server:
 
     def _opened(self, request: dict[str, Any]) -> encoders.Encoder:
         """The encoder that is asked for; the last one stays open."""
-        where = asked.need(request, "encoder", str)
+        where = asked.path_of(request.get("encoder"), "encoder")
         if self._encoder is None or self._encoder[0] != where:
             self._encoder = None  # its memory first
             self._encoder = where, encoders.open_encoder(where)
@@ -370,26 +373,25 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
 
     warming = Warming(tell) if warm else None
     server = Server(warming)
-    for line in requests:
-        if not line.strip():
-            continue
+    while True:
         number = None
         try:
-            request = json.loads(line)
-            if not isinstance(request, dict):
-                raise errors.ConfigError("worker: a request has to be a JSON object")
-            number = request.get("id")
-            if request.get("command") == "shutdown":
+            line = asked.read_line(requests)
+            if not line:
+                break
+            if not line.strip():
+                continue
+            request = asked.parse(line)
+            number = asked.id_of(request)
+            if asked.command_of(request) == "shutdown":
                 send({"id": number, "ok": True, "result": {}})
                 break
             result, arrays = server.answer(request)
         except errors.R5dgsError as error:
             send(_failure(number, type(error).__name__, str(error)))
-        except json.JSONDecodeError as error:
-            send(_failure(number, "ConfigError", f"worker: a request is not JSON: {error}"))
         except Exception as error:  # the worker outlives a failed request; the traceback goes to its log
             traceback.print_exc()
-            send(_failure(number, type(error).__name__, str(error)))
+            send(_failure(number, "BackendError", f"worker: the request failed: {type(error).__name__}: {error}"))
         else:
             send({"id": number, "ok": True, "result": result}, arrays)
         if warming is not None:

@@ -18,7 +18,13 @@ _MOST_DIGITS = 19  # of integers of 64 bits; Python limits what it converts to 4
 
 
 def parse(
-    data: bytes, place: str, kind: type[R5dgsError], remedy: str = "is it truncated?", *, memory: int = MOST_MEMORY
+    data: bytes,
+    place: str,
+    kind: type[R5dgsError],
+    remedy: str = "is it truncated?",
+    *,
+    memory: int = MOST_MEMORY,
+    size: int = MOST_BYTES,
 ) -> Any:
     """Parse JSON.
 
@@ -27,7 +33,8 @@ def parse(
         place: Start of messages: the file, or the member of a file.
         kind: Class of the error.
         remedy: End of messages about damage.
-        memory: Limit of the memory that the result may take, bytes.
+        memory: Limit of the memory that the result may take beside its text, bytes.
+        size: Limit of the length of ``data``, bytes.
 
     Returns:
         Dictionaries, lists, strings, integers of 64 bits, finite floats, booleans and None.
@@ -37,9 +44,9 @@ def parse(
             an object, NaN, infinity, a number out of range, or half of a surrogate pair.
     """
     needed = _memory(data)
-    if len(data) > MOST_BYTES or needed > memory:
+    if len(data) > size or needed > memory:
         raise kind(
-            f"{place}: expected JSON of at most {MOST_BYTES >> 20} MiB that needs {memory >> 20} MiB of memory, found "
+            f"{place}: expected JSON of at most {size >> 20} MiB that needs {memory >> 20} MiB of memory, found "
             f"{len(data) / 2**20:.1f} MiB that need about {needed / 2**20:.0f} MiB"
         )
     try:

@@ -168,7 +168,7 @@ def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, 
         ({"command": "render", "camera": CAMERA_JSON, "instances": [ROWS | {"t": "now"}]}, "ConfigError", "time"),
         ({"command": "render", "camera": CAMERA_JSON, "instances": [], "distance": "far"}, "ConfigError", "'distance'"),
         ({"command": "load", "paths": [3]}, "ConfigError", "paths"),
-        ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "'paths'"),
+        ({"command": "load", "path": "/nowhere/at all.r5dgs"}, "ConfigError", "paths"),
     ],
 )
 def test_impossible_requests_are_answered_by_name_and_the_worker_goes_on(path, request_, kind, message):
@@ -182,7 +182,7 @@ def test_rendering_without_a_scene_and_lines_that_are_no_requests_are_errors():
         {"command": "render", "camera": CAMERA_JSON, "t": 0.0}, b"not json", b"[1, 2]"
     )
     assert "no scene is loaded" in first["error"]["message"]
-    assert "not JSON" in second["error"]["message"] and "JSON object" in third["error"]["message"]
+    assert "not valid JSON" in second["error"]["message"] and "JSON object" in third["error"]["message"]
 
 
 def test_a_failed_load_forgets_the_scene_before(path, tmp_path):
