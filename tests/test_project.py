@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -102,11 +103,56 @@ def test_the_python_of_the_readme_runs():
         assert torch.isfinite(gradient).all() and gradient.abs().max() > 0
 
 
-def test_links_between_documents_lead_somewhere():
-    documents = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    for document in documents:
-        for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text()):
-            assert (document.parent / target).exists(), f"{document.relative_to(ROOT)}: {target}"
+def anchors_of(text: str) -> set[str]:
+    """Anchors of the headings of a page, as GitHub makes them."""
+    found: set[str] = set()
+    for heading in re.findall(r"^#+ +(.*?) *$", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S), re.MULTILINE):
+        shown = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", shown.lower()).replace(" ", "-")
+        found.add(next(name for name in (slug, *(f"{slug}-{k}" for k in range(1, 99))) if name not in found))
+    return found
+
+
+def broken_links(text: str, document: Path) -> list[str]:
+    """Targets of links in a page that lead to no file, or to no heading of a page."""
+    broken = []
+    for target in re.findall(r"\]\(<?([^)>\s]+)>?\)", text):
+        path, _, anchor = target.partition("#")
+        if re.match(r"[a-z]+:", target):  # elsewhere
+            continue
+        page = document.parent / path
+        found = page.exists() and (not anchor or anchor in anchors_of(page.read_text() if path else text))
+        if not found:
+            broken.append(target)
+    return broken
+
+
+def test_links_between_documents_lead_to_files_and_headings():
+    documents = [path for folder in (".", "docs", "examples") for path in sorted((ROOT / folder).glob("*.md"))]
+    assert len(documents) > 15
+    broken = {str(page.relative_to(ROOT)): broken_links(page.read_text(), page) for page in documents}
+    assert not any(broken.values()), {page: links for page, links in broken.items() if links}
+    text = "# A & B\n\n## A (b), c-d\n\n[x](#a--b) [x](#a-b-c-d) [x](#nowhere) [x](nothing.md) [x](README.md#start)"
+    assert broken_links(text, ROOT / "x.md") == ["#nowhere", "nothing.md"]
+
+
+def test_every_page_is_listed_in_the_readme():
+    text = (ROOT / "README.md").read_text()
+    rows = re.findall(r"^\| \[(docs/[^\]]*)\]", text, re.MULTILINE)
+    assert len(rows) == len(set(rows)), "each page has one row"
+    assert all(f"](docs/{page.name})" in text for page in (ROOT / "docs").glob("*.md"))
+
+
+def test_the_citation_has_the_version_and_the_paper():
+    text = (ROOT / "CITATION.cff").read_text()
+    manifest = tomllib.loads((ROOT / "blender_manifest.toml").read_text())
+    assert text.startswith("cff-version: 1.2.0\n") and f"\nversion: {manifest['version']}\n" in text
+    named = re.findall(r"family-names: (\w+)\n +given-names: (\w+)", text)
+    title = re.search(r'title: "(R5DGS: [^"]*)"', text)
+    assert title is not None and named
+    for page in ("README.md", "docs/method.md"):
+        plain = " ".join((ROOT / page).read_text().split())
+        assert title[1] in plain and all(f"{given} {family}" in plain for family, given in named), page
 
 
 def tracked_text() -> dict[str, str]:
@@ -150,3 +196,12 @@ def test_every_function_of_the_method_document_exists():
 
 def is_module(parts: list[str]) -> bool:
     return (ROOT / "r5dgs_core" / Path(*parts)).with_suffix(".py").is_file()
+
+
+def test_the_first_five_minutes_in_blender_name_objects_of_the_demo():
+    text = (ROOT / "docs" / "blender.md").read_text().partition("## First five minutes")[2].partition("\n## ")[0]
+    names = json.loads((ROOT / "examples" / "tabletop" / "objects.json").read_text())
+    objects = [entry["name"] if isinstance(entry, dict) else entry for entry in names.values()]
+    prompt = re.search(r"Type `([^`]*)` into \*\*Select by Prompt", text)
+    assert prompt is not None and objects and all(name in text for name in objects)
+    assert all(phrase.removeprefix("the ") in objects for phrase in prompt[1].split(" and "))
