@@ -29,7 +29,7 @@ speed (the first time it compiles, 10 s)"""
         self._began = time.monotonic()
         worker.stop()
         preferences.forget()
-        job = worker.submit(KEY, [("testing", "check", {})])
+        job = worker.submit(KEY, [("measuring its speed", "check", {})])
         worker_check.begin(job)
         return job
 

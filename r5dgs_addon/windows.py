@@ -1,6 +1,10 @@
 """What Blender's windows are told: words in the status bar, and that an area is to be drawn anew."""
 
+import textwrap
+
 import bpy
+
+_LETTER, _MARGIN, _WIDTH = 8, 70, 400  # pixels of a letter, beside a text, and of a region if there is none
 
 
 def say(context: bpy.types.Context, text: str | None) -> None:
@@ -15,3 +19,13 @@ def redraw(*kinds: str) -> None:
         for area in window.screen.areas:
             if not kinds or area.type in kinds:
                 area.tag_redraw()
+
+
+def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
+    """Draw a text in lines that fit the region; Blender cuts the middle out of a longer label."""
+    width = context.region.width if context.region is not None else _WIDTH
+    scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
+    letters = max(int((width / scale - _MARGIN) / _LETTER), 20)
+    column = layout.column(align=True)
+    for number, line in enumerate(textwrap.wrap(text, letters)):
+        column.label(text=line, icon="BLANK1" if number else icon)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import TYPE_CHECKING
 
 import bpy
@@ -11,8 +10,6 @@ from . import windows
 
 if TYPE_CHECKING:  # the worker needs the preferences, and those need this module
     from . import worker
-
-_LETTER, _WIDTH = 8, 400  # pixels of a letter, and of a region if there is none
 
 _job: worker.Job | None = None
 _result: tuple[str, str] = ("", "NONE")  # text and icon
@@ -43,9 +40,4 @@ def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     text, icon = _result
     if _job is not None and not _job.done:
         text, icon = f"Testing: {_job.doing}, {_job.seconds:.0f} s; Esc stops", "SORTTIME"
-    width = context.region.width if context.region is not None else _WIDTH
-    scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
-    letters = max(int(width / (_LETTER * scale)), 20)
-    column = layout.column(align=True)
-    for number, line in enumerate(textwrap.wrap(text, letters)):
-        column.label(text=line, icon="BLANK1" if number else icon)
+    windows.wrapped(layout, context, text, icon)

@@ -3,7 +3,7 @@
 import bpy
 
 from ...r5dgs_core import errors
-from .. import motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, objects
+from .. import motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, objects, windows
 from . import sidebar
 
 
@@ -84,7 +84,7 @@ def _scene(layout, collection) -> None:
     text = "Exact Mode Is On" if exact.enabled else "Exact Mode"
     column.operator("r5dgs.exact_mode", text=text, icon="MOD_SIMPLEDEFORM", depress=exact.enabled)
     if exact.problem:
-        layout.label(text=exact.problem, icon="ERROR")
+        windows.wrapped(layout, bpy.context, exact.problem, "ERROR")
 
 
 CLASSES = (R5DGS_PT_motion,)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import isolation, objects, prompt, selection, table
+from .. import isolation, objects, prompt, selection, table, windows
 from . import sidebar
 
 
@@ -67,7 +67,8 @@ def _draw_answers(box, session, names):
         for item in session.meant:
             row.operator("r5dgs.select_by_prompt", text=item.name).text = item.name
     for note in session.notes:
-        box.label(text=note.name, icon="TIME" if note.name.startswith(prompt.ASKING) else "ERROR")
+        icon = "TIME" if note.name.startswith(prompt.ASKING) else "ERROR"
+        windows.wrapped(box, bpy.context, note.name, icon)
 
 
 def _current_names(session) -> dict[tuple[str, int], str]:

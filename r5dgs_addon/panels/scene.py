@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import amounts, cloud_points, displays, objects, timeline, trust
+from .. import amounts, cloud_points, displays, objects, timeline, trust, windows
 from . import sidebar
 
 
@@ -46,10 +46,10 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         asked = trust.find(collection).asked
         if asked is not None:
             box = layout.box()
-            box.label(text=f"Outside this .blend's folder, not read: {asked}", icon="LOCKED")
+            windows.wrapped(box, context, f"Not read, outside this .blend's folder: {asked}", "LOCKED")
             row = box.row(align=True)
             row.operator("r5dgs.allow_scene_file").always = False
-            row.operator("r5dgs.allow_scene_file", text="Always Allow Its Folder").always = True
+            row.operator("r5dgs.allow_scene_file", text="Trust Its Folder").always = True
 
 
 CLASSES = (R5DGS_PT_scene,)
