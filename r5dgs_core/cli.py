@@ -13,19 +13,20 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from . import command_line, command_options, commands, errors, exit_status
+from . import command_line, command_options, commands, errors, exit_status, terminal
 from .exit_status import ExitStatus
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return the exit status (`ExitStatus`)."""
-    args = command_line.parser().parse_args(arguments)
-    try:
-        return _RUN[args.command](args) or ExitStatus.SUCCESS
-    except BaseException as error:
-        if isinstance(error, SystemExit | GeneratorExit):
-            raise
-        return _explain(error, args)
+    with terminal.safe_output():
+        args = command_line.parser().parse_args(arguments)
+        try:
+            return _RUN[args.command](args) or ExitStatus.SUCCESS
+        except BaseException as error:
+            if isinstance(error, SystemExit | GeneratorExit):
+                raise
+            return _explain(error, args)
 
 
 def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
@@ -38,9 +39,9 @@ def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
         print("r5dgs: this is a defect of R5DGS; please report it with the lines above", file=sys.stderr)
     elif status == ExitStatus.USAGE:
         args.parser_of.print_usage(sys.stderr)
-        print(f"{args.parser_of.prog}: error: {error}", file=sys.stderr)
+        print(f"{args.parser_of.prog}: error: {terminal.printable(str(error))}", file=sys.stderr)
     else:
-        print(f"r5dgs: {str(error) or 'stopped'}", file=sys.stderr)
+        print(f"r5dgs: {terminal.printable(str(error)) or 'stopped'}", file=sys.stderr)
     return status
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import errors, folder_lock, input_paths
+from . import errors, folder_lock, input_paths, terminal
 from .scene import modes as scene_modes
 from .train import config as configs
 
@@ -83,7 +83,6 @@ def run_bake(
     input_paths.check_run(run_folder)
     if data is not None:
         input_paths.check_dataset(data)
-    from rich.console import Console
 
     from .progress import make
     from .report import table
@@ -98,7 +97,7 @@ def run_bake(
     if progress_kind == "json":
         return
     _tell_scene(scene, out)
-    Console().print(table.needs(scene.needs))
+    terminal.console().print(table.needs(scene.needs))
 
 
 @folder_lock.writes("out")
@@ -168,7 +167,6 @@ def run_evaluate(
     input_paths.check_output("--json", json_path)
     if data is None and not target.is_dir():
         raise errors.UsageError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
-    from rich.console import Console
 
     from .progress import make
     from .report import evaluate, table
@@ -191,7 +189,7 @@ def run_evaluate(
         )
     path = json_path or default
     if progress_kind != "json":
-        Console().print(table.make(result))
+        terminal.console().print(table.make(result))
     evaluate.write(result, path)
     if progress_kind != "json":
         print(f"written: {path}")
@@ -210,7 +208,6 @@ def run_stability(json_path: Path | None = None, *, threads: int | None = None, 
         Whether all cases passed.
     """
     input_paths.check_output("--json", json_path)
-    from rich.console import Console
 
     from .progress import make
     from .report import stability
@@ -222,7 +219,7 @@ def run_stability(json_path: Path | None = None, *, threads: int | None = None, 
             progress=lambda done: progress({"event": "stability", "done": done, "total": total, "unit": "cases"})
         )
     if progress_kind != "json":
-        Console().print(stability.make(rows))
+        terminal.console().print(stability.make(rows))
         print(stability.summary(rows))
     if json_path is not None:
         stability.write(rows, json_path)

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from .check import check
-from .check.names import shown
 from .findings import ERROR
+from .terminal import printable
 
 
 def run_check(path: Path, *, as_json: bool = False) -> bool:
@@ -20,7 +20,7 @@ def run_check(path: Path, *, as_json: bool = False) -> bool:
         print(json.dumps({"errors": failed, "warnings": len(found) - failed, "findings": rows}, indent=2))
     else:
         for finding in found:
-            print(shown(str(finding)))
+            print(printable(str(finding)))
         print(f"{_count(failed, 'error')}, {_count(len(found) - failed, 'warning')}")
     return failed == 0
 

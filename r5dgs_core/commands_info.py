@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from . import input_paths
+from . import input_paths, terminal
 
 
 def run_info(path: Path, *, as_json: bool) -> None:
@@ -31,4 +31,4 @@ def run_info(path: Path, *, as_json: bool) -> None:
 
 
 def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else terminal.printable(str(value))

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, commands_words, errors, input_paths
+from . import commands, commands_words, errors, input_paths, terminal
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -66,9 +66,7 @@ def run_objects(
     if as_json:
         print(json.dumps(result, indent=2))
     else:
-        from rich.console import Console
-
-        Console().print(object_table.table(scene, rows, len(views)))
+        terminal.console().print(object_table.table(scene, rows, len(views)))
     if legend is not None and standpoint is not None:
         from .data import images
         from .report import legend as legends

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import commands, errors, folder_lock, input_paths, strict_json, user_settings
+from . import commands, errors, folder_lock, input_paths, strict_json, terminal, user_settings
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
@@ -267,7 +267,6 @@ def _encoder_for(scene: Scene, encoder: str | None, unknown: Sequence[str], path
 
 
 def _show(scene: Scene, found: Sequence[Match]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -277,7 +276,7 @@ def _show(scene: Scene, found: Sequence[Match]) -> None:
         numbers = ("-" if value is None else f"{value:.2f}" for value in (match.cosine, match.relevancy))
         cells = (str(match.object_id), names[match.object_id], f"{match.score:.2f}", *numbers, match.why)
         table.add_row(*map(Text, cells))  # without markup: names may hold brackets
-    Console().print(table)
+    terminal.console().print(table)
 
 
 def _object(scene: Scene, which: str, place: str) -> SceneObject:

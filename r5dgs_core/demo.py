@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import commands, errors, folder_lock, strict_json
+from . import commands, errors, folder_lock, strict_json, terminal
 from .time_left import Phase
 
 NAME = "tabletop"
@@ -49,7 +49,6 @@ def run_demo(
     began = time.monotonic()
     data = bundled_data()
     settings = commands.training_settings(out, config_path, overrides, preset=preset, resume=resume)
-    from rich.console import Console
 
     from .data import dataset as datasets
     from .progress import make
@@ -83,7 +82,7 @@ def run_demo(
                 progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
             )
     if progress_kind != "json":
-        Console().print(table.make(result))
+        terminal.console().print(table.make(result))
     stopped = f"stopped before the contact sheet; go on with: {go_on}"
     with make(progress_kind) as progress, stopping.at_once(stopped), folder_lock.hold(out):
         json_path = evaluate.write(result, out / checkpoint.EVALUATION_FILE)

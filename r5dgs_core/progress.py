@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from . import terminal
 from .time_left import Timed
 
 Event = dict[str, Any]
@@ -46,7 +47,7 @@ def _rich() -> Iterator[Progress]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[note]}", markup=False),  # paths and names may hold brackets
     ]
-    with Progress(*columns) as bars:
+    with Progress(*columns, console=terminal.console()) as bars:
         tasks: dict[str, TaskID] = {}
         waiting: list[TaskID] = []
         steps = [0]
@@ -130,4 +131,4 @@ def describe(event: Event) -> str:
         parts.append(f"going on at step {event['from']}")
     if "total" in event:
         parts.append(f"of {event['total']} {event.get('unit', 'images')}")
-    return ", ".join(parts)
+    return terminal.printable(", ".join(parts))

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from .. import terminal
 from ..data import dataset as datasets
 from ..errors import CheckpointError, R5dgsError, TrainingError
 from ..progress import make as make_progress
@@ -198,12 +199,11 @@ def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dic
 
 def _show(plan: Plan, result: dict[str, Any]) -> None:
     """Print tables and places."""
-    from rich.console import Console
 
     for sheet in bench_tables.sheets(result):
-        table, console = bench_tables.to_rich(sheet), Console()
+        table, console = bench_tables.to_rich(sheet), terminal.console()
         wide = console.measure(table, options=console.options.update(width=1000)).maximum
-        Console(width=max(wide, console.width)).print(table)  # rather lines too long than figures cut short
+        terminal.console(width=max(wide, console.width)).print(table)  # rather too long than cut short
     print(f"tables: {plan.out / TABLES_FILE}\nresult: {plan.out / RESULT_FILE}\nplot:   {plan.out / PLOT_FILE}")
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from ..data import colmap, dataset, images, masks
 from ..data.dataset import Dataset, View
 from ..findings import Collector, Finding, coded
+from ..terminal import printable
 from .codes import CODES
-from .names import shown
 
 FEWEST_CAMERAS, FEWEST_IMAGES = 3, 3
 LEAST_SPACE = 1 << 30  # bytes
@@ -45,7 +45,7 @@ def _views(found: Dataset) -> list[View]:
 
 
 def _some(names: list[str]) -> str:
-    listed = ", ".join(map(shown, names[:_LISTED]))
+    listed = ", ".join(map(printable, names[:_LISTED]))
     return listed if len(names) <= _LISTED else f"{listed} and {len(names) - _LISTED} more"
 
 
@@ -115,7 +115,7 @@ def _check_names(found: Dataset, collect: Collector) -> None:
     words += [*found.object_names.values(), *(word for some in found.object_aliases.values() for word in some)]
     for word in dict.fromkeys(words):
         if not word.isprintable():
-            collect.add("D52", f"{found.root}: the name {shown(word)!r} holds control characters")
+            collect.add("D52", f"{found.root}: the name {printable(word)!r} holds control characters")
 
 
 def _check_images(found: Dataset, collect: Collector) -> None:

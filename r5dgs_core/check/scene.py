@@ -10,8 +10,8 @@ from ..findings import Collector, Finding
 from ..motion import keyframes, models
 from ..scene import scene_file
 from ..scene.scene import Scene
+from ..terminal import printable
 from .codes import CODES
-from .names import shown
 
 LAST_FRAME = 1_048_574  # of Blender
 _AHEAD = 1 / 3  # of the observed span: as far as Blender extrapolates by default
@@ -32,10 +32,10 @@ def check(path: Path) -> list[Finding]:
         collect.add("S02", f"{path}: expected Gaussians, found none")
     for item in scene.objects:
         if item.count == 0 and item.id > 0:
-            collect.add("S10", f"{path}: object {item.id} ({shown(item.name)}) has no Gaussians")
+            collect.add("S10", f"{path}: object {item.id} ({printable(item.name)}) has no Gaussians")
         for word in (item.name, *item.aliases):
             if not word.strip() or not word.isprintable():
-                collect.add("S12", f"{path}: object {item.id}: the name '{shown(word)}' is empty or not printable")
+                collect.add("S12", f"{path}: object {item.id}: the name '{printable(word)}' is empty or not printable")
     _check_gaussians(scene, path, collect)
     _check_motion(scene, path, collect)
     return collect.findings

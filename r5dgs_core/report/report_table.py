@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from .. import terminal
 from . import report_rows
 from .bench_tables import Sheet, to_rich
 from .report_rows import Row
@@ -174,11 +175,10 @@ def _short(value: float) -> str:
 
 def show(report: dict[str, Any]) -> None:
     """Print the tables, and what is absent."""
-    from rich.console import Console
 
     for sheet in sheets(report):
-        table, console = to_rich(sheet), Console()
+        table, console = to_rich(sheet), terminal.console()
         wide = console.measure(table, options=console.options.update(width=1000)).maximum
-        Console(width=max(min(wide, 240), console.width)).print(table)  # rather long lines than figures cut short
+        terminal.console(width=max(min(wide, 240), console.width)).print(table)  # rather long than cut short
     for text in report["absent"]:
         print(f"not measured: {text}")
