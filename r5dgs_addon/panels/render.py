@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import engine, engine_color, engine_loss, render_notes, worker
+from .. import engine, engine_color, engine_loss, render_notes, windows, worker
 
 
 def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -10,7 +10,8 @@ def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     loss = engine_loss.known(scene)
     if loss is not None:
         poor, text = loss.psnr < engine_loss.ENOUGH_DB, engine_loss.note(loss)
-        layout.label(text=text[0].upper() + text[1:], icon="ERROR" if poor else "BLANK1")
+        text = f"{scene.view_settings.view_transform}: {text}"
+        windows.wrapped(layout, bpy.context, text, "ERROR" if poor else "INFO")
         if poor:
             layout.operator("r5dgs.show_colors_as_trained", icon="COLOR")
 

@@ -322,7 +322,7 @@ def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, 
         assert loss.note(found[name]) in said
         assert ("Warning" in said and "Show Colors as Trained" in said) == (found[name].psnr < loss.ENOUGH_DB)
         shown = layouts.draw(blender, blender.types.R5DGS_PT_render, blender.types.R5DGS_PT_preview)
-        assert any(loss.note(found[name])[1:] in line for line in shown)
+        assert f"{name}: {loss.note(found[name])}" in " ".join(shown)
     assert found["AgX"].psnr < loss.ENOUGH_DB < 50 < found["Filmic"].psnr  # these random colours are saturated
     assert found["Filmic"].unreached < 0.01 < 0.05 < found["AgX"].unreached
     view.view_transform = "False Color"
