@@ -22,7 +22,7 @@ from . import compat, timeline
 TOLERANCE = 3e-6
 _PER_KNOT = 4  # intervals between possible keys: where even more are needed, the knots themselves are fewer
 NEAREST = 0.011  # frames between keys of a curve: Blender takes those that are nearer than 0.01 for one
-_INTERVALS = 1 << 19  # between possible keys of all objects together, so that no file blocks Blender for minutes
+_INTERVALS = 1 << 17  # between possible keys of all objects together, so that no file blocks Blender for minutes
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 
 

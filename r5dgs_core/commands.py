@@ -209,14 +209,16 @@ def run_stability(json_path: Path | None = None, *, threads: int | None = None, 
     """
     input_paths.check_output("--json", json_path)
 
+    from . import stability_training
     from .progress import make
     from .report import stability
 
     use_threads(threads)
     with make(progress_kind) as progress:
-        total = len(stability.CASES)
+        cases = (*stability.CASES, *stability_training.CASES)
         rows = stability.run(
-            progress=lambda done: progress({"event": "stability", "done": done, "total": total, "unit": "cases"})
+            cases,
+            lambda done: progress({"event": "stability", "done": done, "total": len(cases), "unit": "cases"}),
         )
     if progress_kind != "json":
         terminal.console().print(stability.make(rows))

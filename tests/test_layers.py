@@ -50,9 +50,10 @@ ALLOWED = {
     "commands": {
         "terminal",
         *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
-        *("importing", "folder_lock"),
+        *("importing", "folder_lock", "stability_training"),
     },
     "commands_bench": {"scene", "train", "bench", "commands"},
+    "stability_training": {"data", "raster", "train", "report"},
     "check": {"terminal", "motion", "scene", "data", "train"},
     "commands_info": {"terminal", "scene"},
     "commands_check": {"terminal", "check"},

@@ -23,7 +23,8 @@ FEWEST_INTERVALS = 64  # that are tried first, however short the motion
 MOST_INTERVALS = 1 << 15
 _FINER = 4  # points of the checking grid per possible key time
 _PER_FRAME = 4  # possible key times
-_STEPS_PER_INTERVAL = 16  # of integration, in one pass over a motion
+_STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # of integration, in one pass over a motion
+_ENOUGH_STEPS = 1 << 16  # in a pass over few samples
 _ONE_BY_ONE = 256  # keys; what needs more is cut into stripes that are walked side by side
 _PER_STRIPE = 32  # keys: each stripe adds one at most
 
@@ -75,8 +76,9 @@ def model_sampler(model: models.MotionModel, t_max: float, most: int = MOST_INTE
     """Poses and slopes of a motion model at scene times >= t_max, for `reduce` with the same ``most``."""
 
     def sample(times: np.ndarray) -> Samples:
+        steps = max(_STEPS_PER_SAMPLE * len(times), min(_STEPS_PER_INTERVAL * most, _ENOUGH_STEPS))
         quats, displacements, spins, velocities = models.evaluate_with_rates(
-            model, np.maximum(times - t_max, 0.0), _STEPS_PER_INTERVAL * most
+            model, np.maximum(times - t_max, 0.0), steps
         )
         return quats, displacements, rotations.quat_rates(quats, spins), velocities
 

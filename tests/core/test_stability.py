@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from r5dgs_core import cli
+from r5dgs_core import cli, stability_training
 from r5dgs_core.motion import models, poses, rotations, se3
 from r5dgs_core.report import stability
 from r5dgs_core.report.stability import cases as stability_cases
@@ -142,6 +142,34 @@ def test_a_case_that_raises_fails_with_its_message_and_the_others_still_run():
     assert stability.summary(found).startswith("1 of 3 cases pass")
 
 
+def test_a_case_that_takes_too_long_fails_and_what_prepares_it_does_not_count(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(stability.time, "process_time", lambda: clock[0])
+
+    def takes(seconds):
+        clock[0] += seconds
+        return 0.0
+
+    slow = dataclasses.replace(case(lambda: takes(10.5)), prepare=lambda: takes(1.0))
+    quick = dataclasses.replace(case(lambda: takes(9.0)), prepare=lambda: takes(100.0))
+    found = stability.run([slow, quick])
+    assert [row.passed for row in found] == [False, True]
+    assert found[0].message == "took 10.5 s of processor time, expected at most 10"
+
+
+def test_short_trainings_on_extreme_data_stay_finite():
+    rows = stability.run(stability_training.CASES)
+    assert [(row.name, row.measured, row.message) for row in rows if row.measured != 0] == []
+
+
+def test_the_table_fits_80_columns(rows):
+    console = Console(width=80, file=io.StringIO())
+    console.print(stability.make(rows))
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum("pass" in line for line in lines) == len(rows)
+
+
 def test_rows_are_json_whatever_they_measured(tmp_path):
     found = stability.run([case(lambda: math.inf, trace_rk2=lambda: math.nan), case(lambda: 0.0)])
     path = stability.write(found, tmp_path / "rows.json")
@@ -153,6 +181,7 @@ def test_rows_are_json_whatever_they_measured(tmp_path):
 
 def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):
     path = tmp_path / "rows.json"
+    monkeypatch.setattr(stability_training, "CASES", ())
     monkeypatch.setattr(stability, "CASES", (case(lambda: 0.5),))
     assert cli.main(["report", "--stability", "--json", str(path), "--progress", "none"]) == 0
     assert "1 of 1 cases pass" in capsys.readouterr().out

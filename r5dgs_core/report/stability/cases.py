@@ -18,6 +18,7 @@ import numpy as np
 
 from ...motion import dynamics, models, rotations
 
+MOST_SECONDS = 10.0  # of processor time, for a case to pass
 RADIUS = 0.3
 POINT_ERROR = "error of a point / radius"
 ROUNDING = "rounding of float64"
@@ -38,6 +39,7 @@ class Case:
         measure: Runs our code and gives the measured value. An exception is a failure.
         trace_rk2: The same value for TRACE's integrator on each point (`dynamics.rk2`), or None where it has no part in
             it. Tells, and never fails.
+        prepare: Run before the case and not timed, such as compilation.
     """
 
     topic: str
@@ -48,6 +50,7 @@ class Case:
     source: str
     measure: Callable[[], float]
     trace_rk2: Callable[[], float] | None = None
+    prepare: Callable[[], object] | None = None
 
 
 @dataclass(frozen=True)
