@@ -372,6 +372,7 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["bake", ".", "--out", "x.zip"],
     ["import", "nowhere", "--out", "x.r5dgs"],
     ["import", "nowhere", "--out", "x.r5dgs", "--world", "maya"],
+    ["check", "nowhere"],
     ["evaluate", "nowhere"],
     ["evaluate", "nowhere", "--mode", "wobbly"],
     ["evaluate", "nowhere", "--threads", "0"],
