@@ -90,7 +90,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         passes, transparent = engine_passes.of_layer(layer), scene.render.film_transparent
         mattes = engine_cryptomatte.pass_names(layer)
         seen = picture.shown(depsgraph, functools.partial(views.of_camera, depsgraph, eye=eye))
-        render_notes.report(self, render_notes.of(scene))
+        render_notes.report(self, render_notes.of(scene, depsgraph))
         if seen.scenes:
             sky = engine_settings.of(scene).sky and not transparent
             steps = picture.steps(seen, engine_passes.wanted(passes, transparent), sky)

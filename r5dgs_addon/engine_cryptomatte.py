@@ -24,14 +24,15 @@ def pass_names(view_layer: bpy.types.ViewLayer) -> list[str]:
 
 
 def names_of(seen: picture.Shown) -> list[str]:
-    """The names of the clouds that are seen, each once."""
-    return list(dict.fromkeys(instance.object.name for instance in seen.instances))
+    """The names of the clouds that are seen, each once; hold-outs have none."""
+    return list(dict.fromkeys(instance.object.name for instance in seen.instances if not instance.holdout))
 
 
 def request(seen: picture.Shown, passes: int) -> dict[str, Any]:
     """What the worker is asked for beside the picture: the name of each instance by number, and how many ranks."""
     names = names_of(seen)
-    return {"groups": [names.index(one.object.name) for one in seen.instances], "ranks": RANKS * passes}
+    groups = [-1 if one.holdout else names.index(one.object.name) for one in seen.instances]
+    return {"groups": groups, "ranks": RANKS * passes}
 
 
 def pixels(arrays: dict[str, np.ndarray], seen: picture.Shown, number: int) -> np.ndarray:

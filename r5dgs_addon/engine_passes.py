@@ -72,12 +72,19 @@ def pixels(
         Rows from the top. [H, W, channels] float32
     """
     if one == COMBINED:
-        return engine_color.scene_linear(arrays["color"], arrays["alpha"] if transparent else None, inverse)
+        return engine_color.scene_linear(arrays["color"], alpha(arrays, transparent), inverse)
     if one == DEPTH:
         return depths(arrays)[..., None]
     if one.name.startswith(engine_cryptomatte.LAYER):
         return engine_cryptomatte.pixels(arrays, seen, int(one.name[len(engine_cryptomatte.LAYER) :]))
     return indices(arrays, seen)[..., None].astype(np.float32)
+
+
+def alpha(arrays: dict[str, np.ndarray], transparent: bool) -> np.ndarray | None:
+    """Alpha of a picture, 0 in hold-outs, or None if it is opaque everywhere. [H, W]"""
+    if transparent:
+        return arrays["alpha"]
+    return 1 - arrays["holdout"] if "holdout" in arrays else None
 
 
 def depths(arrays: dict[str, np.ndarray]) -> np.ndarray:

@@ -63,6 +63,7 @@ def shown(
         ConfigError: The camera cannot be expressed, or a cloud has lost its points.
     """
     scenes, instances = visible.instances(depsgraph, space)
+    instances = tuple(one for one in instances if one.seen)
     points = visible.points(instances)
     view = views.of_camera(depsgraph, points) if looks is None else looks(points)
     return Shown(view, scenes, tuple(visible.world_of(one, depsgraph) for one in scenes), instances)
@@ -73,14 +74,15 @@ def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[d
 
     Args:
         seen: What `shown` gave.
-        want: Any of ``depth alpha owners``.
+        want: Any of ``depth alpha owners``. With hold-outs, ``holdout`` comes, too.
         sky: Whether the first scene's sky lies behind everything, or black.
 
     Returns:
         The result, with ``ms_motion``, ``ms_raster`` and ``gaussians``, and arrays, top row first: ``color``, display-
         referred sRGB over the sky or, without one, multiplied by alpha [H, W, 3]; ``alpha`` [H, W]; ``depth``, expected
         z in the camera frame divided by alpha, 0 where alpha is 0 [H, W]; ``owners``, which of ``seen.instances`` has
-        the largest share of the pixel, -1 where alpha is below a half [H, W] int32.
+        the largest share of the pixel, -1 where alpha is below a half [H, W] int32; ``holdout``, the coverage of
+        hold-outs, which are black and part of nothing else [H, W].
 
     Raises:
         R5dgsError: What the worker reports.
@@ -96,7 +98,7 @@ def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tup
         "sky": {"scene": 0, "matrix": seen.worlds[0].tolist()} if sky and seen.scenes else None,
         "near": seen.view.near,
         "distance": seen.view.distance,
-        "want": list(want),
+        "want": [*want, *(["holdout"] if any(one.holdout for one in seen.instances) else [])],
     }
     paths = [str(scene_path(collection)) for collection in seen.scenes]
     edits = tuple(dict.fromkeys(one.edit for one in seen.instances if one.edit is not None))

@@ -3,18 +3,28 @@
 import bpy
 from bpy.app.handlers import persistent
 
-from . import cloud_points, objects
+from . import cloud_points, objects, visible
 
 _reported: set[str] = set()  # since the render began; an animation is one render
 
 
-def of(scene: bpy.types.Scene) -> list[str]:
-    """What the engine does not render of a Blender scene, as sentences without a period."""
+def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> list[str]:
+    """What the engine does not render of a Blender scene, as sentences without a period.
+
+    Args:
+        scene: The scene.
+        depsgraph: Evaluated; its other hold-outs are named, too.
+    """
     notes = []
     if scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof:
         notes.append("Depth of field is not rendered")
     if scene.render.use_motion_blur:
         notes.append("Motion blur is not rendered")
+    solid = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
+    others = [obj.original for obj in depsgraph.objects if obj.type in solid] if depsgraph is not None else []
+    held = sorted({obj.name for obj in others if visible.is_held_out(obj, None, depsgraph)})
+    if held:
+        notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
     inside = set(scene.collection.children_recursive)
     return notes + [note for one in objects.scene_collections() if one in inside for note in cloud_points.notes(one)]
 

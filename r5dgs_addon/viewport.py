@@ -16,7 +16,7 @@ from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, view_inverse
-from . import amounts, engine_color, engine_settings, picture, views, windows, worker
+from . import amounts, engine_color, engine_passes, engine_settings, picture, views, windows, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by
 LOOK_S = 0.01  # between two looks at the worker
@@ -129,7 +129,7 @@ class Port:
         """Keep a picture of the worker for the next drawing."""
         result, arrays = answer
         milliseconds = result["ms_motion"] + result["ms_raster"]
-        alpha = arrays["alpha"] if wish.transparent else None
+        alpha = engine_passes.alpha(arrays, wish.transparent)
         linear = engine_color.scene_linear(arrays["color"], alpha, wish.inverse)
         self._pixels = np.ascontiguousarray(linear[::-1])
         self._shown = wish, smaller

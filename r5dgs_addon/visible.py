@@ -33,6 +33,8 @@ class Instance:
         collection: The loaded scene.
         parent: The object that makes the instance, or None.
         edit: The points, if they are not those of the scene file.
+        holdout: Whether it cuts a hole into pictures.
+        seen: Whether cameras see it: not if ray visibility or an indirect-only collection says otherwise.
     """
 
     scene: int
@@ -46,6 +48,8 @@ class Instance:
     parent: bpy.types.Object | None = None
     t: float | None = None
     edit: cloud_points.Edit | None = None
+    holdout: bool = False
+    seen: bool = True
 
     def request(self) -> dict[str, Any]:
         """What the worker reads."""
@@ -59,6 +63,8 @@ class Instance:
             entry["tint"] = list(self.tint)
         if self.t is not None:
             entry["t"] = self.t
+        if self.holdout:
+            entry["holdout"] = True
         return entry
 
 
@@ -95,10 +101,11 @@ def instances(
         edit = cloud_points.of(obj, depsgraph, collection.r5dgs.gaussians).edit
         count = obj.r5dgs.count if edit is None else len(edit.points.rows)
         t = None if edit is not None and edit.bent else t
-        if count:
-            found.append(
-                Instance(number, obj.r5dgs.start, count, matrix, world, tint, obj, collection, parent, t, edit)
-            )
+        if not count:
+            continue
+        camera = is_held_out(obj, parent, depsgraph), _is_seen(obj, parent, depsgraph)
+        start = obj.r5dgs.start
+        found.append(Instance(number, start, count, matrix, world, tint, obj, collection, parent, t, edit, *camera))
     return tuple(scenes), tuple(found)
 
 
@@ -169,6 +176,18 @@ def _clouds(
         original, parent = instance.object.original, instance.parent.original
         if original.r5dgs.role == "CLOUD" and original != parent and _seen(parent, depsgraph, space):
             yield original, np.array(instance.matrix_world, np.float64), parent
+
+
+def is_held_out(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether an object, or what makes an instance of it, is a hold-out by itself or by a collection."""
+    return obj.is_holdout or (parent or obj).holdout_get(view_layer=depsgraph.view_layer)
+
+
+def _is_seen(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Whether cameras see an object, or an instance of it."""
+    maker = parent or obj
+    direct = not maker.indirect_only_get(view_layer=depsgraph.view_layer) or is_held_out(obj, parent, depsgraph)
+    return direct and obj.visible_camera and maker.visible_camera
 
 
 def _seen(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None) -> bool:

@@ -180,18 +180,19 @@ class Server:
         either ``instances``, a list of ``scene start count matrix world tint t``: a range of a scene's Gaussians, the
         [4, 4] map of its bind state into that world, that of the scene's own world (with which its light turns; the
         same where left out), factors on its colours, and the scene time that bends what has residuals. Instead of
-        ``start count``, ``points`` names an edit that a ``points`` request handed over. Or what is seen is ``t``,
+        ``start count``, ``points`` names an edit that a ``points`` request handed over. An instance with ``holdout``
+        cuts a hole: it is black, and in no array but ``holdout``, its share of each pixel. Or what is seen is ``t``,
         playback of ``scene`` in its own world. ``sky``: null for black, or ``scene matrix``; with ``t``, that scene's
         where left out. ``near``: nearest depth that is drawn, the scenes' own where left out. ``distance``: how far
-        before the camera depths count from. ``want``: any of ``depth alpha owners``, with ``t`` ``ids`` for ``owners``:
-        the instance, or object, with the largest share of each pixel, -1 for none. With ``coverage``, of ``groups`` (a
-        number for each instance, -1 for none) and ``ranks``, the groups that cover each pixel most come as
-        ``coverage_groups`` and ``coverage``.
+        before the camera depths count from. ``want``: any of ``depth alpha owners holdout``, with ``t`` ``ids`` for
+        ``owners``: the instance, or object, with the largest share of each pixel, -1 for none. With ``coverage``, of
+        ``groups`` (a number for each instance, -1 for none) and ``ranks``, the groups that cover each pixel most come
+        as ``coverage_groups`` and ``coverage``.
         """
         scenes = self._loaded()
         camera = asked.camera_of(asked.need(request, "camera", dict))
         moved = "instances" in request
-        want = asked.wanted(request, ("alpha", "depth", "owners" if moved else "ids"))
+        want = asked.wanted(request, ("alpha", "depth", *(("owners", "holdout") if moved else ("ids",))))
         near, coverage = asked.near_of(request), asked.coverage_of(request)
         t = 0.0 if moved else asked.time_of(request)
         asked.check_size(camera, 0, 0 if coverage is None else coverage[1])
@@ -217,6 +218,7 @@ class Server:
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
         for name in want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
+            value = 0 * output.alpha if value is None else value  # no hold-outs
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
         arrays |= covered
         result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}

@@ -36,7 +36,7 @@ _FIELDS = {
     "check": (),
     "shutdown": (),
 }
-_INSTANCE_FIELDS = ("scene", "start", "count", "points", "matrix", "world", "tint", "t")
+_INSTANCE_FIELDS = ("scene", "start", "count", "points", "holdout", "matrix", "world", "tint", "t")
 
 
 def read_line(stream: BinaryIO) -> bytes:
@@ -180,7 +180,10 @@ def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_render.Insta
     t = value.get("t")
     if t is not None:
         t = _number(t, "worker: the time of an instance has to be a number")
-    return scene_render.Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t)
+    holdout = value.get("holdout", False)
+    if not isinstance(holdout, bool):
+        raise errors.ConfigError(f"worker: 'holdout' of an instance has to be true or false, found {_short(holdout)}")
+    return scene_render.Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t, holdout)
 
 
 def check_rows(instances: Sequence[scene_render.Instance], lengths: Sequence[int]) -> None:

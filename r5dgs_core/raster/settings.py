@@ -108,6 +108,7 @@ class RenderOutput:
         depth: Expected depth z in the camera frame, divided by alpha; 0 where alpha is 0. [H, W]
         features: Blended features over zeros, or None where none were given. [H, W, F]
         ids: Object with the largest weight, -1 where there is none, or None without object ids. [H, W] int32
+        holdout: Coverage of hold-outs, which alpha and depth leave out, or None without any. [H, W]
     """
 
     color: torch.Tensor
@@ -115,3 +116,4 @@ class RenderOutput:
     depth: torch.Tensor
     features: torch.Tensor | None = None
     ids: torch.Tensor | None = None
+    holdout: torch.Tensor | None = None

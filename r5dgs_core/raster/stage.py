@@ -8,7 +8,6 @@ shown or behind it, everything is drawn; from the next frame on, the instances t
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 import time
 from collections.abc import Sequence
@@ -81,7 +80,8 @@ class Stage:
 
         Returns:
             Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance that has the largest share of each
-            pixel, -1 where there is too little of all; tensors without gradient.
+            pixel, -1 where there is too little of all; tensors without gradient. Hold-outs are black in the colour, and
+            their share of each pixel is ``holdout``; all else is of the other instances alone.
 
         Raises:
             ValueError: As `scene_render.pose_instances`.
@@ -134,6 +134,9 @@ class Stage:
             distance,
         )
         behind = None if sky is None else (sky.scene, np.asarray(sky.matrix, np.float64).tobytes())
+        if any(one.holdout for one in instances):
+            self._shown = None
+            return self._render_all(instances, camera, sky, settings, distance)
         shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
         if shown != self._shown:
             self._shown, self._backdrop, self._moving = shown, None, set()
@@ -228,18 +231,29 @@ class Stage:
         posed = self._pose(instances)
         gaussians = scene_render.PosedGaussians(posed)
         gaussians.object_ids = torch.from_numpy(_owners(instances, range(len(instances))))
+        colors = scene_render.tensor(scene_render.colors(posed, camera))
+        held = torch.tensor([one.holdout for one in instances]) if any(one.holdout for one in instances) else None
+        features = _depths(posed, camera, distance) if distance or held is not None else None
+        if held is not None and features is not None:
+            hidden = held[gaussians.object_ids.long()][:, None]
+            colors, features = colors * ~hidden, torch.cat([features * ~hidden, hidden], 1)
         with torch.no_grad():
             found = rasterize(
                 gaussians,
                 camera,
-                _depths(posed, camera, distance) if distance else None,
+                features,
                 background=self._sky(sky, camera),
-                colors=scene_render.tensor(scene_render.colors(posed, camera)),
+                colors=colors,
                 settings=settings,
             )
-        if found.features is None or not distance:
+        if found.features is None or features is None:
             return found
-        return dataclasses.replace(found, depth=_mean(found.features[..., 0], found.alpha), features=None)
+        alpha, ids, holdout = found.alpha, found.ids, None
+        if held is not None and ids is not None:
+            holdout = found.features[..., 1]
+            alpha, ids = (alpha - holdout).clamp_min(0), torch.where((ids >= 0) & held[ids.long()], -1, ids)
+        depth = _mean(found.features[..., 0], alpha)
+        return RenderOutput(found.color, alpha, depth, None, ids, holdout)
 
     def _pose(self, instances: Sequence[Instance]) -> scene_render.PosedScene:
         start = time.perf_counter()
