@@ -165,11 +165,11 @@ def _rows(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, 
             f"{obj.name}: expected its {obj.r5dgs.count} points, found {len(cloud.points)}, which do not say which "
             f"Gaussians they are (the attribute '{clouds.ROW}'); undo that change, or load the scene again"
         )
-    rows = clouds.read(attribute, "value", 1, np.int32)[:, 0]
+    rows = clouds.view(attribute, "value", 1, np.int32)[:, 0]
     if stored.get(clouds.ROW) == clouds.fingerprint(rows):
         return None
     start, count = obj.r5dgs.start, obj.r5dgs.count
-    return None if len(rows) == count and (rows == np.arange(start, start + count)).all() else rows
+    return None if len(rows) == count and (rows == np.arange(start, start + count)).all() else rows.copy()
 
 
 def _changed(
@@ -179,8 +179,8 @@ def _changed(
     attribute = clouds.attribute(cloud, name, kind)
     if attribute is None:
         return None
-    values = clouds.read(attribute, field_name, width)
-    return None if stored is not None and clouds.fingerprint(values) == stored else values
+    values = clouds.view(attribute, field_name, width)
+    return None if stored is not None and clouds.fingerprint(values) == stored else values.copy()
 
 
 def _changed_harmonics(cloud: bpy.types.PointCloud, stored: dict[str, str]) -> np.ndarray | None:
@@ -219,7 +219,7 @@ def _without_the_originals(
         for k, name in enumerate(names):
             kind = kinds.get(name, ["FLOAT_VECTOR", "vector", 3])
             attribute = clouds.attribute(obj.data, name, kind[0])
-            own = None if attribute is None else clouds.read(attribute, *kind[1:])
+            own = None if attribute is None else clouds.view(attribute, *kind[1:])
             if own is None or clouds.fingerprint(own) != stored.get(name):
                 break
             if not np.array_equal(own[rows - start], columns[:, k]):
@@ -235,7 +235,7 @@ def _is_radius_changed(obj: bpy.types.Object, cloud: bpy.types.PointCloud, store
     if radius is None or "radius" not in stored or len(cloud.points) != obj.r5dgs.count:
         return False
     ellipsoids = obj.modifiers.get(displays.MODIFIER) is not None  # they hide the points by their radius
-    return not ellipsoids and clouds.fingerprint(clouds.read(radius, "value", 1)) != stored["radius"]
+    return not ellipsoids and clouds.fingerprint(clouds.view(radius, "value", 1)) != stored["radius"]
 
 
 def _made_besides_points(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[str]:

@@ -1,5 +1,6 @@
 """Gaussians as attributes of a point cloud, under the names that Blender 5.3 draws as splats, and their material."""
 
+import ctypes
 import hashlib
 
 import bpy
@@ -99,6 +100,21 @@ def read(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.f
     values = np.empty(len(source.data) * width, dtype)
     source.data.foreach_get(field, values)
     return values.reshape(-1, width)
+
+
+def view(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.float32) -> np.ndarray:
+    """Return the values of an attribute without copying them where Blender keeps them in one piece. [n, width]
+
+    The array is valid until Blender changes the attribute; do not write to it.
+    """
+    count, size = len(source.data), width * np.dtype(dtype).itemsize
+    if count == 0:
+        return np.empty((0, width), dtype)
+    first = source.data[0].as_pointer()
+    if source.data[count - 1].as_pointer() - first != (count - 1) * size:
+        return read(source, field, width, dtype)
+    buffer = (ctypes.c_char * (count * size)).from_address(first)
+    return np.frombuffer(buffer, dtype).reshape(count, width)
 
 
 def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:

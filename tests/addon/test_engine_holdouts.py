@@ -95,7 +95,7 @@ def test_cycles_leaves_alpha_and_depth_empty_in_a_hold_out(blender, tmp_path):
     """The rule that the engine follows, by Cycles itself."""
     scene = blender.context.scene
     scene.render.engine, scene.render.film_transparent = "CYCLES", False
-    scene.cycles.samples, scene.view_layers[0].use_pass_z = 1, True
+    scene.cycles.samples, scene.cycles.use_denoising, scene.view_layers[0].use_pass_z = 1, False, True
     scene.render.resolution_x = scene.render.resolution_y = 16
     scene.render.resolution_percentage = 100
     blender.data.objects["Cube"].is_holdout = True
