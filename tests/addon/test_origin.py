@@ -60,6 +60,7 @@ def test_the_origin_is_kept_by_the_blend_to_the_bit(blender, loaded, objects, tm
 
 @pytest.mark.parametrize("value", ["here", [1.0, 2.0], [1.0, float("nan"), 2.0], 3])
 def test_a_broken_property_counts_as_none(loaded, objects, value):
+    del loaded.r5dgs.root[objects.ORIGIN]  # Blender 4.3 loses memory if a property with a description changes its type
     loaded.r5dgs.root[objects.ORIGIN] = value
     assert objects.origin(loaded).tolist() == [0, 0, 0]
 
