@@ -95,7 +95,7 @@ def read_ground_truth(root: Path) -> GroundTruth | None:
             f"{path}: expected 't_max', 'times' and 'objects' of 'id', 'name' and one 4x4 of 'matrices' per time "
             f"({type(error).__name__}: {error})"
         ) from error
-    if not (np.isfinite(matrices).all() and np.isfinite(times).all() and (np.diff(times) > 0).all()):
+    if times.ndim != 1 or not (np.isfinite(matrices).all() and np.isfinite(times).all() and (np.diff(times) > 0).all()):
         raise errors.DatasetError(f"{path}: expected finite poses at increasing times")
     if len(set(ids)) != len(ids):
         raise errors.DatasetError(f"{path}: an object id appears twice")

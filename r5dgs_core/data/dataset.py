@@ -242,10 +242,10 @@ def read(
         names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
     convention = header.get("world_convention", "blender")
     with guard():
-        if convention not in cameras.WORLD_TO_BLENDER:
+        if not isinstance(convention, str) or convention not in cameras.WORLD_TO_BLENDER:
             raise errors.DatasetError(
                 f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
-                f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r}",
+                f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r:.60}",
                 code="D23",
             )
     ground_truth = None
@@ -381,6 +381,10 @@ def _make_views(
             width, height, _ = images.size(image_path)
             matrix = cameras.opengl_to_cam_world(entry.matrix)
             camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
+            try:
+                cameras.check(camera)
+            except ValueError as error:
+                raise errors.DatasetError(f"{entry.place}: {error}") from error
             camera = replace(camera, name=names.name(entry.camera, camera))
             mask_path = None if mask_folder is None else mask_folder / f"{name}.png"
             if mask_path is not None and not mask_path.is_file():

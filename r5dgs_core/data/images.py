@@ -16,6 +16,9 @@ from ..scene import files
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
+# What an image may declare before it is decoded; a PNG of one colour has about 1000 pixels per byte.
+_MOST_PIXELS, _MOST_CHANNELS = 1 << 28, 64
+_PIXELS, _PIXELS_PER_BYTE = 1 << 24, 4096
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".gif", ".bmp", ".psd")
 
@@ -76,7 +79,10 @@ def read_raw(path: Path) -> np.ndarray:
     name = str(spec.format)
     kind = oiio.UINT8 if name == "uint8" else oiio.UINT16 if name == "uint16" else oiio.FLOAT
     pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
-    problem = " ".join(source.geterror().split())
+    try:
+        problem = " ".join(source.geterror().split())
+    except UnicodeError:  # the library's message quotes bytes of the file
+        problem = "damaged"
     source.close()
     if pixels is None or problem:
         raise errors.DatasetError(
@@ -174,10 +180,30 @@ def _open(path: Path):
         raise errors.DatasetError(f"{path}: the image is missing", code="D10")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)  # else the reader multiplies the colours by alpha
-    source = oiio.ImageInput.open(str(path), hints)
+    try:
+        source = oiio.ImageInput.open(str(path), hints)
+        reason = "" if source is not None else oiio.geterror().strip() or "unknown format"
+    except UnicodeError:  # the library's message quotes bytes of the file
+        source, reason = None, "damaged"
     if source is None:
-        reason = oiio.geterror().strip() or "unknown format"
         raise errors.DatasetError(
             f"{path}: not an image that can be read ({reason}); convert it to PNG or JPEG", code="D11"
         )
+    spec = source.spec()
+    try:
+        check_size(path, spec.width, spec.height, spec.nchannels)
+    except errors.DatasetError:
+        source.close()
+        raise
     return source
+
+
+def check_size(path: Path, width: int, height: int, channels: int) -> None:
+    """Raise `DatasetError` if an image has no pixels, or more than a file of its size can hold."""
+    size = Path(path).stat().st_size
+    most = min(_MOST_PIXELS, _PIXELS + _PIXELS_PER_BYTE * size)
+    if min(width, height, channels) < 1 or width * height > most or channels > _MOST_CHANNELS:
+        raise errors.DatasetError(
+            f"{path}: expected 1 to {most} pixels of up to {_MOST_CHANNELS} channels in a file of {size} bytes, found "
+            f"{width} x {height} of {channels}; is it damaged?"
+        )

@@ -236,17 +236,20 @@ def _read_indices(path: Path) -> np.ndarray:
         if data[at + 4 : at + 8] == b"IDAT":
             packed += data[at + 8 : at + 8 + length]
         at += 12 + length
+    if depth not in (1, 2, 4, 8):
+        raise errors.DatasetError(f"{path}: expected 1, 2, 4 or 8 bits per pixel, found {depth}", code="D17")
+    images.check_size(path, width, height, 1)
     stride = (width * depth + 7) // 8
+    size = height * (stride + 1)
     try:
-        raw = np.frombuffer(zlib.decompress(bytes(packed)), np.uint8)
+        raw = np.frombuffer(zlib.decompressobj().decompress(bytes(packed), size + 1), np.uint8)
     except zlib.error as error:
         raise errors.DatasetError(
             f"{path}: the mask cannot be decoded ({error}); is it truncated?", code="D17"
         ) from error
-    if raw.size != height * (stride + 1):
-        raise errors.DatasetError(
-            f"{path}: expected {height * (stride + 1)} bytes of pixels, found {raw.size}", code="D17"
-        )
+    if raw.size != size:
+        found = "more" if raw.size > size else raw.size
+        raise errors.DatasetError(f"{path}: expected {size} bytes of pixels, found {found}", code="D17")
     lines = raw.reshape(height, stride + 1)
     rows = np.zeros((height, stride), np.uint8)
     above = np.zeros(stride, np.uint8)

@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import strict_json
 from ..errors import CheckpointError
+from ..scene import cameras
 from ..scene.cameras import Camera
 
 _log = logging.getLogger(__name__)
@@ -58,4 +59,9 @@ def _camera(entry: Any, place: str) -> Camera:
     T_cam_world = np.eye(4)
     T_cam_world[:3, :3], T_cam_world[:3, 3] = turn.T, -turn.T @ center
     intrinsics = np.array([[fx, 0.0, 0.5 * width], [0.0, fy, 0.5 * height], [0.0, 0.0, 1.0]])
-    return Camera(width, height, intrinsics, T_cam_world, name)
+    camera = Camera(width, height, intrinsics, T_cam_world, name)
+    try:
+        cameras.check(camera)
+    except ValueError as error:
+        raise CheckpointError(f"{place}: {error}") from error
+    return camera

@@ -16,12 +16,13 @@ from ..data import origin as origins
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
 from ..model import spherical_harmonics
-from ..scene import cameras
+from ..scene import cameras, validation
 from ..scene.scene import Scene
 from . import assembly, camera_file, deformable, freegave, run_folder, splatting, trace, weights
 from .foreign import Foreign
 from .run_folder import RunFolder
 
+MOST_KNOTS = 10_000  # that are made without being asked for
 ROUNDING = 1e-9  # share of the extent below which a motion is none
 _log = logging.getLogger(__name__)
 
@@ -115,7 +116,9 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
             "versions": {"r5dgs": __version__},
         },
     )
-    return _among_cameras(scene, run.folder)
+    scene = _among_cameras(scene, run.folder)
+    validation.check(scene, str(run.folder))
+    return scene
 
 
 def _among_cameras(scene: Scene, folder: Path) -> Scene:
@@ -149,7 +152,13 @@ def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
     if options.knots is not None:
         return np.linspace(0.0, t_max, options.knots)
     if dataset is None:
-        return np.linspace(0.0, t_max, max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1))
+        knots = max(2, round(datasets.FRAMES_PER_UNIT * t_max) + 1)
+        if knots > MOST_KNOTS:
+            raise CheckpointError(
+                f"{run.folder}: expected a last time that {MOST_KNOTS} knots reach, found {t_max:g}; give their number "
+                "with --knots, or the time with --t-max"
+            )
+        return np.linspace(0.0, t_max, knots)
     seen = dataset.times[dataset.times < t_max - 1e-6]
     return np.concatenate([seen if len(seen) else [0.0], [t_max]])
 
@@ -179,6 +188,9 @@ def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
 
 def _plain(value: Any) -> Any:
     """JSON form of a setting."""
-    if isinstance(value, str | bool | int) or value is None or (isinstance(value, float) and math.isfinite(value)):
+    whole = isinstance(value, int) and abs(value) < 1 << 63
+    if value is None or whole or (isinstance(value, float) and math.isfinite(value)):
         return value
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else repr(value)
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else f"{value!a:.200}"

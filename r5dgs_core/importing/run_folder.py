@@ -8,7 +8,6 @@ All of them have ``point_cloud/iteration_N/point_cloud.ply`` and most have ``cfg
 from __future__ import annotations
 
 import ast
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ KINDS = ("3dgs", "gaussian_grouping", "deformable_3dgs", "trace", "freegave")
 TITLES: dict[str, str] = dict(
     zip(KINDS, ("3D Gaussian Splatting", "Gaussian Grouping", "Deformable-3DGS", "TRACE", "FreeGave"), strict=True)
 )
+_MOST_BYTES = 1 << 20  # of cfg_args; what follows is not read
+_MOST_TIME = 1e12
 _KNOWN = f"known are the run folders of {', '.join(TITLES.values())}"
 
 
@@ -58,8 +59,8 @@ class RunFolder:
             CheckpointError: ``cfg_args`` does not say it.
         """
         value = self.config.get("max_time")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            found = repr(value) if "max_time" in self.config else "nothing"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST_TIME:
+            found = f"{value!r:.60}" if "max_time" in self.config else "nothing"
             raise CheckpointError(
                 f"{self.folder / 'cfg_args'}: 'max_time': expected the last time of the deformation, found {found}; "
                 "say it with --t-max (both codes take 0.7 where nothing is said)"
@@ -115,12 +116,13 @@ def read_config(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        text = path.read_text(encoding="utf-8")
-        call = ast.parse(text.strip(), mode="eval").body
+        with open(path, "rb") as stream:
+            text = stream.read(_MOST_BYTES).decode("utf-8").strip()
+        call = ast.parse(text, mode="eval").body
     except (OSError, SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', cannot be read ({error})") from error
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
-        raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', found {text.strip()[:40]!r}")
+        raise CheckpointError(f"{path}: expected 'Namespace(key=value, ...)', found {text[:40]!r}")
     config: dict[str, Any] = {}
     for keyword in call.keywords:
         if keyword.arg is None:
@@ -128,7 +130,7 @@ def read_config(path: Path) -> dict[str, Any]:
         try:
             config[keyword.arg] = ast.literal_eval(keyword.value)
         except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            config[keyword.arg] = ast.unparse(keyword.value)
+            config[keyword.arg] = ast.get_source_segment(text, keyword.value) or ""
     return config
 
 

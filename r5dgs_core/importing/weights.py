@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,7 +89,14 @@ def load(path: Path) -> Weights:
     """
     path = Path(path)
     try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                inflated = any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist())
+            if inflated:
+                raise CheckpointError(f"{path}: holds compressed members, which torch.save never writes; refused")
         content = torch.load(path, map_location="cpu", weights_only=True)
+    except CheckpointError:
+        raise
     except FileNotFoundError:
         raise CheckpointError(f"{path}: the file is missing") from None
     except pickle.UnpicklingError as error:
@@ -104,10 +112,28 @@ def load(path: Path) -> Weights:
     for name, value in content.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
             raise CheckpointError(f"{path}: {name!r}: expected a tensor, found {type(value).__name__}")
+        if not _is_plain(value):
+            found = f"{value.dtype}, {value.layout}, {value.device}".replace("torch.", "")
+            raise CheckpointError(
+                f"{path}: {name!r:.60}: expected a dense tensor of real numbers, found one of {found}"
+            )
         tensors[name] = value.detach().to(torch.float32)
         if not torch.isfinite(tensors[name]).all():
             raise CheckpointError(f"{path}: '{name}': expected finite numbers, found NaN or infinity")
     return Weights(path, tensors)
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """Return True for a dense tensor in memory, with a place of its own for each of its real numbers."""
+    return (
+        type(tensor) in (Tensor, torch.nn.Parameter)
+        and not tensor.is_nested
+        and not tensor.is_quantized
+        and not tensor.is_complex()
+        and tensor.layout == torch.strided
+        and tensor.device.type == "cpu"
+        and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -7,6 +7,7 @@ encoding) and obj_id. Other columns and elements are passed over.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -15,7 +16,7 @@ import numpy as np
 
 from .. import errors
 from ..motion import rotations
-from . import files
+from . import files, validation
 
 _TYPES = {
     "char": "i1",
@@ -37,6 +38,8 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _HEADER_LIMIT = 1 << 16
+_LONGEST_NUMBER = 400  # characters with the blank behind it
+_MOST_DIGITS = 18  # of a count
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def _read_header(stream: BinaryIO, place: str) -> tuple[str, list[tuple[str, int
             break
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             layout = words[1]
-        elif words[0] == "element" and len(words) == 3 and words[2].isdigit():
+        elif words[0] == "element" and len(words) == 3 and words[2].isdigit() and len(words[2]) <= _MOST_DIGITS:
             elements.append((words[1], int(words[2]), []))
         elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
             elements[-1][2].append((words[2], _TYPES[words[1]]))
@@ -160,6 +163,13 @@ def _read_vertices(stream: BinaryIO, place: str) -> np.ndarray:
         if len({column for column, _ in properties}) != len(properties):
             raise errors.SceneFileError(f"{place}: element {name}: expected unique property names")
         dtype = np.dtype([(column, _ORDERS[layout] + kind) for column, kind in properties])
+        least = 2 * len(properties) - 1 if layout == "ascii" else dtype.itemsize  # bytes of a row
+        left = os.fstat(stream.fileno()).st_size - stream.tell()
+        if count and (not properties or count * least > left + 1):  # the last line may lack its end
+            raise errors.SceneFileError(
+                f"{place}: element {name}: expected {count} rows of at least {least} bytes, found {left} bytes; "
+                "the file is truncated"
+            )
         if layout == "ascii":
             table = _read_ascii(stream, count, dtype, f"{place}: element {name}")
         else:
@@ -169,7 +179,7 @@ def _read_vertices(stream: BinaryIO, place: str) -> np.ndarray:
                     f"{place}: element {name}: expected {count} rows of {dtype.itemsize} bytes, "
                     f"found {len(data)} bytes; the file is truncated"
                 )
-            table = np.frombuffer(data, dtype)
+            table = np.frombuffer(data, dtype) if count else np.empty(0, dtype)
         if name == "vertex":
             return table
     raise errors.SceneFileError(f"{place}: expected an element 'vertex', found {[e[0] for e in elements]}")
@@ -178,8 +188,9 @@ def _read_vertices(stream: BinaryIO, place: str) -> np.ndarray:
 def _read_ascii(stream: BinaryIO, count: int, dtype: np.dtype, place: str) -> np.ndarray:
     table = np.empty(count, dtype)
     names = dtype.names or ()
+    limit = _LONGEST_NUMBER * (len(names) + 1)
     for row in range(count):
-        words = stream.readline().split()
+        words = stream.readline(limit).split()
         if len(words) != len(names):
             raise errors.SceneFileError(f"{place}: row {row}: expected {len(names)} numbers, found {len(words)}")
         try:
@@ -198,7 +209,8 @@ def _to_splats(table: np.ndarray, place: str) -> Splats:
             raise errors.SceneFileError(
                 f"{place}: expected the columns of a Gaussian splat, not found: {', '.join(missing)}"
             )
-        values = np.stack([table[column].astype(np.float32) for column in columns], axis=-1)
+        with np.errstate(over="ignore"):  # what is beyond single precision becomes infinite
+            values = np.stack([table[column].astype(np.float32) for column in columns], axis=-1)
         if not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
             raise errors.SceneFileError(f"{place}: row {row}: expected finite {columns[0]}.., found NaN or infinity")
@@ -213,12 +225,24 @@ def _to_splats(table: np.ndarray, place: str) -> Splats:
         sh = np.concatenate([sh, channels.transpose(0, 2, 1)], axis=1)
     encoding = sum(name.startswith("obj_dc_") for name in names)
     quats = stack([f"rot_{i}" for i in range(4)]).astype(np.float64)
-    return Splats(
+    splats = Splats(
         means=stack(list("xyz")),
         quats=rotations.normalize(quats).astype(np.float32),
         log_scales=stack([f"scale_{i}" for i in range(3)]),
         opacity_logits=stack(["opacity"])[:, 0],
         sh=np.ascontiguousarray(sh),
         identities=stack([f"obj_dc_{i}" for i in range(encoding)]) if encoding else None,
-        object_ids=table["obj_id"].astype(np.int32) if "obj_id" in names else None,
+        object_ids=_whole(table["obj_id"], f"{place}: obj_id") if "obj_id" in names else None,
     )
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "identities"):
+        if getattr(splats, name) is not None:
+            validation.check_range(name, getattr(splats, name), place)
+    return splats
+
+
+def _whole(values: np.ndarray, place: str) -> np.ndarray:
+    """Ids as int32."""
+    least, most = np.iinfo(np.int32).min, np.iinfo(np.int32).max
+    if values.size and not (values.min() >= least and values.max() <= most):
+        raise errors.SceneFileError(f"{place}: expected whole numbers from {least} to {most}, found others")
+    return values.astype(np.int32)

@@ -110,11 +110,10 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
     for name, dtype in _DTYPES.items():
         if name in arrays and dtype is not None and arrays[name].dtype != dtype:
             _fail(place, name, f"dtype {np.dtype(dtype)}", arrays[name].dtype)
-    for name, limit in _LIMITS.items():
+    for name in _LIMITS:
         with guard():
             if name in arrays:
-                low = _LEAST_LOG_SCALE if "log_scales" in name else None
-                _check_range(place, name, arrays[name], limit, low)
+                check_range(name, arrays[name], place)
     with guard():
         check_meanings({name: getattr(scene, name) for name in EMBEDDINGS}, scene.lookup, place)
     with guard():
@@ -264,6 +263,12 @@ def check_meanings(arrays: Mapping[str, np.ndarray | None], table: Table | None,
 def _length(shapes: Mapping[str, tuple[int, ...]], name: str) -> int:
     """Rows of an array; 0 without it."""
     return next(iter(shapes.get(name, ())), 0)
+
+
+def check_range(name: str, values: np.ndarray, place: str) -> None:
+    """Raise `SceneFileError` where numbers that belong into a field of `Scene` are not finite or out of range."""
+    low = _LEAST_LOG_SCALE if "log_scales" in name else None
+    _check_range(place, name, values, _LIMITS[name], low)
 
 
 def _check_range(

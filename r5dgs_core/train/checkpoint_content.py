@@ -122,6 +122,7 @@ def _is_plain(tensor: Tensor) -> bool:
     """Return True for a dense tensor in memory; one whose elements share memory is none."""
     return (
         type(tensor) is Tensor
+        and not tensor.is_nested
         and tensor.layout == torch.strided
         and tensor.device.type == "cpu"
         and tensor.dtype in _DTYPES

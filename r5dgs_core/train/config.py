@@ -41,6 +41,8 @@ from .sections import (
     TrainSection,
 )
 
+_MOST_BYTES = 1 << 20  # of a configuration file
+
 
 @dataclass(frozen=True)
 class Config:
@@ -129,12 +131,17 @@ def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = 
     values: dict[str, Any] = {}
     if path is not None:
         try:
-            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            with open(path, "rb") as stream:
+                data = stream.read(_MOST_BYTES + 1)
         except FileNotFoundError:
             raise ConfigError(f"{path}: no such configuration file") from None
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read: {error}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        if len(data) > _MOST_BYTES:
+            raise ConfigError(f"{path}: expected at most {_MOST_BYTES >> 10} KiB, found more")
+        try:
+            values = tomllib.loads(data.decode("utf-8"))
+        except (ValueError, RecursionError) as error:  # ValueError: no TOML, no UTF-8, a number of too many digits
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
     if preset is not None:
         values = _merge_under(values, PRESETS[preset])
@@ -171,7 +178,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
         raise UsageError(f"--set {text}: expected SECTION.KEY=VALUE, for example losses.ssim=0.1")
     try:
         return name.strip(), tomllib.loads(f"x = {value}")["x"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # no TOML: text without quotes
         return name.strip(), value.strip()
 
 
@@ -190,11 +197,23 @@ def _suggest(name: str, known: Any) -> str:
     return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(sorted(known))}"
 
 
+def _check_writable(name: str, value: object) -> None:
+    """Raise ConfigError for integers and text that ``run.json`` cannot hold."""
+    if isinstance(value, int) and abs(value) >= 1 << 63:
+        raise ConfigError(f"{name}: expected a number of at most 64 bits, got a longer one")
+    try:
+        if isinstance(value, str):
+            value.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{name}: expected text in UTF-8, got {value!a:.60}") from None
+
+
 def _check(name: str, value: Any, kind: type) -> Any:
+    _check_writable(name, value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ConfigError(f"{name}: expected {kind.__name__}, got {value!r}")
+        raise ConfigError(f"{name}: expected {kind.__name__}, got {value!r:.200}")
     if kind in (int, float) and not 0 <= value < math.inf:
         raise ConfigError(f"{name}: expected a finite number that is not negative, got {value!r}")
     good, expected = _RULES.get(name, (None, ""))

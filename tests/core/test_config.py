@@ -166,3 +166,27 @@ def test_a_file_with_faults_is_named_beside_a_preset_too(tmp_path):
 def test_overrides_change_a_configuration_that_is_there():
     made = config.load(None, ["train.seed=3"]).override(["losses.ssim=0.5", "needs.shadows=off"])
     assert (made.train.seed, made.losses.ssim, made.needs.shadows) == (3, 0.5, "off")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[train]\niterations = " + "9" * 5000,
+        "a = " + "[" * 5000,
+        "[losses]\nssim = 1" + "0" * 400,
+        "#" * (1 << 20) + "\n",
+    ],
+)
+def test_a_file_that_no_configuration_can_be_is_one_error(tmp_path, text):
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"c\.toml|losses\.ssim"):
+        config.load(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["train.iterations=" + "9" * 5000, "losses.ssim=1" + "0" * 400, "train.background=" + "[" * 5000]
+)
+def test_an_override_that_no_key_can_hold_is_one_error(text):
+    with pytest.raises(ConfigError, match="--set"):
+        config.load(None, [text])

@@ -91,7 +91,7 @@ def test_ascii_files_are_read(tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(header("ascii", COLUMNS, 1) + (" ".join(map(str, ROW)) + "\n").encode())
     expect_row(ply.read(path))
-    path.write_bytes(header("ascii", COLUMNS, 1) + b"1 2 3\n")
+    path.write_bytes(header("ascii", COLUMNS, 1) + b"1 2 3\n" + b" " * 40)
     with pytest.raises(errors.SceneFileError, match="row 0: expected 15 numbers, found 3"):
         ply.read(path)
     path.write_bytes(header("ascii", COLUMNS, 1) + b"a " * 15 + b"\n")
@@ -152,3 +152,39 @@ def test_missing_files_and_folders_are_clear_errors(tmp_path):
         ply.read(tmp_path / "absent.ply")
     with pytest.raises(errors.SceneFileError, match="cannot be written"):
         ply.write(splats(), tmp_path / "absent" / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [
+        ("1000000000000", "truncated"),
+        ("9" * 5000, "PLY statement"),
+        ("-1", "PLY statement"),
+        ("2", "truncated|row 0: expected"),
+    ],
+)
+@pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
+def test_counts_beyond_the_file_are_refused_before_anything_is_allocated(tmp_path, layout, count, message):
+    path = tmp_path / "a.ply"
+    text = header(layout, COLUMNS, 1).replace(b"element vertex 1", f"element vertex {count}".encode())
+    path.write_bytes(text + bytes(4 * len(COLUMNS)))
+    with pytest.raises(errors.SceneFileError, match=message):
+        ply.read(path)
+
+
+@pytest.mark.parametrize(("column", "value"), [("x", 3e38), ("scale_1", 100.0), ("f_dc_0", 1e30), ("opacity", 1e20)])
+def test_numbers_that_cannot_be_drawn_are_refused(tmp_path, column, value):
+    path = tmp_path / "a.ply"
+    row = [value if name == column else 0.5 for name, _ in COLUMNS]
+    path.write_bytes(header("ascii", COLUMNS, 1) + (" ".join(map(str, row)) + "\n").encode())
+    with pytest.raises(errors.SceneFileError, match="expected finite numbers up to"):
+        ply.read(path)
+
+
+@pytest.mark.parametrize("value", ["nan", "1e30"])
+def test_ids_that_are_no_whole_numbers_of_32_bits_are_refused(tmp_path, value):
+    path = tmp_path / "a.ply"
+    row = ["0.5"] * len(COLUMNS) + [value]
+    path.write_bytes(header("ascii", [*COLUMNS, ("obj_id", "float")], 1) + (" ".join(row) + "\n").encode())
+    with pytest.raises(errors.SceneFileError, match="obj_id"):
+        ply.read(path)

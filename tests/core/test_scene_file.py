@@ -386,3 +386,65 @@ def test_info_tells_what_the_file_holds(scene):
     assert sum(o["gaussians"] for o in info["objects"]) == 300
     assert sum(g["gaussians"] for g in info["motion_groups"]) == 300
     assert info["motion_groups"][-1]["model"] == "follows 1"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (setter("groups", 1, "model", "velocity", [1e308, 0, 0]), "velocity: expected numbers up to 1e.15"),
+        (setter("groups", 1, "model", "angular_velocity", [0, 1e9, 0]), "angular_velocity"),
+        (setter("groups", 1, "model", "covariance_names", ["bite.x"]), "covariance_names"),
+        (setter("groups", 1, "pivot", [1e300, 0, 0]), "pivot"),
+        (setter("groups", -1, "follow_matrix", [[1e300] * 3] * 3), "follow_matrix"),
+        (setter("groups", []), "track_poses|group"),
+        (setter("cameras", 0, "intrinsics", [[1, 0, 0], [5, 1, 0], [0, 0, 1]]), r"expected 0 at index \(1, 0\)"),
+        (setter("cameras", 0, "intrinsics", [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]), "focal lengths above 0"),
+        (setter("cameras", 0, "height", 10**9), "a width and height of 1 to"),
+        (setter("objects", 1, "id", 2**40), "increasing ids"),
+        (setter("objects", 1, "color", [1e300, 0, 0]), "a color of numbers from 0 to 1"),
+        (setter("frames_per_unit", 1e300), "frames_per_unit"),
+        (setter("near_plane", 1e300), "near_plane"),
+        (lambda tree: json.dumps(tree).replace('"synthetic"', '"\\ud800"').encode(), "surrogates"),
+        (lambda tree: json.dumps(tree).replace('"t_max": 0.75', '"t_max": ' + "9" * 400).encode(), "64 bits"),
+        (lambda tree: json.dumps(tree).replace('"t_max": 0.75', '"t_max": 0.75, "t_max": 1').encode(), "occurs twice"),
+        (setter("provenance", json.loads("[" * 63 + "]" * 63)), "nested deeper|provenance"),
+    ],
+)
+def test_what_could_not_be_played_or_written_is_refused_on_reading(path, tmp_path, change, message):
+    broken = rewrite(path, tmp_path / "broken.r5dgs", change_json=change)
+    with pytest.raises(errors.SceneFileError, match=message):
+        scene_file.read(broken)
+
+
+@pytest.mark.parametrize(
+    ("member", "value"),
+    [("means", 3e38), ("log_scales", 80.0), ("sh", 1e30), ("track_poses", 1e200), ("track_times", -1e300)],
+)
+def test_numbers_that_no_picture_can_show_are_refused(scene, tmp_path, member, value):
+    exact = scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True)
+    array = getattr(scene, member).copy()
+    array.reshape(len(array), -1)[0, -1] = value
+    broken = rewrite(exact, tmp_path / "broken.r5dgs", replace={f"{member}.npy": npy(array)})
+    with pytest.raises(errors.SceneFileError, match=f"{member}: expected finite numbers up to"):
+        scene_file.read(broken)
+
+
+def test_what_json_cannot_hold_is_not_written(scene, tmp_path):
+    for provenance in ({"a": float("nan")}, {"a": "\ud800"}, {"a": 10**400}, {"a": json.loads("[" * 80 + "]" * 80)}):
+        with pytest.raises(errors.SceneFileError, match=r"scene\.json"):
+            scene_file.write(dataclasses.replace(scene, provenance=provenance), tmp_path / "a.r5dgs")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checking_many_groups_takes_calls_in_proportion_to_their_number(monkeypatch):
+    """Each table of ids is built once, not once for each group."""
+    built = []
+    scene = make_scene(n=120, objects=40)
+
+    class Counted(tuple):
+        def __iter__(self):
+            built.append(1)
+            return super().__iter__()
+
+    scene_file.validation.check(dataclasses.replace(scene, objects=Counted(scene.objects)), "scene")
+    assert len(built) < 20
