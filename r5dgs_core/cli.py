@@ -83,7 +83,7 @@ def _associate(args: argparse.Namespace) -> None:
 
 
 def _bake(args: argparse.Namespace) -> None:
-    options = {"threads": args.threads, "progress_kind": args.progress}
+    options = {"with_needs": args.needs, "threads": args.threads, "progress_kind": args.progress}
     commands.run_bake(args.run, args.out, args.data, command_options.overrides(args), **options)
 
 
@@ -142,7 +142,7 @@ def _check(args: argparse.Namespace) -> ExitStatus | None:
 def _info(args: argparse.Namespace) -> None:
     from . import commands_info
 
-    commands_info.run_info(args.file, as_json=args.json)
+    commands_info.run_info(args.file, with_needs=args.needs, as_json=args.json)
 
 
 def _objects(args: argparse.Namespace) -> None:

@@ -138,6 +138,7 @@ def _bake(commands: Any) -> None:
     p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
     p.add_argument("--data", type=Path, metavar="DIR", help="data set, if it was moved")
     command_options.add_overrides(p, "needs.NAME=on|off", "override a need")
+    p.add_argument("--needs", action="store_true", help="print the table of what the scene needs, too")
     command_options.add_threads(p)
     command_options.add_progress(p)
 
@@ -242,6 +243,7 @@ def _info(commands: Any) -> None:
         "command_line.md",
     )
     p.add_argument("file", type=Path, help=".r5dgs file")
+    p.add_argument("--needs", action="store_true", help="print the table of what the scene needs, too")
     p.add_argument("--json", action="store_true", help="print everything as JSON")
 
 

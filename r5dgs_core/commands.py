@@ -74,10 +74,11 @@ def run_bake(
     data: Path | None,
     overrides: Sequence[str] = (),
     *,
+    with_needs: bool = False,
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> None:
-    """Turn a run into a scene file (see `train.bake.run_bake`) and say what the scene needs."""
+    """Turn a run into a scene file (see `train.bake.run_bake`) and print a summary, on demand with the needs table."""
     input_paths.check_scene_output(out)
     configs.require_needs(overrides)
     input_paths.check_run(run_folder)
@@ -85,7 +86,7 @@ def run_bake(
         input_paths.check_dataset(data)
 
     from .progress import make
-    from .report import table
+    from .report import motion_words, table
     from .train import bake
 
     use_threads(threads)
@@ -96,8 +97,9 @@ def run_bake(
             progress({"event": "written", "scene": str(out)})
     if progress_kind == "json":
         return
-    _tell_scene(scene, out)
-    terminal.console().print(table.needs(scene.needs))
+    print(f"written: {terminal.printable(str(out))}\n{motion_words.summary(scene, out)}")
+    if with_needs:
+        terminal.console().print(table.needs(scene.needs))
 
 
 @folder_lock.writes("out")

@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 from . import input_paths, terminal
 
 
-def run_info(path: Path, *, as_json: bool) -> None:
-    """Say what is in a scene file."""
+def run_info(path: Path, *, with_needs: bool = False, as_json: bool = False) -> None:
+    """Print a summary of a scene file.
+
+    Args:
+        path: The scene file.
+        with_needs: Print the table of what the scene needs, too.
+        as_json: Print everything that the file says of the scene as JSON instead.
+    """
     input_paths.check_scene(path)
     from .scene import scene_file
 
-    found = scene_file.info(scene_file.read(path))
+    scene = scene_file.read(path)
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(scene_file.info(scene), indent=2))
         return
-    for key, value in found.items():
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            print(f"{key}:")
-            for row in value:
-                print(
-                    "  "
-                    + "  ".join(f"{name}={_short(item)}" for name, item in row.items() if item not in ("", [], None))
-                )
-        else:
-            print(f"{key}: {_short(value)}")
+    from .report import motion_words
 
+    print(motion_words.summary(scene, path))
+    if with_needs:
+        from .report import table
 
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else terminal.printable(str(value))
+        terminal.console().print(table.needs(scene.needs))

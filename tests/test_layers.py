@@ -55,7 +55,7 @@ ALLOWED = {
     "commands_bench": {"scene", "train", "bench", "commands"},
     "stability_training": {"data", "raster", "train", "report"},
     "check": {"terminal", "motion", "scene", "data", "train"},
-    "commands_info": {"terminal", "scene"},
+    "commands_info": {"terminal", "scene", "report"},
     "commands_check": {"terminal", "check"},
     "commands_config": {"train", "user_settings"},
     "commands_association": {"scene", "data", "semantics", "commands", "progress", "folder_lock"},

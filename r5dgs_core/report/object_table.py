@@ -17,17 +17,9 @@ from ..scene import playback
 from ..scene.scene import MotionGroup, Scene
 from ..semantics import standpoints
 from . import evaluate, overlap
+from .motion_words import motion_of
 
 MOST_VIEWS = 24  # that pixels are counted in
-STILL = 0.05  # of its radius: less than this is no motion
-_KINDS = {  # as the sidebar in Blender calls them
-    "static": "rests",
-    "translation": "slide",
-    "ballistic_spin": "throw+spin",
-    "constant_twist": "screw",
-    "world_twist": "orbit",
-    "free_top": "tumble",
-}
 
 
 @dataclass(frozen=True)
@@ -155,24 +147,6 @@ def strays(scene: Scene) -> dict[int, int]:
     away = (owner != labels) & ((owner > 0) | np.isin(labels, list(bodies.values())))
     ids, counts = np.unique(scene.object_ids[away], return_counts=True)
     return dict(zip(ids.tolist(), counts.tolist(), strict=True))
-
-
-def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
-    """How an object moves past t_max, by its motion models, in words; "pinned" where no group of it can move."""
-    words = []
-    for group in groups:
-        if group.model.kind == "static" and _moved(scene, group) <= STILL * group.model.radius:
-            words.append("still")
-        else:
-            words.append(_KINDS[group.model.kind])
-    return ", ".join(dict.fromkeys(words)) or "pinned"
-
-
-def _moved(scene: Scene, group: MotionGroup) -> float:
-    """The way that a member at the group's radius makes at most in the observed time, world units."""
-    poses = scene.track_poses[group.id]
-    chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
-    return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
 
 
 def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:

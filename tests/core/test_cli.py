@@ -19,7 +19,7 @@ from r5dgs_core.bench import variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.exit_status import ExitStatus
 from r5dgs_core.raster import compile as compilation
-from r5dgs_core.report import evaluate
+from r5dgs_core.report import evaluate, motion_words
 from r5dgs_core.scene import files, modes, scene_file
 from r5dgs_core.time_left import Timed
 from r5dgs_core.train import checkpoint, presets
@@ -84,7 +84,32 @@ def test_info_tells_the_same_to_people_and_programs(made, capsys):
     assert [o["name"] for o in found["objects"]] == ["background", "brick", "ball"]
     assert cli.main(["info", str(made[1])]) == 0
     text = capsys.readouterr().out
-    assert "brick" in text and str(found["gaussians"]) in text
+    assert f"{found['gaussians']} Gaussians, 2 objects" in text
+    start, end = found["times"]
+    frames = round((end - start) * found["frames_per_unit"]) + 1
+    assert f"duration   {frames} frames: scene time {start:g} to {end:g}" in text
+    assert f"{found['frames_per_unit']:g} per unit" in text and f"{found['extent']:.3g} world units" in text
+    assert "quality" in text and "regrouping" not in text
+    assert cli.main(["info", str(made[1]), "--needs"]) == 0
+    assert capsys.readouterr().out.startswith(text) and all(need["name"] for need in found["needs"])
+
+
+def test_a_summary_names_what_moves_and_how(scene):
+    text = motion_words.summary(scene)
+    resting = {item.name for item in scene.objects if motion_words.observed_motion(scene, item.id) is None}
+    assert "background" in resting and len(resting) < len(scene.objects)
+    for item in scene.objects:
+        assert (f"\n  {item.name}: " in text) == (item.name not in resting)
+    shown = [item for item in scene.objects if item.id > 0]
+    assert f"moving     {len(scene.objects) - len(resting)} of {len(shown)} objects" in text
+
+
+def test_bake_prints_the_summary_and_the_needs_on_demand(made, tmp_path, capsys):
+    scene = tmp_path / "again.r5dgs"
+    for extra, shown in (([], False), (["--needs"], True)):
+        assert cli.main(["bake", str(made[0]), "--out", str(scene), "--progress", "none", *extra]) == 0
+        text = capsys.readouterr().out
+        assert text.startswith(f"written: {scene}\nscene ") and ("what the scene needs" in text) == shown
 
 
 def test_missing_things_are_one_line(tmp_path, tiny, made, capsys):
@@ -392,6 +417,7 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
     ["query", "nowhere", "mug", "--threshold", "2"],
     ["name", "nowhere", "1", "mug"],
     ["name", "nowhere", "1"],
+    ["check", "nowhere"],
     ["config", "nowhere"],
     ["config", "--user", "get"],
     ["warm-up", "now"],

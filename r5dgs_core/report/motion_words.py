@@ -1,0 +1,76 @@
+"""Motion of objects in words, and the summary of a scene that ``r5dgs info`` and ``bake`` print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from .. import terminal
+from ..scene import quality
+from ..scene.scene import MotionGroup, Scene
+
+STILL = 0.05  # of its radius: less than this is no motion
+_KINDS = {  # as the sidebar in Blender calls them
+    "static": "rests",
+    "translation": "slide",
+    "ballistic_spin": "throw+spin",
+    "constant_twist": "screw",
+    "world_twist": "orbit",
+    "free_top": "tumble",
+}
+
+
+def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
+    """Motion of an object past t_max in words, by its motion models; "pinned" if none of its groups can move."""
+    words = []
+    for group in groups:
+        if group.model.kind == "static" and _moved(scene, group) <= STILL * group.model.radius:
+            words.append("still")
+        else:
+            words.append(_KINDS[group.model.kind])
+    return ", ".join(dict.fromkeys(words)) or "pinned"
+
+
+def _moved(scene: Scene, group: MotionGroup) -> float:
+    """Largest displacement of a member at the group's radius in the observed time, world units."""
+    poses = scene.track_poses[group.id]
+    chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
+    return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
+
+
+def summary(scene: Scene, path: Path | None = None) -> str:
+    """Return what a user wants to know of a scene: duration, frames, extent, moving objects and quality, in lines.
+
+    Args:
+        scene: The scene.
+        path: Its file; an evaluation beside it gives the quality of the pictures.
+    """
+    objects = [item for item in scene.objects if item.id > 0]
+    first, fps = float(scene.track_times[0]), scene.frames_per_unit
+    frames = round((scene.t_max - first) * fps) + 1
+    moving = [(item.name, motion) for item in objects if (motion := observed_motion(scene, item.id)) is not None]
+    count = "1 object" if len(objects) == 1 else f"{len(objects)} objects"
+    lines = [
+        f"scene      {terminal.printable(scene.name)}: {len(scene.means)} Gaussians, {count}",
+        f"duration   {frames} frame{'s' * (frames != 1)}: scene time {first:g} to {scene.t_max:g}, then predicted",
+        f"frames     {fps:g} per unit of scene time (per second if the data set's times are seconds)",
+        f"extent     {scene.extent:.3g} world units",
+        f"moving     {len(moving)} of {len(objects)} objects",
+        *(f"  {terminal.printable(name)}: {motion}" for name, motion in moving),
+        f"quality    {quality.of(scene, path).text()}",
+    ]
+    return "\n".join(lines)
+
+
+def observed_motion(scene: Scene, object_id: int) -> str | None:
+    """Return how far an object moves and turns in the observed time, and its motion past t_max; None if it rests."""
+    groups = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
+    if not groups or motion_of(scene, groups) in ("still", "pinned"):
+        return None
+    poses = np.concatenate([scene.track_poses[group.id] for group in groups])
+    away = float(np.linalg.norm(poses[:, 4:], axis=1).max())
+    sines = np.clip(np.linalg.norm(poses[:, 1:4], axis=1), 0, 1)
+    degrees = float(np.degrees(2 * np.arcsin(sines)).max())
+    return f"{away:.2g} world units and {degrees:.0f} degrees from its last pose; then {motion_of(scene, groups)}"
