@@ -93,8 +93,10 @@ def _picture(scale: float, shape: tuple[float, float, float] = (0.1, 0.1, 0.1), 
     means = scale * body() + at * np.array([0.0, 0.0, 1.0])
     count = len(means)
     turns = np.random.default_rng(0).normal(size=(count, 4))
-    inputs = (means, turns, np.tile(scale * np.array(shape), (count, 1)), np.full(count, 0.7), np.eye(count)[:, :3])
-    drawn = rasterize_splats(*(torch.tensor(each, dtype=torch.float32) for each in inputs), _looking(4 * scale))
+    scales = np.tile(scale * np.array(shape), (count, 1))
+    channels = np.eye(count)[:, :3]
+    floats = [torch.tensor(each, dtype=torch.float32) for each in (means, turns, scales, np.full(count, 0.7), channels)]
+    drawn = rasterize_splats(floats[0], floats[1], floats[2], floats[3], floats[4], _looking(4 * scale))
     return drawn.image.numpy()
 
 
