@@ -11,6 +11,8 @@ from . import commands, errors, folder_lock, strict_json, terminal
 from .time_left import Phase
 
 NAME = "tabletop"
+EXPECTED = {"val": 41.0, "test": 37.0}  # mean PSNR of a healthy run, dB; test lies past t_max
+TOLERANCE = 1.0  # dB below it at which `.ci/run` fails
 AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # what follows training; costs as measured
 
 
@@ -93,7 +95,23 @@ def run_demo(
     if progress_kind != "json":
         print(f"scene:         {scene_path}\ncontact sheet: {sheet}\ntable:         {json_path}")
         print(f"{time.monotonic() - began:.0f} s in all; open the scene in Blender: File > Import > R5DGS scene")
+        print(expectation())
     return result
+
+
+def expectation() -> str:
+    """Return the line that says what a healthy run of the demo gives."""
+    return f"expected about {EXPECTED['val']:.0f} / {EXPECTED['test']:.0f} dB (val / test)"
+
+
+def shortfalls(evaluation: dict[str, Any]) -> list[str]:
+    """Return a line for each split of an evaluation that lies more than `TOLERANCE` below `EXPECTED`."""
+    found = {split: evaluation["splits"][split]["rigid"]["psnr"] for split in EXPECTED}
+    return [
+        f"{split}: PSNR {found[split]:.2f} dB, expected about {wanted:g} dB"
+        for split, wanted in EXPECTED.items()
+        if not found[split] >= wanted - TOLERANCE
+    ]
 
 
 def _is_demo(run_file: Path) -> bool:

@@ -83,6 +83,7 @@ def fit(
     weights: np.ndarray | None = None,  # [S]
     candidates: Sequence[str] | None = None,
     inertia: np.ndarray | None = None,  # [3, 3]
+    least_noise: tuple[float, float] = (0.0, 0.0),
 ) -> Fit:
     """Fit the family to a pose track and choose.
 
@@ -96,6 +97,8 @@ def fit(
         inertia: Of the group in the bind state, up to a factor (`top.inertia`), or None. With it a body that spins
             about a changing axis may be a free top: tried only where one of the best others has such a spin, and taken
             where it predicts the held-out poses better. [3, 3]
+        least_noise: Noise of displacements (per component, world units) and rotations (rad) that the poses have at
+            least, where more is known of it than their scatter about a smooth motion shows.
 
     Returns:
         The fit. With fewer than four poses of positive weight it is at most a velocity and a spin; with one, static.
@@ -127,6 +130,7 @@ def fit(
 
     tried = tuple(c for c in family if not c.oscillates or families.may_swing(c, track))
     sigmas, outliers = _noise(track, tried)
+    sigmas = (max(sigmas[0], least_noise[0] / radius), max(sigmas[1], least_noise[1]))
     scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
     solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
     # Without a frequency that the poses determine, no swing: then others may be near the best.

@@ -9,37 +9,45 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from ..data import dataset as datasets
 from ..data.dataset import Dataset
-from ..errors import CheckpointError
+from ..errors import CheckpointError, DatasetError
 from ..model import spherical_harmonics
-from ..motion import fitting, gravity, rotations, top
+from ..motion import rotations
 from ..motion.models import MotionModel
 from ..scene import residuals, visibility
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 from . import (
     checkpoint,
-    falling,
+    checkpoint_content,
     groups,
+    image_evidence,
     label_hygiene,
     mask_stack,
     needs,
-    plain_motion,
     point_baking,
+    probing,
     representation,
+    simplify_motion,
     track_checks,
+    views,
 )
 from . import config as configs
 from . import shading as shading_vectors
+from .config import Config
 from .normalization import Normalization
 from .sections import NeedsSection
+
+log = logging.getLogger(__name__)
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
@@ -71,8 +79,8 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     light, strength = _unit(motion.light)
     cloud.shading *= strength
     names = {int(i): dataset.object_names.get(int(i), f"object {i}") for i in tensors["object_ids"]}
-    bound = _bind(cloud, motion, norm, light, wanted, names, dataset.world_convention)
-    rows, track_poses = bound.rows, bound.played
+    bound = _bind(cloud, motion, norm, light, wanted, names)
+    rows = bound.rows
     order = np.lexsort((cloud.motion_ids, cloud.object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
     single: dict[str, Any] = {}
@@ -85,27 +93,12 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         from . import residual
 
         bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
-    bases, classified = cloud.sh.shape[1], cloud.identities is not None
-    decisions = needs.decide(
-        rows,
-        track_poses,
-        cloud.motion_ids,
-        cloud.shading,
-        light,
-        used_background,
-        bases,
-        classified,
-        wanted,
-        bent,
-        motion.moves,
-    )
-    keep_shading = bool(run.config.train.shading) and needs.is_on(decisions, "shading")
-    identities = cloud.identities if needs.is_on(decisions, "classifier") else None
-    if not needs.is_on(decisions, "residuals"):
+    if not bent[2] or wanted.residuals == "off":
         single = {name: value for name, value in single.items() if not name.startswith("residual_")}
     elif "residual_rows" in single:
         stored = single["residual_rows"], single["residual_offsets"]
         rows = point_baking.departures(rows, cloud.motion_ids[order], *stored)
+    shaded = bool(run.config.train.shading) and wanted.shading != "off"
     rank = np.argsort(order)
     rows = [
         dataclasses.replace(row, anchor_index=int(rank[row.anchor_index])) if row.anchor_index >= 0 else row
@@ -121,7 +114,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         object_ids=cloud.object_ids[order],
         motion_ids=cloud.motion_ids[order],
         track_times=motion.times.astype(np.float64),
-        track_poses=track_poses,
+        track_poses=bound.played,
         objects=_objects(cloud.object_ids[order], tensors["object_ids"].numpy(), dataset),
         groups=tuple(rows),
         t_max=float(motion.times[-1]),
@@ -129,12 +122,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         world_convention=dataset.world_convention,
         cameras=dataset.cameras,
         background_sh=used_background.astype(np.float32),
-        identities=None if identities is None else identities[order].astype(np.float16),
-        classifier_weight=tensors["classifier.weight"].numpy() if identities is not None else None,
-        classifier_bias=tensors["classifier.bias"].numpy() if identities is not None else None,
-        shading=cloud.shading[order].astype(np.float32) if keep_shading else None,
-        shading_rest=cloud.rest[order].astype(np.float32) if keep_shading and (cloud.rest != 1).any() else None,
-        light_direction=light if keep_shading else None,
+        shading=cloud.shading[order].astype(np.float32) if shaded else None,
+        shading_rest=cloud.rest[order].astype(np.float32) if shaded and (cloud.rest != 1).any() else None,
+        light_direction=light if shaded else None,
         provenance={
             "config": run.config.to_dict(),
             "dataset_digest": run.digest,
@@ -147,11 +137,39 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
                 "finished": state.finished,
             },
         },
-        needs=(*decisions, *bound.of_objects),
         near_plane=NEAR_PLANE * norm.scale,
         origin=dataset.origin,
         **single,
     )
+    observed = np.stack([group.observed for group in motion.groups])
+    trained = scene
+    simplified = simplify_motion.simplify(scene, observed, _evidence(scene, dataset, run.config), wanted)
+    scene = simplified.scene
+    decisions = needs.decide(
+        scene.groups,
+        scene.track_poses,
+        cloud.motion_ids,
+        cloud.shading,
+        light,
+        used_background,
+        cloud.sh.shape[1],
+        cloud.identities is not None,
+        wanted,
+        bent,
+        motion.moves,
+    )
+    scene = dataclasses.replace(scene, needs=(*decisions, *simplified.rows))
+    if not needs.is_on(decisions, "shading"):
+        scene = dataclasses.replace(scene, shading=None, shading_rest=None, light_direction=None)
+    if cloud.identities is not None and needs.is_on(decisions, "classifier"):
+        scene = dataclasses.replace(
+            scene,
+            identities=cloud.identities[order].astype(np.float16),
+            classifier_weight=tensors["classifier.weight"].numpy(),
+            classifier_bias=tensors["classifier.bias"].numpy(),
+        )
+    compared = _on_training_views(tensors, trained, scene, dataset, run.config)
+    scene = dataclasses.replace(scene, provenance=scene.provenance | compared)
     cleaned = label_hygiene.changes_of(tensors)
     if cleaned is not None:
         scene = dataclasses.replace(scene, provenance=scene.provenance | {"label_hygiene": cleaned})
@@ -159,6 +177,41 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         return scene
     counts = dataclasses.asdict(motion.moves) | {"unexplained": len(residuals.unexplained(scene))}
     return dataclasses.replace(scene, provenance=scene.provenance | {"regrouping": counts})
+
+
+def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.ImageEvidence | None:
+    """What the training images say of a scene's motion; None if nothing moves, or with a warning if one is missing."""
+    if not np.any(scene.track_poses[..., 1:] != 0):
+        return None
+    sampled = image_evidence.sample(dataset.train)
+    try:
+        return image_evidence.ImageEvidence(scene, sampled, views.behind(dataset, config))
+    except DatasetError as error:
+        log.warning(
+            "the motion is simplified without the training images, so only what is too small to be seen is left out: "
+            "%s. Remedy: name the data with --data",
+            error,
+        )
+        return None
+
+
+def _on_training_views(
+    tensors: dict[str, Tensor], trained: Scene, scene: Scene, dataset: Dataset, config: Config
+) -> dict[str, Any]:
+    """PSNR of the checkpoint and of the scene on the training views, for the provenance; empty if one is missing.
+
+    A checkpoint of an unfinished or older run does not hold its own; the scene with the trained motion stands for it.
+    """
+    behind = views.behind(dataset, config)
+    try:
+        baked = probing.training_psnr(dataset, behind, image_evidence.painter(scene))
+        if checkpoint_content.TRAIN_PSNR in tensors:
+            before = float(tensors[checkpoint_content.TRAIN_PSNR])
+        else:
+            before = probing.training_psnr(dataset, behind, image_evidence.painter(trained))
+    except DatasetError:  # `_evidence` says so
+        return {}
+    return {"training_views": {"checkpoint_psnr": before, "baked_psnr": baked}}
 
 
 @dataclass
@@ -192,21 +245,19 @@ class _Cloud:
 
 @dataclass(frozen=True)
 class _Bound:
-    """What `_bind` finds.
+    """The groups as `_bind` leaves them.
 
     Attributes:
-        rows: The scene's groups.
+        rows: The scene's groups, with static models.
         trained: Their poses relative to the bind state as they were trained. [G, S, 7]
         pivots: Points that these turn about. [G, 3]
-        played: As the scene plays them, without what is still, switched off or noise. [G, S, 7]
-        of_objects: Rows of the needs table for each object.
+        played: The same poses without what the user switched off. [G, S, 7]
     """
 
     rows: list[MotionGroup]
     trained: np.ndarray
     pivots: np.ndarray
     played: np.ndarray
-    of_objects: list[dict[str, Any]]
 
 
 def _observed(
@@ -259,11 +310,9 @@ def _bind(
     light: np.ndarray,
     wanted: NeedsSection,
     names: dict[int, str],
-    convention: str,
 ) -> _Bound:
-    """Bring the Gaussians to the bind state, in place, and fit the motion of their groups."""
-    rows, trained, pivots, played, of_objects = [], [], [], [], []
-    fits: dict[int, tuple[gravity.Track, fitting.Fit]] = {}
+    """Bring the Gaussians to the bind state, in place."""
+    rows, trained, pivots, played = [], [], [], []
     opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     for index, group in enumerate(motion.groups):
         group = track_checks.sound(group, names.get(group.object_id, "background"))
@@ -287,26 +336,12 @@ def _bind(
         radius = max(_radius(cloud.means[members], opacities[members], pivot), 1e-9 * norm.scale)
         if wanted.rotation == "off":
             poses[:, :4] = needs.STILL_QUAT
-        if needs.is_pinned(group.role, poses, radius, wanted):
+        if group.role == "pinned" or wanted.tracks == "off":
             poses[:] = [1.0, 0, 0, 0, 0, 0, 0]
-        model = MotionModel(radius=radius)
-        if group.role == "body" and np.any(poses[:, 1:] != 0):
-            track_checks.warn_of_aliasing(names[group.object_id], motion.times, poses)
-            track = gravity.Track(motion.times, poses[:, :4], poses[:, 4:], group.observed.astype(np.float64))
-            body = top.inertia(cloud.means[members][visibility.seen(opacities[members])])
-            fit = fitting.fit(
-                track.times, track.quats, track.displacements, radius=radius, weights=track.weights, inertia=body
-            )
-            fits[index] = track, fit
-            plain = plain_motion.reduce(names[group.object_id], motion.times, poses, fit)
-            poses, model, pivot = plain.poses, plain.model, pivot + plain.shift
-            cloud.means[members] += plain.shift
-            of_objects += plain.rows
         played.append(poses)
         anchor = _anchor(np.flatnonzero(members), cloud.means[members], opacities[members], pivot)
-        rows.append(_motion_group(index, group, motion.times, pivot, model, anchor))
-    rows = falling.share_gravity(rows, fits, played, convention, names)
-    return _Bound(rows, np.stack(trained), np.stack(pivots), np.stack(played), of_objects)
+        rows.append(_motion_group(index, group, motion.times, pivot, MotionModel(radius=radius), anchor))
+    return _Bound(rows, np.stack(trained), np.stack(pivots), np.stack(played))
 
 
 def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np.ndarray) -> np.ndarray:

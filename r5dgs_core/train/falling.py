@@ -2,40 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from ..motion import fitting, gravity
-from ..scene.scene import MotionGroup
-from . import plain_motion
+from ..motion.models import MotionModel
 
 UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}  # others do not say
 
 
-def share_gravity(
-    rows: list[MotionGroup],
-    fits: dict[int, tuple[gravity.Track, fitting.Fit]],
-    played: list[np.ndarray],
-    convention: str,
-    names: dict[int, str],
-) -> list[MotionGroup]:
-    """The groups, those that fall alike with one acceleration between them.
+def share_gravity(fits: dict[int, tuple[gravity.Track, fitting.Fit]], convention: str) -> dict[int, MotionModel]:
+    """Models of the fits; bodies that fall alike have one acceleration between them.
 
     Args:
-        rows: The scene's groups.
-        fits: Per index of a group with a motion: its track and what was fitted to it.
-        played: Poses of all groups as the scene plays them. [S, 7] each
+        fits: By the index of a group: its track and what was fitted to it.
         convention: World axes of the scene.
-        names: Of the objects, by id.
     """
+    models = {index: fit.model for index, (_, fit) in fits.items()}
     if convention not in UP or not fits:
-        return rows
+        return models
     tracks, found = zip(*fits.values(), strict=True)
     shared, who = gravity.share(tracks, found, UP[convention])
-    rows = list(rows)
-    for k in who:
-        index = list(fits)[k]
-        plain = plain_motion.reduce(names[rows[index].object_id], tracks[k].times, played[index], shared[k])
-        rows[index] = dataclasses.replace(rows[index], model=plain.model)
-    return rows
+    return models | {list(fits)[k]: shared[k].model for k in who}

@@ -1,7 +1,7 @@
 """What a scene does not need and therefore does not carry: the table of decisions, with the number behind each.
 
 ``needs.NAME`` of the configuration is the user's word on a row: it wins over the number, in training (`resolve`) and in
-baking (`decide`, `is_pinned`).
+baking (`decide`, `simplify_motion`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from .groups import Moves
 from .sections import NeedsSection
 
 STILL_QUAT = rotations.identity()
-STILL = 0.0025  # displacement over the observed time, as a share of the group's diameter, below which it is static
-TURN = 0.002  # rotation in radians over the observed time below which a group only slides
+STILL = 0.0025  # displacement, as a share of the group's diameter, that counts as rest if the images are missing
+TURN = 0.002  # rotation in radians that counts as none if the images are missing
 SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
 SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
 
@@ -68,18 +68,6 @@ def _looks_for_parts(dataset: Dataset, config: Config) -> bool:
     return unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
 
 
-def is_pinned(role: str, poses: np.ndarray, radius: float, wanted: NeedsSection) -> bool:
-    """Whether a group of a role is baked at rest: it never moves, hardly does, or the user says so. poses [S, 7]"""
-    if role == "pinned" or wanted.tracks == "off":
-        return True
-    return role == "body" and wanted.tracks == "auto" and is_still(poses, radius)
-
-
-def is_still(poses: np.ndarray, radius: float) -> bool:
-    """Whether a group neither travels nor turns over the observed time. poses [S, 7] relative to the bind state."""
-    return _travel(poses, radius) <= STILL and _turn(poses) <= TURN
-
-
 def _travel(poses: np.ndarray, radius: float) -> float:
     """Largest displacement of a track, in diameters."""
     return float(np.linalg.norm(poses[:, 4:], axis=1).max()) / (2 * radius)
@@ -112,7 +100,7 @@ def decide(
 
     Args:
         groups: Motion groups.
-        track_poses: Their tracks relative to the bind state. G of [S, 7]
+        track_poses: Their tracks relative to the bind state, simplified already. G of [S, 7]
         motion_ids: Group of each Gaussian. [N]
         shading: Shading vectors in the bind state. [N, 3]
         light: Light direction. [3]
@@ -131,7 +119,7 @@ def decide(
     bodies = [g for g in groups if g.role == "body"]
     largest_travel = max((_travel(track_poses[g.id], g.model.radius) for g in bodies), default=0.0)
     largest_turn = max((_turn(track_poses[g.id]) for g in bodies), default=0.0)
-    moving = sum(not is_still(track_poses[g.id], g.model.radius) for g in bodies)
+    moving = sum(bool(np.any(track_poses[g.id][:, 1:] != 0)) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
     sky, moved_over = len(background_sh), 0 if moves is None else moves.moved
@@ -140,8 +128,8 @@ def decide(
     followers = "Gaussians that follow a caster on its support"
     # Name, value, threshold, whether it is needed by that, whether the run has it at all, what the value is.
     rows = [
-        ("tracks", largest_travel, STILL, moving > 0, len(bodies) > 0, moved),
-        ("rotation", largest_turn, TURN, largest_turn > TURN, len(bodies) > 0, turned),
+        ("tracks", largest_travel, 0.0, moving > 0, len(bodies) > 0, moved),
+        ("rotation", largest_turn, 0.0, largest_turn > 0, len(bodies) > 0, turned),
         ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, lit, "largest change of colour"),
         ("shadows", shadow_members, 1, shadow_members > 0, shadow_members > 0, followers),
         ("view_dependent_colour", bases, 2, bases > 1, bases > 1, "spherical harmonics bases"),

@@ -1,8 +1,12 @@
-"""A look at a few held-out views while training runs; the run's numbers do not depend on it."""
+"""A look at a few held-out views while training runs, and at the training views after it.
+
+The run's numbers do not depend on it.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +17,8 @@ from .views import spread
 
 if TYPE_CHECKING:
     from .trainer import Trainer
+
+TRAINING_VIEWS = 150  # that are compared at most
 
 
 class Probe:
@@ -44,6 +50,23 @@ class Probe:
             found = [psnr(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
         self._trainer.generator.set_state(state)
         return float(np.mean(found))
+
+
+def training_psnr(
+    dataset: datasets.Dataset, behind: np.ndarray | None, draw: Callable[[datasets.View], np.ndarray]
+) -> float:
+    """Mean PSNR on the training views, or on `TRAINING_VIEWS` of them spread evenly, dB.
+
+    Args:
+        dataset: The data set.
+        behind: Background of transparent pixels, as for `views.load`. [3] or None
+        draw: Gives the picture of a view. [H, W, 3]
+
+    Raises:
+        DatasetError: An image is missing or cannot be read.
+    """
+    chosen = spread(dataset.train, TRAINING_VIEWS)
+    return float(np.mean([psnr(draw(view), _load(view, behind)) for view in chosen]))
 
 
 def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:

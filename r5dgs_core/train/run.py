@@ -332,6 +332,13 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
         count = int(labels.max())
         progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), mask_stack.LABELS: labels}
+    with torch.no_grad():
+        shown = probing.training_psnr(
+            trainer.dataset,
+            trainer.behind,
+            lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
+        )
+    extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
     _save(trainer, run, began, finished=True, extra=extra)
 
 

@@ -78,7 +78,7 @@ class Trainer:
         self.dataset = dataset
         self.config = config = needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
-        behind = self._fixed_background()
+        behind = views.behind(dataset, config)
         self.views = views.load(dataset, self.normalization, behind)
         rng = np.random.default_rng(config.train.seed)
         self.found = None if found is None else mask_stack.pack(found)
@@ -145,12 +145,6 @@ class Trainer:
         if points is None or colors is None or len(points) == 0:
             return None
         return (points - self.normalization.origin) / self.normalization.scale, colors
-
-    def _fixed_background(self) -> np.ndarray | None:
-        kind = self.config.train.background
-        if kind == "auto":
-            kind = "white" if self.dataset.has_alpha else "learned"
-        return {"learned": None, "white": np.ones(3), "black": np.zeros(3)}[kind]
 
     def _mean_color(self) -> np.ndarray:
         """Coefficients of one colour, the median of all pixels, where no sky was found. [1, 3]"""

