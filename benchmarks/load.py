@@ -69,13 +69,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--gaussians", type=int, nargs="*", help="only scenes of these sizes")
     options = parser.parse_args(arguments)
     package = check_playback.extension_package()
-    scene_file = importlib.import_module(f"{package}.r5dgs_core.scene.scene_file")
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for count, degree in CASES:
             if options.gaussians and count not in options.gaussians:
                 continue
-            path = run.synthetic(count, Path(folder), scene_file, degree)
+            path = run.synthetic(count, Path(folder), degree)
             size = {"gaussians": count, "sh_degree": degree, "mb": path.stat().st_size / 1e6}
             rows.append({**size, **measure(path, options.rounds, package)})
             path.unlink()

@@ -27,7 +27,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from tests import scenes  # noqa: E402  (the line before finds it)
+from r5dgs_core.scene import scene_file  # noqa: E402  (the line before finds it)
+from tests import scenes  # noqa: E402
 from tests.blender import check_playback  # noqa: E402
 
 LOAD_LIMITS_S = {40_000: 0.5, 1_000_000: 5.0}
@@ -64,16 +65,16 @@ def load(path: Path, **options):
     return next(c for c in bpy.data.collections if c.r5dgs.is_scene), *seconds
 
 
-def synthetic(count: int, folder: Path, scene_file, sh_degree: int = 0) -> Path:
+def synthetic(count: int, folder: Path, sh_degree: int = 0) -> Path:
     """A scene of twelve bodies and a floor."""
     scene = scenes.make_scene(n=count, objects=BODIES, sh_degree=sh_degree, seed=1, identities=False)
     return scene_file.write(scene, folder / f"synthetic_{count}_{sh_degree}.r5dgs")
 
 
-def measure_loading(table: Table, folder: Path, modules) -> None:
+def measure_loading(table: Table, folder: Path) -> None:
     """Seconds until a scene is there, keys included; the best of three for the small one."""
     for count, limit in LOAD_LIMITS_S.items():
-        path = synthetic(count, folder, modules["scene_file"])
+        path = synthetic(count, folder)
         times = [load(path)[1:] for _ in range(3 if count < 1_000_000 else 1)]
         wall, processor = min(t[0] for t in times), min(t[1] for t in times)
         good, wanted = min(wall, processor) <= limit, f"one of them at most {limit:g} s"
@@ -153,8 +154,8 @@ def figures(path: Path | None) -> Table:
     table = Table()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        measure_loading(table, folder, modules)
-        moving = synthetic(40_000, folder, modules["scene_file"])
+        measure_loading(table, folder)
+        moving = synthetic(40_000, folder)
         for scene in (moving,) if path is None else (moving, path.resolve()):
             measure_positions(table, scene, modules)
             measure_keys(table, scene, modules, package)
