@@ -305,7 +305,7 @@ def _check_residuals(scene: Scene, place: str) -> None:
         _fail(place, "dynamics", "an array beside 'canonical_means'", "none")
     if rows is None or scene.residual_offsets is None or scene.residual_log_scales is None:
         return
-    if len(rows) and (rows[0] < 0 or rows[-1] >= len(scene.means) or (np.diff(rows) <= 0).any()):
+    if len(rows) and (rows[0] < 0 or rows[-1] >= len(scene.means) or (rows[1:] <= rows[:-1]).any()):
         _fail(place, "residual_rows", f"increasing rows below {len(scene.means)}", "others")
     for name in ("residual_offsets", "residual_log_scales"):
         if (getattr(scene, name)[:, -1] != 0).any():
