@@ -451,13 +451,13 @@ def test_checking_many_groups_takes_calls_in_proportion_to_their_number(monkeypa
 
 
 def test_residual_rows_whose_differences_overflow_are_not_increasing(scene):
-    rows, knots = np.array([1, -(2**31), 5, 7], np.int32), len(scene.track_times)
+    rows, knots = np.array([1, -(2**31)], np.int32), len(scene.track_times)
     wild = dataclasses.replace(
         scene,
         residual_rows=rows,
-        residual_offsets=np.zeros((4, knots, 3), np.float32),
-        residual_quats=np.tile(np.array([1, 0, 0, 0], np.float32), (4, knots, 1)),
-        residual_log_scales=np.zeros((4, knots, 3), np.float32),
+        residual_offsets=np.zeros((2, knots, 3), np.float32),
+        residual_quats=np.tile(np.array([1, 0, 0, 0], np.float32), (2, knots, 1)),
+        residual_log_scales=np.zeros((2, knots, 3), np.float32),
     )
     with pytest.raises(errors.SceneFileError, match="residual_rows: expected increasing rows"):
         scene_file.validation.check(wild, "scene")
