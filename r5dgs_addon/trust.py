@@ -1,9 +1,9 @@
-"""Which scene files may be read because a .blend names them.
+"""Rules for reading scene files that a .blend names.
 
 A .blend can come from anybody and name any path, and much is read without a click: Exact Mode on each frame, Rendered
 viewports, renders in the background. A file is read if it lies beside or below the .blend that names it, in a trusted
 folder of the preferences, or if the user loaded, chose or allowed it in this session. For any other the panel *Scene*
-asks. On Windows a path of the network is not even looked at before, as that would send the user's credentials there.
+asks. On Windows a network path is not even looked up before that, as the lookup would send the user's credentials.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ _allowed: set[str] = set()  # files that the user loaded, chose or allowed in th
 
 @dataclass(frozen=True)
 class Found:
-    """Where the file of a loaded scene is.
+    """Result of the search for the file of a loaded scene.
 
     Attributes:
         path: The file to read; None if none was found that may be read.
@@ -41,17 +41,22 @@ def _library(collection: bpy.types.Collection) -> bpy.types.Library | None:
 
 
 def folders(collection: bpy.types.Collection) -> list[str]:
-    """Folders of the .blend files that name the file of a loaded scene: the library's, and that of the open one."""
-    library = _library(collection)
-    blends = [bpy.path.abspath(library.filepath)] if library is not None else []
+    """Folders of the .blend files that name the file of a loaded scene: the library's, and that of the open one.
+
+    The library's counts only if the linked scene itself names the file: of an override, the open .blend stores the
+    file's path, and the path of a library that need not exist.
+    """
+    library, override = _library(collection), collection.override_library
+    named = library is not None and (override is None or override.reference.r5dgs.filepath == collection.r5dgs.filepath)
+    blends = [bpy.path.abspath(library.filepath)] if named else []
     return [str(Path(blend).parent) for blend in (*blends, bpy.data.filepath) if blend]
 
 
 def places(collection: bpy.types.Collection) -> list[Path]:
-    """Where the file of a loaded scene may lie, likeliest first.
+    """Possible paths of the file of a loaded scene, likeliest first.
 
-    That is where the .blend says, which for linked data is the library; beside the open .blend, as both may have moved
-    together; and where the file was last seen, as appended data comes from a .blend elsewhere.
+    These are the stored path, relative to the library for linked data; the folder of the open .blend, as both files may
+    have moved together; and the place where the file was last seen, as appended data comes from a .blend elsewhere.
     """
     stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=_library(collection)))
     found = [stored]
@@ -63,7 +68,7 @@ def places(collection: bpy.types.Collection) -> list[Path]:
 
 
 def find(collection: bpy.types.Collection) -> Found:
-    """The first of `places` that exists; a file that may not be read comes in its turn, too."""
+    """Return the first of `places` that exists, or ask for it if it may not be read."""
     trusted = [*folders(collection), *preferences.choice().trusted]
     asked = None
     for place in places(collection):
@@ -78,7 +83,7 @@ def find(collection: bpy.types.Collection) -> Found:
 
 
 def may_read(place: Path, folders: list[str]) -> bool:
-    """True if a file lies in or below one of some folders once links are followed, or was allowed in this session."""
+    """Return True if a file was allowed in this session, or lies in or below a folder once links are followed."""
     given = _key(os.path.abspath(place))
     if given in _allowed:
         return True
@@ -94,7 +99,7 @@ def allow(place: Path) -> None:
 
 
 def on_network(place: Path, windows: bool = os.name == "nt") -> bool:
-    """True for a path of the form ``\\\\server\\share`` on Windows; also for device paths, which can name one."""
+    """Return True for a path of the form ``\\\\server\\share`` on Windows or a device path, which can name one."""
     return windows and str(place).replace("/", "\\").startswith("\\\\")
 
 

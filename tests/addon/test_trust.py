@@ -181,6 +181,26 @@ def test_a_linked_scene_may_read_beside_its_library_alone(blender, blend, trust,
     assert trust.find(target.collections[0]).asked == scene_path
 
 
+def test_an_override_of_a_library_that_is_missing_lets_nothing_be_read_beside_it(
+    blender, blend, trust, scene_path, tmp_path
+):
+    opened(blender, blend)
+    library, folder = scene_path.parent / "library.blend", tmp_path / "project"
+    blender.ops.wm.save_as_mainfile(filepath=str(library))
+    blender.ops.wm.read_homefile(app_template="")
+    with blender.data.libraries.load(str(library), link=True) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    own = target.collections[0].override_hierarchy_create(blender.context.scene, blender.context.view_layer)
+    new_session(trust)
+    assert trust.find(own).path.resolve() == scene_path
+    blender.ops.wm.save_as_mainfile(filepath=str(folder / "overriding.blend"))
+    library.unlink()
+    blender.ops.wm.open_mainfile(filepath=str(folder / "overriding.blend"))
+    own = next(one for one in blender.data.collections if one.r5dgs.is_scene)
+    assert own.override_library is not None
+    assert trust.find(own) == trust.Found(asked=scene_path)
+
+
 def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(blender, blend, trust, scene_path, reads, caplog):
     trust.allow(scene_path)
     whole = scene_path.read_bytes()
