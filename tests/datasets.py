@@ -18,7 +18,7 @@ from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import cameras, playback
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
-from r5dgs_core.train import config
+from r5dgs_core.train import checkpoint, config
 from tests import scenes
 
 T_MAX = 0.75
@@ -150,6 +150,12 @@ def make_dataset(
 def settings(*overrides: str) -> config.Config:
     """Configuration for this data set, with further ``section.key=value`` overrides."""
     return config.load(None, [*SETTINGS, *overrides])
+
+
+def as_trained(made: checkpoint.Run) -> checkpoint.Run:
+    """The run, to be baked with the motion that was trained, noise and all."""
+    kept = made.config.override(("needs.tracks=on", "needs.rotation=on"))
+    return dataclasses.replace(made, config=kept)
 
 
 def make_truth(*, floor: bool = True) -> Scene:

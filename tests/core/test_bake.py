@@ -22,11 +22,6 @@ def train_briefly(data, folder, *overrides):
     return run.train(data.root, folder, settings)
 
 
-def as_trained(made):
-    """The scene with the motion that was trained, noise and all."""
-    return bake.bake(dataclasses.replace(made, config=made.config.override(("needs.tracks=on", "needs.rotation=on"))))
-
-
 def psnr(a, b):
     return -10 * np.log10(np.mean((np.asarray(a, np.float64) - b) ** 2))
 
@@ -75,13 +70,13 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
         angles = torch.linspace(0.4, 1.9, base.shape[1])[:, None] * torch.tensor([0.3, 0.5, 0.8])
         base[1:] = rotations.multiply(rotations.rotvecs_to_quats(angles), base[1:])
         checkpoint.save(made.folder, state)
-    scene = as_trained(made)
+    scene = bake.bake(tiny_datasets.as_trained(made))
     assert not scene.provenance["train"]["finished"] and scene.identities is None
     assert_shows_what_was_trained(made, scene)
 
 
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
-    scene = as_trained(trained)
+    scene = bake.bake(tiny_datasets.as_trained(trained))
     state = checkpoint.load(trained.folder)
     tracks = tracks_representation.tracks_of(state.tensors)
     norm = normalization.Normalization(np.array(state.origin), state.scale)

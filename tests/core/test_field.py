@@ -49,7 +49,7 @@ def made(tiny, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(made, tiny):
-    return bake.bake(made, datasets.read(tiny.root))
+    return bake.bake(tiny_datasets.as_trained(made), datasets.read(tiny.root))
 
 
 def test_times_in_the_unit_interval_are_used_as_they_are_and_others_brought_there():
@@ -289,7 +289,7 @@ def test_harmonics_of_what_moves_turn_with_it(tiny, tmp_path):
     rest = state.tensors["gaussians.sh_rest"]
     rest += 0.2 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(1))
     checkpoint.save(made.folder, state)
-    scene = bake.bake(made, datasets.read(tiny.root))
+    scene = bake.bake(tiny_datasets.as_trained(made), datasets.read(tiny.root))
     trainer = Trainer(datasets.read(tiny.root), made.config)
     trainer.restore(checkpoint.load(made.folder))
     view = trainer.views[0]
