@@ -121,7 +121,10 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
     rows = _rows(obj, cloud, stored)
     values: dict[str, np.ndarray] = {}
     for part, (name, *kind) in PARTS.items():
-        found = _changed(cloud, (prefix if part in BENDING else "") + name, stored.get(name), *kind)
+        if prefix and part in BENDING:  # Exact Mode takes edits over without a new evaluation
+            found = _changed(obj.data, prefix + name, stored.get(name), *kind)
+        else:
+            found = _changed(cloud, name, stored.get(name), *kind)
         if found is not None:
             values[part] = found
     sh = _changed_harmonics(cloud, stored)

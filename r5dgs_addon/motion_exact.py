@@ -2,10 +2,11 @@
 
 Anchors move groups as a whole; residuals of the scene file say how single Gaussians leave that motion. Switched on, a
 collection's clouds keep their bind state in attributes of their own, and each frame change writes their points anew.
-Nothing listens to frame changes while no scene has it on.
+Edits of points are taken over into the bind state. Nothing listens to frame changes while no scene has it on.
 """
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -15,7 +16,7 @@ from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.motion import columns
-from ..r5dgs_core.scene import residuals, scene_file
+from ..r5dgs_core.scene import point_edits, residuals, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from . import clouds, objects, picture, remembered, timeline
 
@@ -25,6 +26,8 @@ PARTS = (
     ("rotation", "QUATERNION", "value", 4),
     ("scale", "FLOAT_VECTOR", "vector", 3),
 )
+
+_WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints of what was written, and its time
 
 _log = logging.getLogger(__name__)
 _told: set[str] = set()  # errors that were logged
@@ -38,17 +41,25 @@ class R5DGS_PG_exact(bpy.types.PropertyGroup):
     problem: StringProperty(name="Problem", description="Why nothing bends although it should", options={"HIDDEN"})
 
 
-def _read_file(path: Path) -> tuple[int, Residuals]:
-    """Number of Gaussians and the residuals of a scene file."""
+@dataclass(frozen=True)
+class _File:
+    """Residuals and centres of a scene file. means [N, 3]"""
+
+    bending: Residuals
+    means: np.ndarray
+
+
+def _read_file(path: Path) -> _File:
     scene = scene_file.read(path)
-    return len(scene.means), residuals.Residuals(scene)
+    return _File(residuals.Residuals(scene), scene.means)
 
 
-_files: remembered.Remembered[tuple[int, Residuals]] = remembered.Remembered(_read_file)
+_files: remembered.Remembered[_File] = remembered.Remembered(_read_file)
+_turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # by session_uid, see `_turn_of`
 
 
 def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Residuals:
-    """The residuals of a loaded scene; its file is read once for each state of it.
+    """Return the residuals of a loaded scene; its file is read once for each state of it.
 
     Args:
         collection: The scene.
@@ -57,12 +68,16 @@ def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Resid
     Raises:
         SceneFileError: The file is missing, may not be read (`trust`), cannot be read, or is of another scene.
     """
+    return _file_of(collection, again).bending
+
+
+def _file_of(collection: bpy.types.Collection, again: bool = False) -> _File:
     path = picture.scene_path(collection)
-    count, found = _files.get(path, again)
-    if count != collection.r5dgs.gaussians:
+    found = _files.get(path, again)
+    if len(found.means) != collection.r5dgs.gaussians:
         raise errors.SceneFileError(
-            f"{path}: expected the {collection.r5dgs.gaussians} Gaussians that were loaded, found {count}; load the "
-            "scene anew"
+            f"{path}: expected the {collection.r5dgs.gaussians} Gaussians that were loaded, found {len(found.means)}; "
+            "load the scene anew"
         )
     return found
 
@@ -101,42 +116,136 @@ def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> 
 
 
 def apply(collection: bpy.types.Collection, frame: float) -> None:
-    """Write the points of a scene as they are at a frame, sub-frame included.
+    """Write the points of a scene as they are at a frame, sub-frame included. Edits of points are kept.
 
     Raises:
         SceneFileError: The scene's file cannot be read.
     """
-    bending = residuals_of(collection)
-    found = bending.at(timeline.of_collection(collection).time(frame))
+    file = _file_of(collection)
+    t = timeline.of_collection(collection).time(frame)
     done = set()
     for cloud in objects.members(collection, "CLOUD"):
         if cloud.data in done or cloud.data.library is not None:
             continue
         done.add(cloud.data)
-        points, part = _bending_points(cloud.data, bending)
+        rows = _rows(cloud.data)
+        points, part = _bending_points(rows, file.bending)
         if len(points) == 0:
             continue
         bind = _bind_state(cloud.data)
-        if found is not None:
-            offsets, turns, growths = (values[:, part] for values in found)
-            bind["position"][points] += offsets.T
-            bind["rotation"][points] = columns.multiply(turns.astype(np.float32), bind["rotation"][points].T).T
-            bind["scale"][points] *= np.exp(growths.T)
+        _keep_edits(cloud.data, file, rows, points, part, bind)
+        bent = _bend(bind, file.bending, t, points, part, _turn_of(cloud.data, file.means, rows, bind["position"]))
         for name, _, field, _ in PARTS:
-            cloud.data.attributes[name].data.foreach_set(field, bind[name].ravel())
+            cloud.data.attributes[name].data.foreach_set(field, bent[name].ravel())
+        cloud.data[_WRITTEN] = {"t": t, **{name: clouds.fingerprint(values) for name, values in bent.items()}}
         cloud.data.update_tag()
 
 
-def _bending_points(cloud: bpy.types.PointCloud, bending: Residuals) -> tuple[np.ndarray, np.ndarray]:
+def _rows(cloud: bpy.types.PointCloud) -> np.ndarray:
+    """Row of the scene file that each point is; none if the attribute is missing. [n]"""
+    named = clouds.attribute(cloud, clouds.ROW, "INT")
+    return np.zeros(0, np.int32) if named is None else clouds.read(named, "value", 1, np.int32)[:, 0]
+
+
+def _bending_points(rows: np.ndarray, bending: Residuals) -> tuple[np.ndarray, np.ndarray]:
     """Points of a cloud that have residuals, and which residuals those are; deleted points have none. [n], [n]"""
-    named = cloud.attributes.get(clouds.ROW)
-    if named is None or len(bending.rows) == 0:
+    if len(bending.rows) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    rows = np.empty(len(cloud.points), np.int32)
-    named.data.foreach_get("value", rows)
     part = np.minimum(np.searchsorted(bending.rows, rows), len(bending.rows) - 1)
     points = np.flatnonzero(bending.rows[part] == rows)
     return points, part[points]
+
+
+def _bend(
+    values: dict[str, np.ndarray],
+    bending: Residuals,
+    t: float,
+    points: np.ndarray,
+    part: np.ndarray,
+    turn: tuple[np.ndarray, np.ndarray] | None,
+    back: bool = False,
+) -> dict[str, np.ndarray]:
+    """Bend points as they are at a time, or bend them back. Returns new arrays."""
+    values, found = {name: array.copy() for name, array in values.items()}, bending.at(t)
+    if found is None:
+        return values
+    offsets, turns, growths = (array[:, part] for array in found)
+    if turn is not None:
+        linear, carried = turn
+        offsets = np.where(carried[points], linear @ offsets, offsets)
+    if back:
+        offsets, turns, growths = -offsets, turns * [[1], [-1], [-1], [-1]], -growths
+    values["position"][points] += offsets.T
+    values["rotation"][points] = columns.multiply(turns.astype(np.float32), values["rotation"][points].T).T
+    values["scale"][points] *= np.exp(growths.T)
+    return values
+
+
+def _turn_of(
+    cloud: bpy.types.PointCloud, means: np.ndarray, rows: np.ndarray, position: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the map that residuals follow after *Apply Transform*, as `point_edits` does for pictures.
+
+    Args:
+        cloud: The points.
+        means: Centres in the scene file. [N, 3]
+        rows: Row of each point. [n]
+        position: Centres in the bind state. [n, 3]
+
+    Returns:
+        The linear map [3, 3] and the points that it moves [n] bool; None if nothing was transformed.
+    """
+    stored = clouds.fingerprints(cloud)
+    now = clouds.fingerprint(position)
+    if stored.get("position") in (None, now) or not ((rows >= 0) & (rows < len(means))).all():
+        return None
+    shapes = [cloud.attributes[BIND + name] for name in ("rotation", "scale")]
+    for attribute, (name, _, field, width) in zip(shapes, PARTS[1:], strict=True):
+        if clouds.fingerprint(clouds.view(attribute, field, width)) != stored.get(name):
+            return None
+    if _turns.get(cloud.session_uid, ("",))[0] != now:
+        found = point_edits.affine_between(means[rows], position)
+        linear = None if found is None else found[0][:3, :3]
+        carried = (means[rows] != position).any(-1)
+        _turns[cloud.session_uid] = now, None if linear is None else (linear, carried)
+    return _turns[cloud.session_uid][1]
+
+
+def _is_edited(cloud: bpy.types.PointCloud) -> bool:
+    """Return True if points are no longer as `apply` wrote them."""
+    written = cloud.get(_WRITTEN)
+    if written is None:
+        return False
+    every = ((clouds.attribute(cloud, name, kind), name, field, width) for name, kind, field, width in PARTS)
+    return any(
+        found is not None and clouds.fingerprint(clouds.view(found, field, width)) != written[name]
+        for found, name, field, width in every
+    )
+
+
+def _keep_edits(
+    cloud: bpy.types.PointCloud,
+    file: _File,
+    rows: np.ndarray,
+    points: np.ndarray,
+    part: np.ndarray,
+    bind: dict[str, np.ndarray],
+) -> None:
+    """Take edits of the points since `apply` over into their bind state, ``bind``, which is changed."""
+    if not _is_edited(cloud):
+        return
+    turn, t = _turn_of(cloud, file.means, rows, bind["position"]), cloud[_WRITTEN]["t"]
+    written = _bend(bind, file.bending, t, points, part, turn)
+    now = {name: clouds.read(cloud.attributes[name], field, width) for name, _, field, width in PARTS}
+    back = _bend(now, file.bending, t, points, part, turn, back=True)
+    found = point_edits.affine_between(written["position"], now["position"])
+    if found is not None:  # the offsets follow the map, too
+        matrix, inside = found
+        back["position"][inside] = bind["position"][inside] @ matrix[:3, :3].T + matrix[:3, 3]
+    for name, _, field, _ in PARTS:
+        changed = (now[name] != written[name]).any(-1)
+        bind[name][changed] = back[name][changed]
+        cloud.attributes[BIND + name].data.foreach_set(field, bind[name].ravel())
 
 
 def _bind_state(cloud: bpy.types.PointCloud) -> dict[str, np.ndarray]:
@@ -164,6 +273,7 @@ def _give_back(cloud: bpy.types.PointCloud) -> None:
         kept.data.foreach_get(field, values)
         cloud.attributes[name].data.foreach_set(field, values)
         cloud.attributes.remove(cloud.attributes[BIND + name])
+    cloud.pop(_WRITTEN, None)
     cloud.update_tag()
 
 
@@ -175,6 +285,18 @@ def _exact_scenes() -> list[bpy.types.Collection]:
 def _follow_frame(scene, *_):
     for collection in _exact_scenes():
         _try(collection, scene.frame_current_final)
+
+
+@persistent
+def _follow_edits(scene, depsgraph=None):
+    """Keep edits of points at once, as pictures show the bind state."""
+    updated = set() if depsgraph is None else {one.id.original for one in depsgraph.updates if one.is_updated_geometry}
+    if not updated:
+        return
+    for collection in _exact_scenes():
+        members = objects.members(collection, "CLOUD")
+        if any((one in updated or one.data in updated) and _is_edited(one.data) for one in members):
+            _try(collection, scene.frame_current_final)
 
 
 def _try(collection: bpy.types.Collection, frame: float) -> None:
@@ -205,13 +327,18 @@ def _look_again(*_):
 
 
 def listen() -> None:
-    """Listen to frame changes exactly while some scene plays what bends."""
-    events = bpy.app.handlers.frame_change_pre
-    if _exact_scenes():
-        if _follow_frame not in events:
-            events.append(_follow_frame)
-    elif _follow_frame in events:
-        events.remove(_follow_frame)
+    """Listen to frame changes and edits exactly while some scene plays what bends."""
+    playing = bool(_exact_scenes())
+    for events, handler in _hooks():
+        if playing and handler not in events:
+            events.append(handler)
+        elif not playing and handler in events:
+            events.remove(handler)
+
+
+def _hooks():
+    handlers = bpy.app.handlers
+    return (handlers.frame_change_pre, _follow_frame), (handlers.depsgraph_update_post, _follow_edits)
 
 
 def register():
@@ -227,9 +354,11 @@ def unregister():
     for events in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         if _look_again in events:
             events.remove(_look_again)
-    if _follow_frame in bpy.app.handlers.frame_change_pre:
-        bpy.app.handlers.frame_change_pre.remove(_follow_frame)
+    for events, handler in _hooks():
+        if handler in events:
+            events.remove(handler)
     _files.clear()
+    _turns.clear()
     _told.clear()
     del bpy.types.Collection.r5dgs_exact
     bpy.utils.unregister_class(R5DGS_PG_exact)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.scene import playback, ply, scene_file
 from tests import datasets
 from tests.addon import motions
 
@@ -151,3 +151,81 @@ def test_deleted_points_leave_the_others_where_they_belong(blender, scene, loade
     motions.go_to(blender, loaded, 0.3)
     expected = playback.frame(scene, 0.3).means[keep]
     np.testing.assert_allclose(motions.points(blender, cloud), expected, atol=1e-5 * scene.extent)
+
+
+@pytest.fixture
+def bending(loaded, scene):
+    """The cloud that bends."""
+    every = (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD")
+    return next(o for o in every if o.r5dgs.start <= scene.residual_rows[0] < o.r5dgs.start + o.r5dgs.count)
+
+
+def seen(bpy, cloud):
+    """Points as the viewport shows them, Blender's world. [n, 3]"""
+    evaluated = cloud.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    points = np.empty(3 * len(evaluated.data.points), np.float32)
+    evaluated.data.attributes["position"].data.foreach_get("vector", points)
+    matrix = np.array(evaluated.matrix_world, np.float64)
+    return points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def exported(bpy, cloud, folder):
+    """Centres of a cloud that are exported, by the scene file. [n, 3]"""
+    for other in bpy.context.selected_objects:
+        other.select_set(False)
+    cloud.select_set(True)
+    bpy.ops.r5dgs.export_ply(filepath=str(folder / "a.ply"), which="SELECTED")
+    return ply.read(folder / "a.ply").means
+
+
+def apply_transform(bpy, cloud):
+    for other in bpy.context.selected_objects:
+        other.select_set(False)
+    cloud.select_set(True)
+    bpy.context.view_layer.objects.active = cloud
+    assert bpy.ops.object.transform_apply(location=True, rotation=True, scale=True) == {"FINISHED"}
+
+
+@pytest.mark.parametrize("first", (False, True))
+def test_apply_transform_turns_what_bends_with_the_object(blender, loaded, bending, tmp_path, first):
+    motions.go_to(blender, loaded, 0.2)
+    if first:
+        blender.ops.r5dgs.exact_mode(action="ON")
+    bending.location, bending.rotation_euler, bending.scale = (0.3, -0.2, 0.1), (0.5, 0.6, -0.7), (1.2, 1.2, 1.2)
+    blender.context.view_layer.update()
+    before = exported(blender, bending, tmp_path)
+    apply_transform(blender, bending)
+    if not first:
+        blender.ops.r5dgs.exact_mode(action="ON")
+        assert np.abs(exported(blender, bending, tmp_path) - before).max() > 1e-3  # it did not bend before
+    else:
+        np.testing.assert_allclose(exported(blender, bending, tmp_path), before, atol=1e-5)
+    np.testing.assert_allclose(exported(blender, bending, tmp_path), seen(blender, bending), atol=1e-5)
+    motions.go_to(blender, loaded, 0.5)
+    motions.go_to(blender, loaded, 0.2)
+    np.testing.assert_allclose(exported(blender, bending, tmp_path), seen(blender, bending), atol=1e-5)
+    if first:
+        np.testing.assert_allclose(seen(blender, bending), before, atol=1e-5)
+
+
+def test_edits_of_points_stay_at_other_frames_and_when_it_is_off(blender, loaded, bending, tmp_path):
+    blender.ops.r5dgs.exact_mode(action="ON")
+    motions.go_to(blender, loaded, 0.2)
+    before = stored(bending, "position", "vector", 3)
+    sizes = stored(bending, "scale", "vector", 3)
+    for point in list(bending.data.points)[::3]:
+        point.co = (point.co[0] + 0.5, point.co[1], point.co[2])
+    bending.data.attributes["scale"].data[1].vector = (0.1, 0.2, 0.3)
+    moved = before.copy()
+    moved[::3, 0] += 0.5
+    sizes[1] = (0.1, 0.2, 0.3)
+    np.testing.assert_allclose(exported(blender, bending, tmp_path), seen(blender, bending), atol=1e-5)
+    motions.go_to(blender, loaded, 0.5)
+    motions.go_to(blender, loaded, 0.2)
+    np.testing.assert_allclose(stored(bending, "position", "vector", 3), moved, atol=1e-6)
+    np.testing.assert_allclose(stored(bending, "scale", "vector", 3), sizes, rtol=1e-5)
+    motions.go_to(blender, loaded, datasets.T_MAX)
+    there = stored(bending, "position", "vector", 3)
+    blender.ops.r5dgs.exact_mode(action="OFF")
+    np.testing.assert_allclose(stored(bending, "position", "vector", 3), there, atol=1e-6)
+    np.testing.assert_allclose(exported(blender, bending, tmp_path), seen(blender, bending), atol=1e-5)
