@@ -6,6 +6,7 @@ Accepted content can be written as JSON again: numbers are finite and in range, 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -
         raise kind(f"{path}: the file is missing") from error
     except OSError as error:
         raise kind(f"{path}: cannot be read ({error})") from error
-    return parse(data, str(path), kind, remedy)
+    return parse(data, str(path), kind, remedy, size=MOST_BYTES)
 
 
 def _memory(data: bytes) -> int:
@@ -108,10 +109,8 @@ def _integer(text: str) -> int:
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(
-            f"the key {next(key for key in keys if keys.count(key) > 1)[:60]!r} occurs twice in one object"
-        )
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key {twice[:60]!r} occurs twice in one object")
     return result
 
 

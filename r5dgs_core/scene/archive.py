@@ -13,6 +13,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -135,8 +136,7 @@ class Archive:
         found = self._zip.infolist()
         members = {info.filename: info for info in found}
         if len(members) < len(found):
-            names = [info.filename for info in found]
-            twice = next(name for name in names if names.count(name) > 1)
+            twice = Counter(info.filename for info in found).most_common(1)[0][0]
             raise SceneFileError(f"{self.place}: expected each member once, found {twice[:60]!r} twice")
         if sum(info.compress_size for info in found) > size:
             raise SceneFileError(f"{self.place}: expected members beside each other, found members that overlap")

@@ -155,6 +155,15 @@ def test_doubled_members_are_refused(path, tmp_path):
     assert_refused_cheaply(target, r"'means\.npy' twice")
 
 
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_the_doubled_one_of_many_members_is_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "many.r5dgs", "w") as file:
+        for name in (*map(str, range(2000)), "z", "z"):
+            file.writestr(name, b"")
+    with pytest.raises(errors.SceneFileError, match="'z' twice"):
+        scene_file.read(tmp_path / "many.r5dgs")
+
+
 def test_members_that_overlap_are_refused(path, tmp_path):
     data = bytearray(write(tmp_path / "a.r5dgs", members(path), zipfile.ZIP_STORED).read_bytes())
     with zipfile.ZipFile(io.BytesIO(data)) as file:

@@ -48,6 +48,22 @@ def test_each_fault_is_one_error_of_the_kind_asked_for(text, message):
     assert len(str(caught.value)) < 300
 
 
+def test_a_doubled_key_is_found_in_linear_time():
+    class Counted(str):
+        compared = 0
+
+        def __eq__(self, other):
+            Counted.compared += 1
+            return str.__eq__(self, other)
+
+        __hash__ = str.__hash__
+
+    pairs = [(Counted(i), i) for i in range(3000)]
+    with pytest.raises(ValueError, match="'z' occurs twice"):
+        strict_json._object([*pairs, (Counted("z"), 0), (Counted("z"), 1)])
+    assert Counted.compared < 10 * len(pairs)
+
+
 def test_nesting_up_to_the_limit_is_accepted():
     parse("[" * strict_json.MOST_DEPTH + "]" * strict_json.MOST_DEPTH)
 
