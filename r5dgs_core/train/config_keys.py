@@ -26,6 +26,7 @@ _KEYS_BY_UNIT = {
         losses.ssim field.trd_share curriculum.newest densify.share densify_mcmc.grow
     """,
     "share of the image": "init.min_mask_pixels",
+    "share of the images": "data.min_registered",
     "share of the image width": "densify.prune_width",
     "share of the cameras' extent": "densify_default.percent_dense densify_default.prune_extent",
     "opacity, 0 to 1": """
