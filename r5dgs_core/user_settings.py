@@ -8,11 +8,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-import tempfile
 import tomllib
 from pathlib import Path
 
 from .errors import ConfigError, UsageError
+from .scene import files
 
 MEANINGS = {
     "encoder": "folder of the text and image encoder, or 'text' (lookup and query --encoder)",
@@ -78,15 +78,20 @@ def write(key: str, value: str) -> Path:
     if value:
         settings[key] = _checked(key, value)
     place = path()
-    lines = [f"{name} = {json.dumps(settings[name], ensure_ascii=False)}\n" for name in MEANINGS if name in settings]
+    lines = [f"{name} = {_quoted(settings[name])}\n" for name in MEANINGS if name in settings]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=place.parent, delete=False) as stream:
-            stream.writelines(lines)
-        os.replace(stream.name, place)
+        files.write(place, "".join(lines).encode())
+    except UnicodeEncodeError as error:
+        raise ConfigError(f"config --user set {key}: expected a path in UTF-8; rename the folder") from error
     except OSError as error:
         raise ConfigError(f"{place}: cannot be written: {error}") from error
     return place
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; unlike JSON, TOML also escapes DEL."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _checked(key: str, value: str) -> str:

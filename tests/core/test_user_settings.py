@@ -29,7 +29,7 @@ def test_without_a_file_nothing_is_set(place, capsys):
     assert all(f"{key} = (not set)" in shown for key in user_settings.MEANINGS)
 
 
-@pytest.mark.parametrize("name", ["plain", 'quo"ted \\ back', "süß 日本 😀", "line\nbreak"])
+@pytest.mark.parametrize("name", ["plain", 'quo"ted \\ back', "süß 日本 😀", "line\nbreak", "delete\x7f"])
 def test_what_is_set_is_read_again(place, tmp_path, capsys, name):
     folder = tmp_path / name
     folder.mkdir()
@@ -42,6 +42,14 @@ def test_what_is_set_is_read_again(place, tmp_path, capsys, name):
     assert shown == {"path": str(place), "settings": user_settings.read()}
     assert cli.main(["config", "--user", "set", "encoder", ""]) == 0
     assert list(user_settings.read()) == ["worker_python"] and [p.name for p in place.parent.iterdir()] == [place.name]
+
+
+def test_a_path_that_is_not_utf8_is_refused_and_leaves_the_file(place, tmp_path):
+    user_settings.write("encoder", str(tmp_path))
+    (tmp_path / "\udcff").mkdir()
+    with pytest.raises(ConfigError, match="UTF-8"):
+        user_settings.write("sam2", str(tmp_path / "\udcff"))
+    assert user_settings.read() == {"encoder": str(tmp_path)} and list(place.parent.iterdir()) == [place]
 
 
 def test_relative_paths_are_stored_absolute(place, tmp_path, monkeypatch):
