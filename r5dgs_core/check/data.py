@@ -21,12 +21,17 @@ _PARALLEL = 1e-6  # of the axes of all cameras: they meet nowhere
 _LISTED = 5  # names in one finding
 
 
-def check(root: Path) -> list[Finding]:
-    """Return all faults of a data set folder."""
+def check(root: Path, train_masks: str = dataset.MASKS, min_registered: float = colmap.MIN_REGISTERED) -> list[Finding]:
+    """Return all faults of a data set folder.
+
+    Args:
+        root: The folder.
+        train_masks, min_registered: As of `dataset.read`.
+    """
     collect = Collector(CODES, "D00")
     found: Dataset | None = None
     with collect():
-        found = dataset.read(root, guard=collect)
+        found = dataset.read(root, train_masks, min_registered, collect)
     if shutil.disk_usage(root).free < LEAST_SPACE:
         collect.add("D53", f"{root}: expected at least 1 GB of free disk space, found less")
     if found is None:

@@ -61,10 +61,10 @@ def _check_data(run: Run, collect: Collector) -> None:
         root = run.data()
     if root is None:
         return
-    faults = data.check(root)
-    collect.findings += faults
+    section = run.config.data
+    collect.findings += data.check(root, section.masks, section.min_registered)
     try:
-        found = dataset.read(root, run.config.data.masks, run.config.data.min_registered)
+        found = dataset.read(root, section.masks, section.min_registered)
     except errors.R5dgsError:
         collect.add("R10", f"{root}: the data set of the run has faults, which are listed too")
         return

@@ -510,6 +510,20 @@ def test_the_reader_raises_the_first_of_the_faults_that_check_lists(tmp_path):
             pytest.fail(f"{name} was accepted")
 
 
+def test_the_data_of_a_run_are_checked_as_the_run_reads_them(tmp_path, small_run):
+    run, root = tmp_path / "run", tmp_path / "data"
+    shutil.copytree(small_run, run)
+    content = json.loads((run / "run.json").read_text())
+    shutil.copytree(content["dataset"], root)
+    mask = next((root / "object_mask" / "train").rglob("*.png"))
+    mask.write_bytes(b"no mask")
+    run_changed(run, dataset=str(root))
+    assert "D17" in {found.code for found in check.check(run)}
+    content["config"]["data"]["masks"] = "none"
+    run_changed(run, config=content["config"])
+    assert not [str(found) for found in check.check(run) if found.severity == findings.ERROR]
+
+
 def test_statuses_and_the_last_line(tmp_path, capsys):
     (tmp_path / "bad").mkdir()
     (tmp_path / "warned").mkdir()
