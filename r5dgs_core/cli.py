@@ -41,7 +41,8 @@ def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
         args.parser_of.print_usage(sys.stderr)
         print(f"{args.parser_of.prog}: error: {terminal.printable(str(error))}", file=sys.stderr)
     else:
-        print(f"r5dgs: {terminal.printable(str(error)) or 'stopped'}", file=sys.stderr)
+        remedy = "; check the path, its permissions and the free disk space" if isinstance(error, OSError) else ""
+        print(f"r5dgs: {terminal.printable(str(error)) or 'stopped'}{remedy}", file=sys.stderr)
     return status
 
 

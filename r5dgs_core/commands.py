@@ -131,16 +131,9 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
         if progress_kind == "json":
             progress({"event": "imported", "path": str(out), "gaussians": len(scene.means)})
     if progress_kind != "json":
-        _tell_scene(scene, out)
-
-
-def _tell_scene(scene: Scene, out: Path) -> None:
-    count = sum(o.id > 0 for o in scene.objects)
-    objects = "1 object" if count == 1 else f"{count} objects"
-    print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
-    compared = scene.provenance.get("training_views")
-    if compared:
-        print(f"training views: checkpoint {compared['checkpoint_psnr']:.2f} dB, baked {compared['baked_psnr']:.2f} dB")
+        count = sum(o.id > 0 for o in scene.objects)
+        objects = "1 object" if count == 1 else f"{count} objects"
+        print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
 
 
 @folder_lock.writes("json_path", "target")

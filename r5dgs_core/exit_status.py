@@ -24,6 +24,6 @@ def of(error: BaseException) -> ExitStatus:
         return ExitStatus.INTERRUPTED
     if isinstance(error, errors.UsageError):
         return ExitStatus.USAGE
-    if isinstance(error, errors.R5dgsError | BrokenPipeError):
+    if isinstance(error, errors.R5dgsError | OSError):  # the system refuses a file, or the reader of a pipe is gone
         return ExitStatus.ERROR
     return ExitStatus.DEFECT

@@ -60,8 +60,18 @@ def summary(scene: Scene, path: Path | None = None) -> str:
         f"moving     {len(moving)} of {len(objects)} objects",
         *(f"  {terminal.printable(name)}: {motion}" for name, motion in moving),
         f"quality    {quality.of(scene, path).text()}",
+        *_loss_of_baking(scene),
     ]
     return "\n".join(lines)
+
+
+def _loss_of_baking(scene: Scene) -> list[str]:
+    """PSNR of checkpoint and scene on the training views, in a line; none if the file has no such numbers."""
+    found = scene.provenance.get("training_views")
+    values = [found.get(name) for name in ("checkpoint_psnr", "baked_psnr")] if isinstance(found, dict) else [None]
+    if not all(isinstance(value, int | float) for value in values):
+        return []
+    return ["baking     checkpoint {:.2f} dB, scene {:.2f} dB on the training views".format(*values)]
 
 
 def observed_motion(scene: Scene, object_id: int) -> str | None:

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -104,12 +105,19 @@ def test_a_summary_names_what_moves_and_how(scene):
     assert f"moving     {len(scene.objects) - len(resting)} of {len(shown)} objects" in text
 
 
+@pytest.mark.parametrize("odd", ["x", {}, {"checkpoint_psnr": 1.0, "baked_psnr": "x"}])
+def test_a_summary_leaves_out_what_provenance_does_not_have(scene, odd):
+    odd_scene = dataclasses.replace(scene, provenance={"training_views": odd})
+    assert motion_words.summary(odd_scene) == motion_words.summary(scene)
+
+
 def test_bake_prints_the_summary_and_the_needs_on_demand(made, tmp_path, capsys):
     scene = tmp_path / "again.r5dgs"
     for extra, shown in (([], False), (["--needs"], True)):
         assert cli.main(["bake", str(made[0]), "--out", str(scene), "--progress", "none", *extra]) == 0
         text = capsys.readouterr().out
         assert text.startswith(f"written: {scene}\nscene ") and ("what the scene needs" in text) == shown
+        assert re.search(r"^baking +checkpoint \d+\.\d\d dB, scene \d+\.\d\d dB on the training views$", text, re.M)
 
 
 def test_missing_things_are_one_line(tmp_path, tiny, made, capsys):
@@ -462,6 +470,8 @@ for arguments in json.loads(sys.argv[1]):
         (errors.SceneFileError("x"), 3),
         (errors.Interrupted("x"), 130),
         (KeyboardInterrupt(), 130),
+        (PermissionError(13, "Permission denied", "x"), 3),
+        (OSError(28, "No space left on device"), 3),
         (ZeroDivisionError("x"), 70),
     ],
 )
