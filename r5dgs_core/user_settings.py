@@ -1,6 +1,6 @@
 """The user's settings: paths of weights and of the worker's Python, in the configuration folder of the platform.
 
-The file is TOML with one ``key = "value"`` per line. Needs the standard library alone.
+The file is TOML with one ``key = "value"`` per line. Needs no library outside the standard one.
 """
 
 from __future__ import annotations

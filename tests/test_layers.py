@@ -26,7 +26,7 @@ ALLOWED = {
     "time_left": set(),
     "input_paths": set(),
     "exit_status": set(),
-    "user_settings": set(),
+    "user_settings": {"scene"},
     "folder_lock": set(),
     "motion": set(),
     "scene": {"motion"},
