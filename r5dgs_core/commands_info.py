@@ -14,7 +14,7 @@ def run_info(path: Path, *, with_needs: bool = False, as_json: bool = False) -> 
     Args:
         path: The scene file.
         with_needs: Print the table of what the scene needs, too.
-        as_json: Print everything that the file says of the scene as JSON instead.
+        as_json: Print all data of the scene as JSON instead.
     """
     input_paths.check_scene(path)
     from .scene import scene_file

@@ -99,8 +99,8 @@ def run_query(
         path: The scene file.
         text: One or several things.
         encoder: Folder of the encoder that made the scene's table, or "text", for what names and stored words leave
-            unanswered; another one is refused even where nothing is left. If None, that of the user's settings serves
-            where the scene's table was made with it.
+            unanswered; any other is refused, even if nothing is left. None uses that of the user's settings if the
+            scene's table was made with it.
         threshold: Least score of a match, the usual one where None.
         as_json: Print JSON instead of a table.
 

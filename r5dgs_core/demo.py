@@ -100,7 +100,7 @@ def run_demo(
 
 
 def expectation() -> str:
-    """Return the line that says what a healthy run of the demo gives."""
+    """Return the line with the PSNR of a healthy run."""
     return f"expected about {EXPECTED['val']:.0f} / {EXPECTED['test']:.0f} dB (val / test)"
 
 

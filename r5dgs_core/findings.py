@@ -43,8 +43,8 @@ class Finding:
         code: Key of the table of codes.
         severity: `ERROR` or `WARNING`.
         place: File or folder.
-        problem: What was expected and what was found.
-        remedy: What to do.
+        problem: Expected and found content.
+        remedy: Advice to the user.
     """
 
     code: str

@@ -166,7 +166,7 @@ def _description() -> dict[str, str | int]:
 
 
 def _holder(path: Path) -> str:
-    """Describe the process that holds a lock, as well as its file tells."""
+    """Describe the process that holds a lock, from the lock file; "another process" if that cannot be read."""
     try:
         with open(path, "rb") as stream:
             found = strict_json.parse(stream.read(_MOST_BYTES), str(path), CheckpointError)

@@ -112,7 +112,7 @@ def path_of(path: Any, command: str) -> str:
 
 
 def stamp_of(path: Any) -> tuple[str, int, int]:
-    """What tells a scene file from another, and from itself after a change."""
+    """Path, time and size of a scene file, which change when the file does."""
     path = path_of(path, "load")
     try:
         status = Path(path).stat()
@@ -127,7 +127,7 @@ def stamp_of(path: Any) -> tuple[str, int, int]:
 
 
 def number_of(value: dict[str, Any], numbers: list[int]) -> int:
-    """Which of the loaded scenes is meant by its place among the paths; the first one where nothing is said."""
+    """Number of a loaded scene, from its place among the paths; the first one by default."""
     number = value.get("scene", 0)
     if not _is_whole(number) or not 0 <= number < len(numbers):
         raise errors.ConfigError(f"worker: 'scene' has to be a number below {len(numbers)}, found {_short(number)}")
@@ -219,7 +219,7 @@ def check_size(camera: Camera, gaussians: int, ranks: int = 0) -> None:
 
 
 def free_memory() -> int:
-    """Memory that a picture may take, bytes: what the system has to give, or half of all that it has."""
+    """Memory that a picture may take, bytes: the available memory, or half of all memory if that is unknown."""
     try:
         with open("/proc/meminfo", encoding="ascii") as stream:
             return next(int(line.split()[1]) << 10 for line in stream if line.startswith("MemAvailable:"))
@@ -255,7 +255,7 @@ def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
 
 
 def distance_of(request: dict[str, Any]) -> float:
-    """From which depth on depths count."""
+    """Depth at which depths begin to count."""
     return _number(request.get("distance", 0.0), "worker: 'distance' has to be a number")
 
 
@@ -268,7 +268,7 @@ def near_of(request: dict[str, Any]) -> float | None:
 
 
 def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
-    """Names of the arrays that are asked for."""
+    """Names of the arrays to send."""
     want = request.get("want", [])
     if not isinstance(want, list) or not all(isinstance(name, str) for name in want):
         raise errors.ConfigError(f"worker: 'want' has to be a list of names, found {_short(want)}")
@@ -279,7 +279,7 @@ def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
 
 
 def coverage_of(request: dict[str, Any]) -> tuple[list[int], int] | None:
-    """The group of each instance, and how many of them each pixel keeps; None if no coverage is asked for."""
+    """The group of each instance, and the number of groups that each pixel keeps; None without 'coverage'."""
     asked = request.get("coverage")
     if asked is None:
         return None

@@ -33,7 +33,7 @@ def _write(root: Path, *, scale: float, far: float, views: int, constant: bool, 
     """Write a data set of a two-coloured disk that moves before a gray background, with its masks.
 
     Args:
-        root: Where to.
+        root: Folder to write.
         scale: World units per unit of the scene.
         far: Distance of the scene from the world's origin, in the scene's units.
         views: Cameras on a circle.

@@ -1,4 +1,4 @@
-"""The one reader of JSON: bounded in size, depth and memory; every fault is one error of the class asked for.
+"""The one reader of JSON: bounded in size, depth and memory; every fault is one error of the caller's class.
 
 Accepted content can be written as JSON again: numbers are finite and in range, and text is valid Unicode.
 """

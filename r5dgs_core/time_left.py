@@ -40,7 +40,7 @@ class TimeLeft:
     """The estimate.
 
     Args:
-        phases: What the command does; `add` adds what becomes known later.
+        phases: Phases of the command; `add` adds those that become known later.
         clock: Seconds of a clock that never goes back.
     """
 
@@ -108,7 +108,7 @@ class TimeLeft:
         self._measured[phase.name] = self._measured.get(phase.name, 0.0) + cost
 
     def _limited(self, raw: float, now: float) -> float:
-        """What is shown: the raw estimate, held near the one shown before."""
+        """Return the raw estimate, limited to a small change from the one shown before."""
         if self._shown is not None and self._work_done() >= SETTLED * self._total() and raw > 0:
             expected = max(0.0, self._shown[0] - (now - self._shown[1]))
             most = CHANGE * expected + SLACK_S

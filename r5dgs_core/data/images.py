@@ -28,7 +28,7 @@ def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
 
     Args:
         path: The file.
-        place: What names it; the path itself by default.
+        place: Place for the message; the path by default.
     """
     kind = path.suffix.lower()
     found = f"{path.name}, of the unreadable kind {kind.removeprefix('.') or 'without suffix'}"

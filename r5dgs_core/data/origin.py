@@ -1,6 +1,6 @@
 """The origin of a data set: the point of its world from which everything is measured after reading.
 
-float32 has 24 bits: at a distance of 5e6 it resolves half a unit. Where cameras stand that far from the world's origin,
+float32 has 24 bits: at a distance of 5e6 it resolves half a unit. If cameras stand that far from the world's origin,
 compared with their distance from each other, positions are taken relative to a point among them, in float64.
 """
 

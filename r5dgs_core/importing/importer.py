@@ -22,7 +22,7 @@ from . import assembly, camera_file, deformable, freegave, run_folder, splatting
 from .foreign import Foreign
 from .run_folder import RunFolder
 
-MOST_KNOTS = 10_000  # that are made without being asked for
+MOST_KNOTS = 10_000  # without --knots
 ROUNDING = 1e-9  # share of the extent below which a motion is none
 _log = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ class Feature:
 
     Attributes:
         name: Lower case, with underscores.
-        required: Whether a reader without the feature would misread the scene.
+        required: True if a reader without the feature would misread the scene.
         since: First release that reads it.
     """
 

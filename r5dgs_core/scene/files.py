@@ -26,7 +26,7 @@ def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[
             leaves the old content there and nothing at ``path``.
 
     Raises:
-        OSError: It cannot be written; the caller says what that means.
+        OSError: It cannot be written.
     """
     path = Path(path)
     temporary = _temporary(path, ".part")

@@ -136,7 +136,7 @@ def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str])
     """Refuse a text that leaves out what is not there: that would select what the user did not mean.
 
     Args:
-        labels: What the objects answer to.
+        labels: Labels of the objects.
         text: The text.
         missing: Its phrases of `not_excluded`.
 
@@ -170,7 +170,7 @@ def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
     """Names and aliases that someone may have meant who typed a text that nothing matches.
 
     Args:
-        labels: What the objects answer to.
+        labels: Labels of the objects.
         text: What was typed.
         count: Most suggestions.
 

@@ -53,7 +53,7 @@ class PointEdit:
 
 @dataclass(frozen=True)
 class Place:
-    """Rows of an extended scene that hold the points of an edit, and the map that brings them where they were put.
+    """Rows of an extended scene that hold the points of an edit, and the map from there to their final places.
 
     Attributes:
         start: First row.
@@ -282,7 +282,7 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
 
 
 def _copy_numbers(rows: np.ndarray) -> np.ndarray:
-    """How often each row has occurred before. [n]"""
+    """Return the number of earlier occurrences of each row. [n]"""
     order = np.argsort(rows, kind="stable")
     ordered = rows[order]
     starts = np.flatnonzero(np.diff(ordered, prepend=-1))

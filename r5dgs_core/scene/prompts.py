@@ -34,9 +34,9 @@ class Prompt:
     """A prompt in its parts.
 
     Attributes:
-        wanted: What is asked for beside ``everything``.
-        excluded: What is left out.
-        everything: True if all objects are asked for.
+        wanted: Phrases of the objects to find, beside ``everything``.
+        excluded: Phrases of the objects to leave out.
+        everything: True if the prompt means all objects.
     """
 
     wanted: tuple[Phrase, ...] = ()
@@ -92,7 +92,7 @@ def _list(text: str, names: set[str]) -> Prompt:
 
 
 def _first(text: str) -> tuple[int, int] | None:
-    """Where the first word that leaves out begins and ends."""
+    """Return start and end of the first word that leaves objects out; None if there is none."""
     always, but = _EXCEPT.search(text), _BUT.match(text)
     spans = [always.span()] if always is not None else []
     spans += [but.span("but" if but["but"] else "late")] if but is not None else []

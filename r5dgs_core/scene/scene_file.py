@@ -130,7 +130,7 @@ def is_exact(path: str | Path) -> bool:
 
 
 def read_meanings(path: str | Path) -> meanings.Meanings | None:
-    """Only the stored embeddings of a scene, None where it has none. Raises as `read` does."""
+    """Return only the stored embeddings of a scene; None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
         data = _read_json(archive)

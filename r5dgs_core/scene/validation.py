@@ -1,6 +1,6 @@
-"""Whether a `Scene` is consistent: shapes, types, finite numbers, unit quaternions, ranges, references.
+"""Checks that a `Scene` is consistent: shapes, types, finite numbers, unit quaternions, ranges, references.
 
-Reading and writing check the same rules, so what one accepts the other does too.
+Reading and writing apply the same rules.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ _DTYPES = {
 
 
 def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> None:
-    """Raise `SceneFileError` naming ``place``, the member and what was expected where the scene is inconsistent.
+    """Raise `SceneFileError` with ``place``, the member and the expected content if the scene is inconsistent.
 
     Args:
         scene: The scene.
@@ -155,10 +155,10 @@ def check_shapes(
     table: Table | None,
     place: str,
 ) -> None:
-    """Raise `SceneFileError` where the shapes of a scene's arrays do not fit each other or the rest of the scene.
+    """Raise `SceneFileError` if the shapes of a scene's arrays do not fit each other or the rest of the scene.
 
     Args:
-        shapes: Shape of each array that there is; at least those that every scene has.
+        shapes: Shapes by name, at least of the arrays that every scene has.
         objects, groups, vocabulary, table: Fields of `Scene`, the last one `Scene.lookup`.
         place: For messages.
     """
@@ -203,13 +203,13 @@ def check_shapes(
 def check_meaning_shapes(
     shapes: Mapping[str, tuple[int, ...]], objects: int, words: int, table: Table | None, place: str
 ) -> None:
-    """Raise `SceneFileError` where the shapes of stored embeddings do not fit each other or what is said about them.
+    """Raise `SceneFileError` if the shapes of stored embeddings do not fit each other or their table.
 
     Args:
-        shapes: Shape of each of `EMBEDDINGS` that there is; others are ignored.
+        shapes: Shapes by name; only `EMBEDDINGS` are checked.
         objects: Rows of the table of objects.
         words: Words of the vocabulary.
-        table: What is said about the embeddings.
+        table: Encoder, thresholds and views of the embeddings.
         place: For messages.
     """
     there = {name: shapes[name] for name in EMBEDDINGS if name in shapes}
@@ -240,11 +240,11 @@ def check_meaning_shapes(
 
 
 def check_meanings(arrays: Mapping[str, np.ndarray | None], table: Table | None, place: str) -> None:
-    """Raise `SceneFileError` where the numbers of stored embeddings, or of what is said about them, are out of range.
+    """Raise `SceneFileError` if numbers of stored embeddings or of their table are out of range.
 
     Args:
         arrays: `EMBEDDINGS` by name.
-        table: What is said about the embeddings.
+        table: Encoder, thresholds and views of the embeddings.
         place: For messages.
     """
     for name, array in arrays.items():
@@ -266,7 +266,7 @@ def _length(shapes: Mapping[str, tuple[int, ...]], name: str) -> int:
 
 
 def check_range(name: str, values: np.ndarray, place: str) -> None:
-    """Raise `SceneFileError` where numbers that belong into a field of `Scene` are not finite or out of range."""
+    """Raise `SceneFileError` if numbers of a field of `Scene` are not finite or out of range."""
     low = _LEAST_LOG_SCALE if "log_scales" in name else None
     _check_range(place, name, values, _LIMITS[name], low)
 
@@ -274,7 +274,7 @@ def check_range(name: str, values: np.ndarray, place: str) -> None:
 def _check_range(
     place: str, name: str, values: np.ndarray, limit: float | np.ndarray, low: float | None = None
 ) -> None:
-    """Raise `SceneFileError` naming the first row that holds NaN or what is out of range.
+    """Raise `SceneFileError` with the first row that holds NaN or a number out of range.
 
     Args:
         place, name: For the message.
@@ -416,7 +416,7 @@ def _check_group(scene: Scene, place: str, row: int, group: MotionGroup, object_
 
 
 def _check_model(model: MotionModel, place: str) -> None:
-    """Raise `SceneFileError` naming the rate that no motion can be computed with."""
+    """Raise `SceneFileError` with the name of a rate that playback cannot use."""
     for name, limit in _MODEL_LIMITS.items():
         value = np.max(np.abs(getattr(model, name)))
         if not value <= limit:

@@ -72,7 +72,7 @@ class Inverse:
 
 @dataclass(frozen=True)
 class Loss:
-    """How far display colours come out of a view that is inverted.
+    """Error of display colours under a view that is inverted.
 
     Attributes:
         psnr: In dB, of colours that are rounded to 255 steps afterwards: at most 59.
@@ -90,7 +90,7 @@ def loss(forward: Forward, made: Inverse, display: np.ndarray, weights: np.ndarr
         forward: Displays scene-linear colours.
         made: Its inverse.
         display: The colours that are wanted. [N, 3]
-        weights: How much each counts. [N]
+        weights: Weight of each colour. [N]
 
     Returns:
         The loss.

@@ -77,7 +77,7 @@ def check(content: Any) -> dict[str, Any]:
     """Return the values of a checkpoint by the names of its fields.
 
     Args:
-        content: What the file holds.
+        content: Content of the file.
 
     Raises:
         CheckpointError: Something is missing or does not fit; the message names it and not the file.
@@ -121,7 +121,7 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    """Return True for a dense tensor in memory; one whose elements share memory is none."""
+    """Return True for a dense tensor of which no two elements share memory."""
     return (
         type(tensor) is Tensor
         and not tensor.is_nested

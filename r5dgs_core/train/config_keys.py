@@ -68,7 +68,7 @@ class Key:
 
     Attributes:
         name: ``section.key``.
-        meaning: What it sets.
+        meaning: Description, from the section's docstring.
         unit: Unit of a number, "text" or "true or false".
         default: Value if nothing is given.
         value: Value in force.

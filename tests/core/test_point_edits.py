@@ -1,4 +1,4 @@
-"""Edited points look as what they were made of, put where the edit puts it."""
+"""Edited points look like their Gaussians, moved by the edit."""
 
 import dataclasses
 

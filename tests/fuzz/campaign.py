@@ -62,7 +62,7 @@ class Tally:
 
     @property
     def good(self) -> bool:
-        """Whether nothing went wrong."""
+        """True if no input failed."""
         return not self.uncaught and not self.hangs and self.peak <= MOST_MEMORY
 
     def row(self) -> str:

@@ -62,7 +62,7 @@ class Row:
         tolerance: Largest value that passes.
         source: Where the tolerance comes from.
         trace_rk2: The same value for TRACE's integrator, or None where it has no part in the case.
-        passed: Whether the value is within the tolerance, and the case took at most `MOST_SECONDS`.
+        passed: True if the value is within the tolerance and the case took at most `MOST_SECONDS`.
         seconds: CPU time of our side.
         message: The error of a case that raised one, else "".
     """
