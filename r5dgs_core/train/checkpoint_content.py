@@ -82,7 +82,8 @@ def check(content: Any) -> dict[str, Any]:
     Raises:
         CheckpointError: Something is missing or does not fit; the message names it and not the file.
     """
-    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
+    version = content.get("format_version") if isinstance(content, dict) else None
+    if not isinstance(version, int) or version != FORMAT_VERSION:
         raise CheckpointError(f"expected a checkpoint of format_version {FORMAT_VERSION}")
     for name, (good, expected) in _RULES.items():
         if name not in content:

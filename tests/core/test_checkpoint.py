@@ -86,7 +86,7 @@ def test_foreign_files_and_other_versions_are_named(tmp_path):
     path.write_bytes(b"not a checkpoint" * 10)
     with pytest.raises(CheckpointError, match="checkpoint.pt"):
         checkpoint.load(tmp_path)
-    for content in ({"format_version": 999}, {"tensors": {}}, [1, 2]):
+    for content in ({"format_version": 999}, {"format_version": torch.ones(2)}, {"tensors": {}}, [1, 2]):
         torch.save(content, path)
         with pytest.raises(CheckpointError, match="checkpoint.pt: expected a checkpoint of format_version 1"):
             checkpoint.load(tmp_path)
