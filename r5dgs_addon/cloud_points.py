@@ -32,7 +32,7 @@ class Edit:
     Attributes:
         key: Digest of the points.
         points: The points. Only what differs from the scene file is there.
-        bent: Whether they are already bent as Exact Mode bends them.
+        bent: True if they are already bent as Exact Mode bends them.
     """
 
     key: str
@@ -48,11 +48,11 @@ class Edit:
 
 @dataclass(frozen=True)
 class Found:
-    """What a cloud's points are.
+    """Result of comparing a cloud's points with the scene file.
 
     Attributes:
-        edit: How they differ from the scene file; None if they do not.
-        notes: What of them cannot be drawn, as sentences that begin with the cloud's name.
+        edit: The points, if they differ; else None.
+        notes: Sentences on what cannot be drawn of them; each begins with the cloud's name.
     """
 
     edit: Edit | None = None
@@ -76,7 +76,7 @@ def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) ->
     Raises:
         ConfigError: Points were deleted or added, and the attribute `gaussian` is missing.
     """
-    edited = bool(_modifiers(obj, depsgraph.mode))
+    edited = _is_modified(obj, depsgraph)
     key = (obj.session_uid, depsgraph.mode, depsgraph.scene.session_uid, depsgraph.view_layer.name)
     known = _known.get(key)
     if known is not None and known[0] == obj.data.session_uid and not (edited and depsgraph.mode == "RENDER"):
@@ -87,9 +87,10 @@ def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) ->
 
 
 def notes(collection: bpy.types.Collection) -> list[str]:
-    """What the last comparisons found that cannot be drawn of a loaded scene's clouds; nothing is compared for this."""
-    own = {obj.session_uid for obj in collection.all_objects}
-    return list(dict.fromkeys(note for key, (_, found) in _known.items() if key[0] in own for note in found.notes))
+    """Return the notes of the last comparisons of a loaded scene's clouds, without comparing them again."""
+    known = [(key[0], found) for key, (_, found) in list(_known.items()) if found.notes]  # renders add to it meanwhile
+    own = {obj.session_uid for obj in collection.all_objects} if known else set()
+    return list(dict.fromkeys(note for uid, found in known if uid in own for note in found.notes))
 
 
 def forget(*_) -> None:
@@ -103,17 +104,18 @@ def evaluated(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.type
     return obj.data if len(found.points) == 0 and displays.hides_points(obj) else found
 
 
-def _modifiers(obj: bpy.types.Object, mode: str) -> list[bpy.types.Modifier]:
-    """Modifiers that change a cloud's points; ellipsoids do not."""
-    flag = "show_render" if mode == "RENDER" else "show_viewport"
-    return [one for one in obj.modifiers if one.name != displays.MODIFIER and getattr(one, flag)]
+def _is_modified(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
+    """Return True if modifiers are on that change a cloud's points; ellipsoids do not."""
+    flag = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
+    found = obj.evaluated_get(depsgraph).modifiers  # a render does not write animated switches to the original
+    return any(one.name != displays.MODIFIER and getattr(one, flag) for one in found)
 
 
 def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool, gaussians: int) -> Found:
-    cloud, said = evaluated(obj, depsgraph), []
+    cloud, problems = evaluated(obj, depsgraph), []
     hidden = cloud == obj.data
     if hidden and edited:
-        said.append("its modifiers are ignored under ellipsoids of an earlier version; choose the display again")
+        problems.append("its modifiers are ignored under ellipsoids of an earlier version; choose the display again")
     stored = clouds.fingerprints(obj.data)
     bound = clouds.attribute(cloud, clouds.BIND + "position", "FLOAT_VECTOR") is not None
     bent = bound and edited and not hidden
@@ -132,28 +134,28 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
         values["sh"] = sh
     missing = [name for name, kind, *_ in PARTS.values() if clouds.attribute(cloud, name, kind) is None]
     if missing and len(cloud.points):
-        said.append(f"{', '.join(missing)} missing or of another type; the scene file's values are drawn")
+        problems.append(f"{', '.join(missing)} missing or of another type; the scene file's values are drawn")
     if edited and not hidden:
-        said += _made_besides_points(obj, depsgraph)
+        problems += _made_besides_points(obj, depsgraph)
     if _is_radius_changed(obj, cloud, stored):
-        said.append("the radius of points is for display only; change the attribute 'scale' instead")
+        problems.append("the radius of points is for display only; change the attribute 'scale' instead")
     if rows is None and not values:
-        return Found(None, _said(obj, said))
+        return Found(None, _notes(obj, problems))
     whole = np.arange(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count, dtype=np.int32)
     rows = whole if rows is None else rows
     there = _drawable(rows, values, gaussians)
     if not there.all():
-        said.append(f"{amounts.of(int((~there).sum()), 'point')} without a Gaussian; new points are not drawn")
+        problems.append(f"{amounts.of(int((~there).sum()), 'point')} without a Gaussian; new points are not drawn")
         rows, values = rows[there], {part: found[there] for part, found in values.items()}
     values = _without_the_originals(obj, rows, values, stored)
     edit = None
     if values or not np.array_equal(rows, whole):
         edit = Edit(_key(rows, values), PointEdit(rows, **values), bent)
-    return Found(edit, _said(obj, said))
+    return Found(edit, _notes(obj, problems))
 
 
-def _said(obj: bpy.types.Object, said: list[str]) -> tuple[str, ...]:
-    return tuple(f"{obj.name}: {text}" for text in said)
+def _notes(obj: bpy.types.Object, problems: list[str]) -> tuple[str, ...]:
+    return tuple(f"{obj.name}: {text}" for text in problems)
 
 
 def _rows(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, str]) -> np.ndarray | None:
@@ -165,8 +167,8 @@ def _rows(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, 
         if len(cloud.points) == 0:
             return np.zeros(0, np.int32)
         raise errors.ConfigError(
-            f"{obj.name}: expected its {obj.r5dgs.count} points, found {len(cloud.points)}, which do not say which "
-            f"Gaussians they are (the attribute '{clouds.ROW}'); undo that change, or load the scene again"
+            f"{obj.name}: expected its {obj.r5dgs.count} points, found {len(cloud.points)}, without the "
+            f"attribute '{clouds.ROW}' that names the Gaussian of each; undo that change, or load the scene again"
         )
     rows = clouds.view(attribute, "value", 1, np.int32)[:, 0]
     if stored.get(clouds.ROW) == clouds.fingerprint(rows):
@@ -242,8 +244,8 @@ def _is_radius_changed(obj: bpy.types.Object, cloud: bpy.types.PointCloud, store
 
 
 def _made_besides_points(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[str]:
-    """What the modifiers of a cloud make that the engine does not draw."""
-    if obj.modifiers.get(displays.MODIFIER) is not None:  # its ellipsoids cannot be told from other instances
+    """Sentences on geometry that the modifiers of a cloud make and the engine does not draw."""
+    if obj.modifiers.get(displays.MODIFIER) is not None:  # its ellipsoids are instances like any others
         return []
     own, instanced = set(), False
     for one in depsgraph.object_instances:
@@ -268,8 +270,9 @@ def _follow_updates(_, depsgraph=None):
     if not _known or depsgraph is None:
         return
     updated = {one.id.original.session_uid for one in depsgraph.updates if one.is_updated_geometry}
-    for key in [key for key, (data, _) in _known.items() if key[0] in updated or data in updated]:
-        del _known[key]
+    for key, (data, _) in list(_known.items()):  # a render's thread may change it meanwhile
+        if key[0] in updated or data in updated:
+            _known.pop(key, None)
 
 
 @persistent

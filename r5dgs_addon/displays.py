@@ -1,4 +1,4 @@
-"""What stands for Gaussians in viewports that do not draw splats: points, or an ellipsoid for each by geometry nodes.
+"""Stand-ins for Gaussians in viewports that do not draw splats: points, or an ellipsoid for each by geometry nodes.
 
 Points are quick at any number. Ellipsoids show size, direction and opacity as they are, at a price; they are
 instances that a modifier of the point cloud makes. The modifier passes the points on with a radius of 0, so that the
@@ -47,7 +47,7 @@ def show(collection: bpy.types.Collection, display: str) -> None:
 
 
 def hides_points(cloud: bpy.types.Object) -> bool:
-    """Whether a cloud has ellipsoids of a version that did not pass the points on."""
+    """Return True if a cloud has ellipsoids of a version that did not pass the points on."""
     found = cloud.modifiers.get(MODIFIER)
     tree = None if found is None else found.node_group
     return tree is not None and not any(node.bl_idname == JOIN for node in tree.nodes)

@@ -92,7 +92,7 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:
-    """What the file does not hold of edited points, as sentences."""
+    """Sentences on edited points that the file does not hold."""
     notes = [note for member in members for note in member.points.notes]
     animated = [member.cloud.name for member in members if len(member.keys) > 1]
     if animated:

@@ -31,7 +31,7 @@ class Plan:
         place: Where its curves lie.
         times: Its times, with the new end.
         tails: Keys by path, over frames.
-        too_fast: Whether the motion is too fast for keys, which then are exact only at frames.
+        too_fast: True if the motion is too fast for keys, which then are exact only at frames.
     """
 
     anchor: bpy.types.Object

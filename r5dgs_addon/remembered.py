@@ -1,4 +1,4 @@
-"""What was read from files, or why that failed, until a file changes."""
+"""Cache of files that were read, and of errors in reading them, until a file changes."""
 
 from collections.abc import Callable
 from pathlib import Path

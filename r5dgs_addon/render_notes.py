@@ -1,4 +1,4 @@
-"""What a render leaves out: named in the render's report, once per render, and in the render properties."""
+"""Notes on what a render leaves out, for the render's report, once per render, and the render properties."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -9,7 +9,7 @@ _reported: set[str] = set()  # since the render began; an animation is one rende
 
 
 def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> list[str]:
-    """What the engine does not render of a Blender scene, as sentences without a period.
+    """Name what the engine does not render of a Blender scene, as sentences without a period.
 
     Args:
         scene: The scene.
@@ -25,8 +25,7 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
     held = sorted({obj.name for obj in others if visible.is_held_out(obj, None, depsgraph)})
     if held:
         notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
-    inside = set(scene.collection.children_recursive)
-    return notes + [note for one in objects.scene_collections() if one in inside for note in cloud_points.notes(one)]
+    return notes + [note for one in objects.shown(scene) for note in cloud_points.notes(one)]
 
 
 def report(engine: bpy.types.RenderEngine, notes: list[str]) -> None:

@@ -33,8 +33,8 @@ class Instance:
         collection: The loaded scene.
         parent: The object that makes the instance, or None.
         edit: The points, if they are not those of the scene file.
-        holdout: Whether it cuts a hole into pictures.
-        seen: Whether cameras see it: not if ray visibility or an indirect-only collection says otherwise.
+        holdout: True if it cuts a hole into pictures.
+        seen: True if cameras see it: neither its ray visibility nor an indirect-only collection hides it from them.
     """
 
     scene: int
@@ -179,15 +179,16 @@ def _clouds(
 
 
 def is_held_out(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether an object, or what makes an instance of it, is a hold-out by itself or by a collection."""
-    return obj.is_holdout or (parent or obj).holdout_get(view_layer=depsgraph.view_layer)
+    """Return True if an object, or the instancer of it, is a hold-out by itself or by a collection."""
+    own = obj.evaluated_get(depsgraph)  # a render does not write animated values to the original
+    return own.is_holdout or (parent or obj).holdout_get(view_layer=depsgraph.view_layer)
 
 
 def _is_seen(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Whether cameras see an object, or an instance of it."""
+    """Return True if cameras see an object, or an instance of it."""
     maker = parent or obj
     direct = not maker.indirect_only_get(view_layer=depsgraph.view_layer) or is_held_out(obj, parent, depsgraph)
-    return direct and obj.visible_camera and maker.visible_camera
+    return direct and all(one.evaluated_get(depsgraph).visible_camera for one in (obj, maker))
 
 
 def _seen(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None) -> bool:

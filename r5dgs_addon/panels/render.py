@@ -47,7 +47,7 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
             box.label(text=", ".join(objections))
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
         for note in render_notes.of(scene):
-            layout.label(text=note, icon="INFO")
+            windows.wrapped(layout, context, note, "INFO")
         settings = scene.r5dgs_render
         column = layout.column()
         column.prop(settings, "as_trained")

@@ -36,7 +36,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         else:
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
         for note in cloud_points.notes(collection):
-            layout.label(text=note, icon="ERROR")
+            windows.wrapped(layout, context, note, "ERROR")
         if not timeline.fits(context.scene, times):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
         row = layout.row(align=True)

@@ -307,6 +307,21 @@ def test_what_cannot_be_drawn_is_named(blender, loaded, mug, cloud_points, visib
     assert "mesh made by its modifiers" in capfd.readouterr().out
 
 
+def test_what_cannot_be_drawn_of_a_linked_scene_is_named_where_it_is_instanced(blender, mug, visible, tmp_path):
+    nodes(blender, mug, doubled)
+    library = str(tmp_path / "library.blend")
+    blender.ops.wm.save_as_mainfile(filepath=library)
+    blender.ops.wm.read_homefile(app_template="")
+    with blender.data.libraries.load(library, link=True) as (source, target):
+        target.collections = [name for name in source.collections if name.startswith("R5DGS")]
+    instancer = blender.data.objects.new("instancer", None)
+    instancer.instance_type, instancer.instance_collection = "COLLECTION", target.collections[0]
+    blender.context.scene.collection.objects.link(instancer)
+    visible.instances(blender.context.evaluated_depsgraph_get())
+    said = importlib.import_module("r5dgs.r5dgs_addon.render_notes").of(blender.context.scene)
+    assert any("1 point without a Gaussian" in note for note in said)
+
+
 def test_unrealized_instances_and_radii_are_named(blender, loaded, mug, cloud_points, visible):
     def instanced(tree, source, target):
         tree.links.new(chain(tree, source, ("GeometryNodeGeometryToInstance", {})), target)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from r5dgs_core.data import images
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import playback
 from tests.addon.test_engine import NOTHING, assert_almost_all_close, go_to, loaded, psnr, render_passes, scene
@@ -89,6 +90,21 @@ def test_what_cameras_do_not_see_is_not_drawn(blender, loaded, passes):
     hidden = passes()
     assert psnr(before.combined, unseen.combined) < 40
     np.testing.assert_allclose(unseen.combined, hidden.combined, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "value"), [("is_holdout", True), ("visible_camera", False)])
+def test_an_animation_follows_keyed_hold_outs_and_visibility(blender, loaded, passes, tmp_path, name, value):
+    blender.context.scene.frame_start, blender.context.scene.frame_end = 1, 2
+    for obj in loaded.all_objects:  # what rests
+        obj.animation_data_clear()
+    mug, settings = cloud(loaded, "mug"), blender.context.scene.render
+    for frame, at in ((1, value), (2, not value)):
+        setattr(mug, name, at)
+        mug.keyframe_insert(name, frame=frame)
+    settings.filepath, settings.image_settings.file_format = str(tmp_path / "frame_"), "PNG"
+    assert blender.ops.render.render(animation=True) == {"FINISHED"}
+    first, second = (images.read(tmp_path / f"frame_000{frame}.png") for frame in (1, 2))
+    assert psnr(first, second) < 40
 
 
 def test_cycles_leaves_alpha_and_depth_empty_in_a_hold_out(blender, tmp_path):
