@@ -135,7 +135,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
         **_vector("angular_velocity"),
     )
     angular_acceleration: FloatVectorProperty(
-        name="Spin Change /s²",
+        name="Spin /s²",
         description="How the spin changes, per second and second",
         subtype="EULER",
         unit="ROTATION",

@@ -4,7 +4,7 @@ import textwrap
 
 import bpy
 
-_LETTER, _MARGIN, _WIDTH = 8, 70, 400  # pixels of a letter, beside a text, and of a region if there is none
+_LETTER, _MARGIN, _WIDTH = 7, 70, 400  # pixels of a letter, beside a text, and of a region if there is none
 
 
 def say(context: bpy.types.Context, text: str | None) -> None:

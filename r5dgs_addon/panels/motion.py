@@ -39,7 +39,7 @@ def _physics(layout, anchor) -> None:
     layout.label(text=anchor.name, icon="EMPTY_ARROWS")
     refused = motion_curves.refusal(anchor)
     if refused:
-        layout.label(text=refused, icon="ERROR")
+        windows.wrapped(layout, bpy.context, refused, "ERROR")
     layout.prop(state, "leader")
     if motion_physics.follow_matrix(state) is not None:
         layout.label(text="Moves with what it follows", icon="LINKED")
@@ -51,9 +51,9 @@ def _physics(layout, anchor) -> None:
         layout.prop(state, name)
     layout.prop(state, "at_once")
     if state.too_fast:
-        layout.label(text="Too fast for keys: exact only at frames", icon="ERROR")
+        windows.wrapped(layout, bpy.context, "Too fast for keys: exact only at frames", "ERROR")
     if not motion_physics.is_written(anchor):
-        layout.label(text="Re-Extrapolate writes this to the keys", icon="ERROR")
+        windows.wrapped(layout, bpy.context, "Re-Extrapolate writes this to the keys", "ERROR")
     elif motion_physics.edited(state):
         layout.label(text="Edited", icon="GREASEPENCIL")
     else:

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import engine, figures, live_preview, worker, worker_check
+from .. import engine, figures, live_preview, windows, worker, worker_check
 from . import render, sidebar
 
 
@@ -18,14 +18,14 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
         row.operator("r5dgs.preview", icon="RENDER_STILL")
         row.operator("r5dgs.live_preview", text="Live", icon="PLAY", depress=live_preview.running())
         if live_preview.message():
-            layout.label(text=live_preview.message(), icon="ERROR")
+            windows.wrapped(layout, context, live_preview.message(), "ERROR")
         if worker.notice():
-            layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
+            windows.wrapped(layout, context, worker.notice().capitalize(), "SORTTIME")
         if figures.speed():
             column = layout.column(align=True)
-            column.label(text=figures.speed(), icon="TIME")
+            windows.wrapped(column, context, figures.speed(), "TIME")
             for line in figures.errors():
-                column.label(text=line[0].upper() + line[1:], icon="BLANK1")
+                windows.wrapped(column, context, line[0].upper() + line[1:], "BLANK1")
         if context.scene.camera is None:
             layout.label(text="The scene has no camera", icon="INFO")
         if context.scene.render.engine != engine.ENGINE:

@@ -51,7 +51,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 def _draw_answers(box, session, names):
     asking = any(note.name.startswith(prompt.ASKING) for note in session.notes)
     if not session.matches and not asking:
-        box.label(text=f"Nothing matches '{session.asked}'", icon="INFO")
+        windows.wrapped(box, bpy.context, f"Nothing matches '{session.asked}'", "INFO")
     for match in session.matches:
         line = box.split(factor=0.5)
         action = line.operator(

@@ -43,8 +43,8 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         objections = engine_color.objections(scene)
         if objections:
             box = layout.box().column(align=True)
-            box.label(text="Colors do not come out as trained:", icon="ERROR")
-            box.label(text=", ".join(objections))
+            text = f"Colors do not come out as trained: {', '.join(objections)}"
+            windows.wrapped(box, context, text, "ERROR")
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
         for note in render_notes.of(scene):
             windows.wrapped(layout, context, note, "INFO")
@@ -53,15 +53,16 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         column.prop(settings, "as_trained")
         inverse = engine_color.inverse(scene)
         if inverse is not None and not objections:
-            column.label(text=f"{scene.view_settings.view_transform} is inverted for Gaussians", icon="CHECKMARK")
+            text = f"{scene.view_settings.view_transform} is inverted for Gaussians"
+            windows.wrapped(column, context, text, "CHECKMARK")
             draw_loss(column, scene)
             if inverse.reach < engine_color.WIDE:
-                column.label(text="Very saturated colors stay paler")
+                windows.wrapped(column, context, "Very saturated colors stay paler")
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")
         if worker.notice():
-            layout.label(text=worker.notice().capitalize(), icon="SORTTIME")
+            windows.wrapped(layout, context, worker.notice().capitalize(), "SORTTIME")
 
 
 class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):

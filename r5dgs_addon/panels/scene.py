@@ -42,7 +42,9 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         row = layout.row(align=True)
         for value, name, _ in displays.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
-        layout.prop(state, "filepath")
+        row = layout.split(factor=0.33)  # beside the field Blender would cut the name
+        row.label(text="Scene File")
+        row.prop(state, "filepath", text="")
         asked = trust.find(collection).asked
         if asked is not None:
             box = layout.box()

@@ -22,7 +22,7 @@ from .meanings import Meanings
 from .scene import Scene
 
 THRESHOLD = stored.PASS
-EVERYTHING = "everything"  # begins the reason of a match that no word of its own found
+EVERYTHING = "all"  # begins the reason of a match that no word of its own found
 Embed = Callable[[str], np.ndarray | None]  # embedding of a phrase, unit [D]; None where it cannot be had
 _SETTLED = 0.9  # of a name that says the wish whole
 _TYPO_RATIO = 0.75
@@ -97,8 +97,7 @@ def search_labels(
     """
     asked, best = _asked(labels, text), {}
     if asked.everything:
-        why = " and ".join(repr(said) for said, _ in asked.excluded)
-        why = f"{EVERYTHING} but {why}" if why else EVERYTHING
+        why = f"{EVERYTHING} others" if asked.excluded else EVERYTHING
         best = {label.object_id: Match(label.object_id, 1.0, why) for label in labels if label.object_id > 0}
     for match in _matches(labels, asked.wanted, threshold, meanings, embed):
         if match.object_id not in best or match.score > best[match.object_id].score:

@@ -1,5 +1,6 @@
 """The sidebar, menus and drag and drop are there, and name only operators and properties that exist."""
 
+import contextlib
 import dataclasses
 import importlib
 import os
@@ -58,7 +59,33 @@ def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, s
     before = sidebar()
     process = importlib.import_module("r5dgs.r5dgs_addon.worker_process")
     monkeypatch.setattr(worker, "notice", lambda: process.COMPILING)
-    assert [text for text in sidebar() if text not in before] == ["Preparing the rasterizer (first use, about 10 s)"]
+    new = [text for text in sidebar() if text not in before]
+    assert " ".join(new) == "Preparing the rasterizer (first use, about 10 s)"
+
+
+def test_no_text_is_longer_than_a_sidebar_of_normal_width_shows(blender, sidebar, scene_path, monkeypatch):
+    blender.ops.r5dgs.load_scene(filepath=str(scene_path))
+    windows, points, worker, live, notes = (
+        importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+        for name in ("windows", "cloud_points", "worker", "live_preview", "render_notes")
+    )
+    monkeypatch.setattr(windows, "_WIDTH", 280)
+    long = "mug: the radius of points is for display only; change the attribute 'scale' instead"
+    monkeypatch.setattr(points, "notes", lambda collection: [long])
+    monkeypatch.setattr(notes, "of", lambda scene: [long])
+    monkeypatch.setattr(worker, "notice", lambda: long)
+    monkeypatch.setattr(live, "message", lambda: long)
+    blender.context.scene.render.engine = "R5DGS"
+    blender.context.scene.view_settings.view_transform = "False Color"
+    figures = blender.context.window_manager.r5dgs_figures
+    figures.size, figures.unbent = "1920 x 1080", 1234
+    with contextlib.suppress(RuntimeError):  # the error that the sidebar repeats
+        blender.ops.r5dgs.select_by_prompt(text="not the unicorn that lives in the forest")
+    said = sidebar()
+    words = " ".join(said)
+    assert words.count("change the attribute") == 5 and "False Color" in words
+    assert "1920 x 1080" in words and "shown unbent" in words and "lives in the forest" in words
+    assert [text for text in said if len(text) > 40] == []
 
 
 def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender, extension):

@@ -28,7 +28,7 @@ def found(scene, text):
 def test_everything_is_all_objects_without_the_background(scene, text):
     matches = query.find(scene, text)
     assert [match.object_id for match in matches] == sorted(ALL)
-    assert {match.score for match in matches} == {1.0} and {match.why for match in matches} == {"everything"}
+    assert {match.score for match in matches} == {1.0} and {match.why for match in matches} == {"all"}
 
 
 @pytest.mark.parametrize(
@@ -63,6 +63,7 @@ def test_what_is_left_out_is_all_that_is_missing(scene, text, left_out):
 @pytest.mark.parametrize("text", ["mug", "cup", "fruit", "red apple", "glob", "wooden blocks", "lemon and globe"])
 def test_not_is_the_complement_among_the_objects(scene, text):
     assert found(scene, f"not {text}") == found(scene, f"everything but {text}") == ALL - found(scene, text)
+    assert {match.why for match in query.find(scene, f"not {text}")} == {"all others"}
 
 
 @pytest.mark.parametrize(
