@@ -13,7 +13,7 @@ from typing import Any
 from .errors import R5dgsError
 
 MOST_BYTES = 64 << 20  # of a file
-MOST_MEMORY = 256 << 20  # of what the parser builds, as `_memory` estimates it
+MOST_MEMORY = 256 << 20  # of what the parser builds, as `memory_of` estimates it
 MOST_DEPTH = 64
 _MOST_DIGITS = 19  # of integers of 64 bits; Python limits what it converts to 4300
 
@@ -44,7 +44,7 @@ def parse(
         R5dgsError: Of class ``kind``: not JSON, too large, nested deeper than `MOST_DEPTH`, a key that occurs twice in
             an object, NaN, infinity, a number out of range, or half of a surrogate pair.
     """
-    needed = _memory(data)
+    needed = memory_of(data)
     if len(data) > size or needed > memory:
         raise kind(
             f"{place}: expected JSON of at most {size >> 20} MiB that needs {memory >> 20} MiB of memory, found "
@@ -82,8 +82,8 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -
     return parse(data, str(path), kind, remedy, size=MOST_BYTES)
 
 
-def _memory(data: bytes) -> int:
-    """Upper bound of the memory of the parsed values, without their text, from counts of what separates them."""
+def memory_of(data: bytes) -> int:
+    """Return an upper bound of the memory of parsed values, without their text, from counts of separators; bytes."""
     return 240 * data.count(b"{") + 64 * (data.count(b"[") + data.count(b","))
 
 

@@ -206,27 +206,29 @@ def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
 
 
 def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:
-    content = _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED)
-    if content > most_content(stream.tell()):  # made scenes, of equal Gaussians: a reader would take it for a bomb
+    if not _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED):  # made scenes, of equal Gaussians or objects
         stream.seek(0)
         stream.truncate()
         _write_members(scene, stream, exact, zipfile.ZIP_STORED)
 
 
-def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> int:
-    """Write the zip; returns the size of its content, bytes."""
+def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> bool:
+    """Write the zip; returns False if it compresses so well that a reader would take it for a bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
         arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None and name not in still]
         head = {"format": FORMAT, "format_version": features.version(scene), "arrays": arrays, **features.dump(scene)}
-        _add(archive, JSON_MEMBER, scene_json.dump(scene, head), compression)
+        text = scene_json.dump(scene, head)
+        _add(archive, JSON_MEMBER, text, compression)
         for name in arrays:
             array, dtype = getattr(scene, name), _MEMORY_DTYPES[name]
             buffer = io.BytesIO()
             stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
             np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
             _add(archive, f"{name}.npy", buffer.getvalue(), compression)
-        return sum(info.file_size for info in archive.infolist())
+        content = sum(info.file_size for info in archive.infolist())
+        packed = archive.getinfo(JSON_MEMBER).compress_size
+    return content <= most_content(stream.tell()) and strict_json.memory_of(text) <= most_content(packed)
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> None:

@@ -155,6 +155,11 @@ def test_doubled_members_are_refused(path, tmp_path):
     assert_refused_cheaply(target, r"'means\.npy' twice")
 
 
+def test_a_scene_whose_json_compresses_like_a_bomb_can_be_read_again(tmp_path):
+    scene = dataclasses.replace(make_scene(n=60), provenance={"zeros": [0] * 600_000})
+    assert scene_file.read(scene_file.write(scene, tmp_path / "zeros.r5dgs")).provenance == scene.provenance
+
+
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_the_doubled_one_of_many_members_is_named(tmp_path):
     with zipfile.ZipFile(tmp_path / "many.r5dgs", "w") as file:

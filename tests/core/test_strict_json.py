@@ -86,7 +86,7 @@ def test_the_estimate_of_memory_is_an_upper_bound(unit):
     tracemalloc.start()
     try:
         content = parse(text)
-        assert tracemalloc.get_traced_memory()[0] < strict_json._memory(text) + 100_000
+        assert tracemalloc.get_traced_memory()[0] < strict_json.memory_of(text) + 100_000
     finally:
         tracemalloc.stop()
     assert len(content) == 20_001
