@@ -15,10 +15,13 @@ from . import clouds, engine_color, engine_view, objects, windows
 
 ENOUGH_DB = 40.0  # below it, the loss is worth a warning
 _CELL = 0.02  # of the extent of what is loaded
+_FARTHEST = 1 << 20  # cells from the middle: numbers of three axes fit into 64 bits
 _DELAY_S = 0.1
 
-_Key = tuple[engine_view.Management, tuple[tuple[int, int], ...]]
+_Scenes = tuple[tuple[int, int], ...]  # session_uid and number of Gaussians of each
+_Key = tuple[engine_view.Management, _Scenes]
 _known: dict[_Key, view_inverse.Loss | None] = {}  # None if it could not be measured
+_cells: dict[_Scenes, tuple[np.ndarray, np.ndarray]] = {}  # of the last scenes: no view changes their colours
 
 
 def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
@@ -32,7 +35,10 @@ def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
         return None
     key = _key(scene, collections)
     if key not in _known:
-        displays, weights = _colors(collections)
+        if key[1] not in _cells:
+            _cells.clear()
+            _cells[key[1]] = _colors(collections)
+        displays, weights = _cells[key[1]]
         found = engine_view.loss(engine_view.of(scene), inverse, displays, weights) if len(weights) else None
         while len(_known) >= engine_view.KEPT:
             del _known[next(iter(_known))]
@@ -83,8 +89,9 @@ def _colors(collections: list[bpy.types.Collection]) -> tuple[np.ndarray, np.nda
         return np.zeros((0, 3)), np.zeros(0)
     extent = np.ptp(np.quantile(places, (0.02, 0.98), axis=0), axis=0).max() or 1.0
     weights = colors[:, 3] * np.sort(sizes, axis=1)[:, 1:].prod(axis=1)
-    cells = np.floor(places / (_CELL * extent)).astype(np.int64)
-    _, cells = np.unique(cells, axis=0, return_inverse=True)
+    cells = np.floor((places - np.median(places, axis=0)) / (_CELL * extent))
+    cells = np.clip(cells, -_FARTHEST, _FARTHEST - 1).astype(np.int64) @ (2 * _FARTHEST) ** np.arange(3)
+    _, cells = np.unique(cells, return_inverse=True)
     totals = np.bincount(cells.ravel(), weights)
     shown = clouds.linear_to_srgb(colors[:, :3])
     means = np.stack([np.bincount(cells.ravel(), weights * shown[:, k]) for k in range(3)], axis=-1)
@@ -109,3 +116,4 @@ def unregister() -> None:
     if bpy.app.timers.is_registered(_measure_shown):
         bpy.app.timers.unregister(_measure_shown)
     _known.clear()
+    _cells.clear()

@@ -330,6 +330,17 @@ def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, 
     assert "colors are not as trained with view transform False Color" in capfd.readouterr().out
 
 
+def test_the_loss_under_another_exposure_reads_no_points_again(blender, loaded, monkeypatch):
+    loss, reads = importlib.import_module("r5dgs.r5dgs_addon.engine_loss"), []
+    plain = loss._colors
+    monkeypatch.setattr(loss, "_colors", lambda collections: reads.append(1) or plain(collections))
+    view = blender.context.scene.view_settings
+    view.view_transform = "AgX"
+    for view.exposure in (0.5, 0.75, 1.0):
+        assert loss.measure(blender.context.scene) is not None
+    assert len(reads) == 1
+
+
 def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene, tmp_path):
     color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
     view = blender.context.scene.view_settings
