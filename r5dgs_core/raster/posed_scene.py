@@ -31,7 +31,7 @@ class Instance:
             are the same. [4, 4]
         tint: Factors >= 0 on the display-referred red, green and blue; None for 1.
         t: Scene time at which Gaussians with residuals are bent, before the matrix moves them; None for not at all.
-        holdout: Whether the Gaussians cut a hole into the picture instead of being seen.
+        holdout: True if the Gaussians cut a hole into the picture instead of being visible.
     """
 
     start: int
