@@ -54,7 +54,8 @@ def _read_file(path: Path) -> _File:
     return _File(residuals.Residuals(scene), scene.means)
 
 
-_files: remembered.Remembered[_File] = remembered.Remembered(_read_file)
+# In quotes: `typing` would keep the class, and with it this module, until after Blender has ended, which crashes then.
+_files: "remembered.Remembered[_File]" = remembered.Remembered(_read_file)
 _turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # by session_uid, see `_turn_of`
 
 
