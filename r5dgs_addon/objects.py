@@ -191,10 +191,15 @@ def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.O
     result: dict[bpy.types.Collection, list[bpy.types.Object]] = {one: [] for one in loaded if one in inside}
     outside = set(loaded) - inside
     if outside:  # else the objects need not be looked through
+        known: dict[bpy.types.Collection, set[bpy.types.Collection]] = {}  # panels call this at each redraw
         for obj in scene.collection.all_objects:
-            for collection in _instanced(obj):
-                if collection in outside:
-                    result.setdefault(collection, []).append(obj)
+            own = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+            if own is None:
+                continue
+            if own not in known:
+                known[own] = _instanced(obj) & outside
+            for collection in known[own]:
+                result.setdefault(collection, []).append(obj)
     return result
 
 
