@@ -31,7 +31,6 @@ from . import (
     needs,
     probing,
     representation,
-    residual,
     stopping,
 )
 from .config import Config
@@ -183,10 +182,12 @@ def _plan(trainer: Trainer, progress: Timed) -> None:
     estimate.finish("discovery")  # `discovery.NAME`, without its networks
     estimate.add(Phase("step", config.train.iterations))
     estimate.at("step", trainer.iteration)
-    decision = residual.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
-    tried = trainer.motion.name == representation.TRACKS and len(trainer.times) > 1
-    if tried and decision is not None and decision > trainer.iteration:
-        estimate.add(Phase(residual.TRIAL, residual.trial_steps(config), TRIAL_COST))
+    if trainer.motion.name == representation.TRACKS and len(trainer.times) > 1:
+        from . import residual  # scenes at rest do without it
+
+        decision = residual.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
+        if decision is not None and decision > trainer.iteration:
+            estimate.add(Phase(residual.TRIAL, residual.trial_steps(config), TRIAL_COST))
     estimate.add(Phase("identity", _identity_steps(trainer)))
 
 

@@ -9,7 +9,7 @@ import signal
 import numpy as np
 import pytest
 
-from r5dgs_core import cli
+from r5dgs_core import cli, exit_status
 from r5dgs_core.bench import benchmark, cases, playing, process, variants
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
@@ -298,7 +298,7 @@ def test_a_process_tells_its_own_memory_and_its_complaint(tmp_path):
     log_path, ended = tmp_path / "log", []
     log_path.write_text("an earlier complaint\n")
     sitting = process.train(["evaluate", str(tmp_path / "gone.r5dgs")], log_path, lambda event: None, ended.append)
-    assert ended == [sitting] and sitting.status == 1
+    assert ended == [sitting] and sitting.status == exit_status.ExitStatus.ERROR
     assert "gone.r5dgs" in process.reason(sitting) and not process.reason(sitting).startswith("r5dgs:")
     assert sitting.cpu_seconds is not None and sitting.cpu_seconds > 0
     assert sitting.peak_mb is not None and 10 < sitting.peak_mb < ballast.nbytes / 2**20
