@@ -32,6 +32,7 @@ MODELS = {
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 _REMEDY = "run 'colmap image_undistorter' and use the folder that it writes"
+LONGEST_NAME = 255  # bytes of a file or folder name; the limit of common file systems
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,11 @@ def read(folder: Path) -> Reconstruction:
     found = _text_images(image_path) if image_path.suffix == ".txt" else _binary_images(image_path)
     images = {}
     for name, camera_id, quat, shift in found:
+        if any(len(part.encode(errors="replace")) > LONGEST_NAME for part in name.split("/")):
+            raise errors.DatasetError(
+                f"{image_path}: image {name[:40]}...: expected a name that a file can have, found one of {len(name)} "
+                "letters; is the file damaged?"
+            )
         if camera_id not in lenses:
             raise errors.DatasetError(f"{image_path}: image {name}: camera {camera_id} is not in {camera_path.name}")
         if not (np.isfinite([*quat, *shift]).all() and np.linalg.norm(quat) > 1e-6):

@@ -217,6 +217,7 @@ def test_truncated_files_are_named(flat, name, share):
         ("cameras", "77 PINHOLE 12 8 10 10 6 4", "image img_00.png: camera 1 is not in cameras.txt"),
         ("images", "101 1 0 0", "images.txt: line 1: expected id, quaternion"),
         ("images", "101 0 0 0 0 1 2 3 1 img_00.png\n", "image img_00.png: expected a finite pose"),
+        ("images", f"101 1 0 0 0 1 2 3 1 {'a' * 300}/img_00.png\n", "expected a name that a file can have"),
         ("images", "# nothing\n", "expected registered images, found none"),
         ("points3D", "1 2 3", "points3D.txt: line 1: expected id, x, y, z"),
     ],
