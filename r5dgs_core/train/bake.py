@@ -180,7 +180,10 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
 
 
 def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.ImageEvidence | None:
-    """What the training images say of a scene's motion; None if nothing moves, or with a warning if one is missing."""
+    """Return the evidence of the training images on a scene's motion; None if nothing moves.
+
+    A missing image is logged as a warning and gives None, too.
+    """
     if not np.any(scene.track_poses[..., 1:] != 0):
         return None
     sampled = image_evidence.sample(dataset.train)

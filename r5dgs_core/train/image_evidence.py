@@ -1,4 +1,4 @@
-"""Evidence of the training images on the motion of a scene's groups: errors of its pictures, significance of a change.
+"""Evidence of the training images on the motion of a scene's groups: picture errors, significance of a change.
 
 Notation: a group's poses change along d from what they are (0) to a simpler motion (1). To first order the picture of
 view v at l is I_v + l D_v. With the residual r_v = I_v - truth, each cluster c of views (a camera, or some of its
@@ -33,7 +33,7 @@ STEP = 0.02  # rad or radii by which poses are changed to see what the images do
 
 @dataclass(frozen=True)
 class Support:
-    """How the images see the change from one motion of a group to a simpler one.
+    """Support of the images for a change from one motion of a group to a simpler one.
 
     Attributes:
         sigmas: Distance of the simpler motion from what the images like best, in standard deviations; negative if they
@@ -56,7 +56,7 @@ class ImageEvidence:
     Args:
         scene: The scene with the motion that was trained; groups stay within the observed time.
         views: Views, as from `sample`.
-        behind: Colour behind transparent pixels, or None where images are opaque. [3]
+        behind: Colour behind transparent pixels; None if the images are opaque. [3]
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -84,7 +84,7 @@ class ImageEvidence:
             before: Poses of all groups that were trained. [G, S, 7]
             after: Poses of all groups with the simpler motion. [G, S, 7]
             size: Largest change, rad or radii.
-            rows: Views to look at, all where None.
+            rows: Indices of the views to use; None for all.
         """
         rows = range(len(self._views)) if rows is None else rows
         step = min(1.0, STEP / max(size, 1e-12))
@@ -154,7 +154,7 @@ class ImageEvidence:
 
 
 def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:
-    """What scores and information of each cluster and patch say. [C, PATCHES + 1] each
+    """Return the support from the scores and the information of each cluster and patch. [C, PATCHES + 1] each
 
     The variance is that over clusters and over patches, less that over both, which is in each of them.
     """
@@ -175,7 +175,7 @@ def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: 
 
 
 def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
-    """Draws what a scene shows in a view. [H, W, 3]"""
+    """Return a function that renders the scene at a view. [H, W, 3]"""
     player = playback.Player(scene)
 
     def draw(view: datasets.View) -> np.ndarray:

@@ -56,8 +56,8 @@ class _Part:
         change: The same in units of its noise.
         allowed: Largest change that counts as noise.
         why: What the noise was judged by, in words.
-        kept: Whether the user wants the part kept.
-        seen: Whether the images measured the noise.
+        kept: True if the user keeps the part.
+        seen: True if the noise was measured in the images.
     """
 
     group: int
@@ -73,7 +73,7 @@ class _Part:
 
     @property
     def noise(self) -> bool:
-        """Whether the poses change by no more than their noise."""
+        """True if the poses change by no more than their noise."""
         return self.change <= self.allowed and not self.kept
 
 
@@ -98,12 +98,12 @@ def simplify(
     Args:
         scene: The scene with the poses that were trained and static models of the groups' radii.
         observed: Knots at which each group was placed. [G, S] bool
-        evidence: The training images; None if they are missing. Then only what is too small to be seen
-            (`needs.STILL`, `needs.TURN`) is dropped.
-        wanted: The user's word: what is "on" is kept.
+        evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and
+            `needs.TURN` is dropped.
+        wanted: The user's overrides; parts that are "on" are kept.
 
     Returns:
-        The simplified scene. Groups that follow a body follow what it does now.
+        The simplified scene. Groups that follow a body follow its simplified motion.
     """
     wanted = wanted or NeedsSection()
     names = {item.id: item.name for item in scene.objects}
@@ -207,7 +207,7 @@ def _independent(series: np.ndarray) -> float:
 def _unseen(
     scene: Scene, parts: Sequence[_Part], evidence: ImageEvidence | None
 ) -> tuple[list[_Part], dict[int, float]]:
-    """Parts that the images do not need, by what each costs, and that cost by the part's `id`, dB."""
+    """Return the parts that the images do not need, cheapest first, and the cost of each part by its `id`, dB."""
     if evidence is None or not parts:
         return list(parts), {}
     losses = {id(part): evidence.loss(_with_parts(scene, [part])) for part in parts}
@@ -241,7 +241,7 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
-    """The scene that moves so, bound in the last pose of each group. [G, S, 7]"""
+    """Return the scene with other poses [G, S, 7], bound in the last pose of each group."""
     if np.array_equal(poses, scene.track_poses):
         return scene
     arrays = {name: getattr(scene, name) for name in _BOUND}
@@ -293,7 +293,7 @@ def _bind(
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
-    """Poses that tell how a body goes on: without noise, even if the images need it. [S, 7] relative to t_max"""
+    """Poses that the future motion is fitted to: without noise, even if the images need it. [S, 7] relative to t_max"""
     result = poses.copy()
     for part in parts:
         if part.noise and part.name == "rotation":
@@ -306,7 +306,7 @@ def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
 def _fit(
     scene: Scene, group: int, observed: np.ndarray, poses: np.ndarray, parts: Sequence[_Part]
 ) -> tuple[gravity.Track, fitting.Fit]:
-    """What a body's poses were fitted with, and the fit; the noise is at least what the images leave."""
+    """Fit a body's future motion; return the fitted track, too. The noise is at least that measured in the images."""
     members = scene.motion_ids == group
     opacities = 1 / (1 + np.exp(-scene.opacity_logits[members].astype(np.float64)))
     body = top.inertia(scene.means[members][visibility.seen(opacities)].astype(np.float64))
@@ -325,7 +325,7 @@ def _fit(
 
 
 def _said(fit: fitting.Fit | None) -> str:
-    """How a body goes on, in words."""
+    """Description of a body's motion past t_max."""
     if fit is None:
         return "static"
     return f"came to rest, {fit.chosen}" if fit.rested else fit.chosen

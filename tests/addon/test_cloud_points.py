@@ -121,7 +121,7 @@ def swaying(tree, source, target):
 
 
 def viewport(bpy, obj):
-    """Where the viewport draws a cloud's points, Blender's world, and their rows. [n, 3], [n]"""
+    """Positions of a cloud's points as the viewport draws them, Blender's world, and their rows. [n, 3], [n]"""
     evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     count = len(evaluated.data.points)
     points, rows = np.empty(3 * count, np.float32), np.empty(count, np.int32)
@@ -400,7 +400,7 @@ def engine(blender, rendered, monkeypatch):
 
 
 def render(bpy, folder, name="out", **arguments):
-    """What F12 saves, as 8 bits per channel, / 255. [H, W, 3]"""
+    """Picture that F12 saves, 8 bits per channel divided by 255. [H, W, 3]"""
     settings = bpy.context.scene.render
     settings.filepath, settings.dither_intensity = str(folder / name), 0.0
     settings.image_settings.file_format, settings.image_settings.color_mode = "PNG", "RGB"

@@ -27,7 +27,7 @@ def cloud(collection, name):
 
 
 def shares(scene, rows):
-    """Which part of each pixel some Gaussians cover, and the depth of the others at t_max. [H, W] each"""
+    """Share of each pixel that some Gaussians cover, and the depth of the others at t_max. [H, W] each"""
     pose, camera = playback.frame(scene, scene.t_max), scene.cameras[0]
     held = np.zeros(len(scene.means), np.float32)
     held[rows] = 1

@@ -40,7 +40,7 @@ def files_in(folder: Path) -> Files:
 
 
 def made_in(write: Callable[[Path], Any]) -> Files:
-    """What a function writes into a folder."""
+    """Files that a function writes into a folder."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder))
         return files_in(Path(folder))
