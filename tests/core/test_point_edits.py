@@ -48,7 +48,7 @@ def mapped(points, matrix):
 
 
 def drawn(extended, place, t=None):
-    """Export an edit."""
+    """Return the points of an edit as they are placed in the extended scene."""
     bend = None if t is None else carried.bend_of(Residuals(extended), t, place.start, place.count)
     return carried.place(extended, place.start, place.count, place.matrix, bend=bend)
 
