@@ -13,7 +13,7 @@ from .time_left import Phase
 NAME = "tabletop"
 # Mean PSNR of a healthy run, dB; test lies past t_max. Rounding differs between processors, and moves val as another
 # seed does: seeds 0, 1 and 2 gave 39.6, 42.1 and 42.6 dB on one machine.
-EXPECTED = {"val": 40.5, "test": 37.0}
+EXPECTED = {"val": 40.0, "test": 37.0}
 TOLERANCE = 1.0  # dB below it at which `.ci/run` fails
 AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # what follows training; costs as measured
 
