@@ -55,6 +55,8 @@ def check_scene(path: Path) -> None:
 
 def check_target(path: Path) -> None:
     """Raise `CheckpointError` or `SceneFileError` if a path is neither a run folder nor a file."""
+    if not _holds(path.exists):
+        raise errors.SceneFileError(f"{path}: expected a run folder or a {SCENE_SUFFIX} file, found {_found(path)}")
     if _holds(path.is_dir):
         check_run(path)
     else:

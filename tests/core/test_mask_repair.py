@@ -134,7 +134,7 @@ def test_a_scene_file_alone_is_not_enough(tmp_path):
     (tmp_path / "scene.r5dgs").touch()
     with pytest.raises(errors.ConfigError, match="needs the data set and a folder, --data and --out"):
         commands_association.run_associate(tmp_path / "scene.r5dgs")
-    with pytest.raises(errors.ConfigError, match=r"nowhere: expected a run folder or a \.r5dgs file, found nothing"):
+    with pytest.raises(errors.SceneFileError, match=r"nowhere: expected a run folder or a \.r5dgs file, found nothing"):
         commands_association.run_associate(tmp_path / "nowhere")
 
 

@@ -210,7 +210,7 @@ def test_parts_that_do_not_fit_are_refused(rich, tmp_path, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"thresholds": (None, None, float("nan"), 0.1, 0.1)}, "finite thresholds"),
+        ({"thresholds": (None, None, float("nan"), 0.1, 0.1)}, "expected thresholds, margin and scale up to"),
         ({"views": ((),) * 2}, "5 objects of at most 2 views"),
         ({"encoder": dataclasses.replace(CARD, templates=("a photo",))}, "templates with '{}'"),
         ({"encoder": dataclasses.replace(CARD, dimension=5)}, "vectors of one length"),
