@@ -323,7 +323,7 @@ def widen(folder):
         (widen, "broken: the model cannot be loaded"),
         (set_kind("clip"), r"config\.json: expected a model of type 'sam2_video', found 'clip'"),
         (set_kind("sam2"), "found 'sam2'; a folder of the image model alone cannot follow objects"),
-        (lambda folder: (folder / "config.json").write_text("{"), r"config\.json: expected JSON, found damage"),
+        (lambda folder: (folder / "config.json").write_text("{"), r"config\.json: damaged, not valid JSON"),
         (lambda folder: (folder / "config.json").unlink(), r"config\.json: expected in the folder of SAM2, found"),
         (lambda folder: (folder / "model.safetensors").unlink(), r"model\.safetensors: expected the weights, found"),
     ],
