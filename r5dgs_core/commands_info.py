@@ -17,11 +17,11 @@ def run_info(path: Path, *, with_needs: bool = False, as_json: bool = False) -> 
         as_json: Print all data of the scene as JSON instead.
     """
     input_paths.check_scene(path)
-    from .scene import scene_file
+    from .scene import scene_file, scene_info
 
     scene = scene_file.read(path)
     if as_json:
-        print(json.dumps(scene_file.info(scene), indent=2))
+        print(json.dumps(scene_info.info(scene), indent=2))
         return
     from .report import motion_words
 

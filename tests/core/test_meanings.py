@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
-from r5dgs_core.scene import lookup, meanings, scene_file, scene_json
+from r5dgs_core.scene import lookup, meanings, scene_file, scene_info, scene_json
 from r5dgs_core.scene.meanings import EncoderCard, Meanings, Table, View
 from tests.scenes import make_scene
 
@@ -180,14 +180,14 @@ def test_a_file_keeps_the_table(rich, tmp_path):
     light = scene_file.read_meanings(path)
     assert light.table == rich.lookup
     np.testing.assert_array_equal(light.view_embeddings, rich.view_embeddings)
-    assert scene_file.info(back)["lookup"] == "clip tiny"
+    assert scene_info.info(back)["lookup"] == "clip tiny"
     assert scene_file.write(back, tmp_path / "again.r5dgs").read_bytes() == path.read_bytes()
 
 
 def test_a_file_without_a_table_is_as_before(tmp_path):
     path = scene_file.write(make_scene(n=60, objects=1), tmp_path / "plain.r5dgs")
     assert scene_file.read(path).lookup is None and b'"lookup"' not in scene_json.dump(scene_file.read(path), {})
-    assert scene_file.info(scene_file.read(path))["lookup"] is None
+    assert scene_info.info(scene_file.read(path))["lookup"] is None
 
 
 @pytest.mark.parametrize(

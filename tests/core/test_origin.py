@@ -12,7 +12,7 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images, origin
 from r5dgs_core.raster import scene_render
 from r5dgs_core.report import evaluate
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.scene import cameras, playback, scene_file, scene_info
 from r5dgs_core.train import bake, checkpoint, run
 from tests import colmap_files, scenes
 from tests import datasets as tiny_datasets
@@ -158,5 +158,5 @@ def test_scenes_near_the_origin_are_read_without_a_warning(baked, tmp_path, capl
 
 
 def test_info_prints_an_origin_where_there_is_one(baked):
-    assert "origin" not in scene_file.info(baked)
-    assert scene_file.info(dataclasses.replace(baked, origin=FAR))["origin"] == FAR.tolist()
+    assert "origin" not in scene_info.info(baked)
+    assert scene_info.info(dataclasses.replace(baked, origin=FAR))["origin"] == FAR.tolist()

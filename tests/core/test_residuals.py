@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations, se3
-from r5dgs_core.scene import group_dynamics, playback, residuals, scene_file
+from r5dgs_core.scene import group_dynamics, playback, residuals, scene_file, scene_info
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, TIMES, make_scene
 
@@ -214,8 +214,8 @@ def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
     for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
         np.testing.assert_array_equal(getattr(exact, name), getattr(scene, name))
         np.testing.assert_allclose(getattr(small, name), getattr(scene, name), atol=2e-3)
-    assert scene_file.info(small)["modes"] == list(playback.modes(scene))
-    assert scene_file.info(small)["residuals"] == 30
+    assert scene_info.info(small)["modes"] == list(playback.modes(scene))
+    assert scene_info.info(small)["residuals"] == 30
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import files, playback, scene_file
+from r5dgs_core.scene import files, playback, scene_file, scene_info
 from tests.scenes import make_scene
 
 # Half a step of the stored fixed point, and half-precision rounding.
@@ -379,7 +379,7 @@ def test_inconsistent_scenes_are_not_written(scene, tmp_path):
 
 
 def test_info_tells_what_the_file_holds(scene):
-    info = json.loads(json.dumps(scene_file.info(scene)))
+    info = json.loads(json.dumps(scene_info.info(scene)))
     assert info["gaussians"] == 300
     assert info["sh_degree"] == 2
     assert [o["name"] for o in info["objects"]][:2] == ["unassigned", "background"]

@@ -21,7 +21,7 @@ from r5dgs_core import errors
 from r5dgs_core.data import colmap, dataset, images, mask_notes, masks
 from r5dgs_core.importing import importer, weights
 from r5dgs_core.raster import rasterize, scene_render
-from r5dgs_core.scene import cameras, lookup, meanings, playback, ply, quality, scene_file
+from r5dgs_core.scene import cameras, lookup, meanings, playback, ply, quality, scene_file, scene_info
 from r5dgs_core.scene.meanings import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.semantics import encoders
@@ -153,7 +153,7 @@ def use_scene(scene: Scene, path: Path) -> None:
         if stored is not None:
             meanings.ask(stored, stored.vocabulary_embeddings[0] if len(stored.vocabulary) else np.zeros(0))
         lookup.search(scene, "mug")
-        json.dumps(scene_file.info(scene), allow_nan=False).encode()
+        json.dumps(scene_info.info(scene), allow_nan=False).encode()
         again = scene_file.read(scene_file.write(scene, path))
         assert len(again.means) == len(scene.means) and again.objects == scene.objects
 
