@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..r5dgs_addon import actions, objects, table
+from ..r5dgs_addon import actions, loaded_scenes, table
 
 
 class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
@@ -24,7 +24,7 @@ class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
     def execute(self, context):
         found = self.found(context)
         entry = None if found is None else table.entry_of(*found)
-        if entry is None or not objects.is_own(found[0]):
+        if entry is None or not loaded_scenes.is_own(found[0]):
             self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")
             return {"CANCELLED"}
         word = self.word.strip()

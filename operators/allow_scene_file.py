@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ..r5dgs_addon import actions, motion_exact, objects, preferences, trust, windows
+from ..r5dgs_addon import actions, loaded_scenes, motion_exact, preferences, trust, windows
 
 
 class R5DGS_OT_allow_scene_file(actions.NeedsScene, bpy.types.Operator):
@@ -19,7 +19,7 @@ class R5DGS_OT_allow_scene_file(actions.NeedsScene, bpy.types.Operator):
     )
 
     def execute(self, context):
-        found = trust.find(objects.active_collection(context))
+        found = trust.find(loaded_scenes.active_collection(context))
         if found.asked is None:
             self.report({"WARNING"}, "There is no file to allow")
             return {"CANCELLED"}

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, amounts, motion_exact, objects
+from ..r5dgs_addon import actions, amounts, loaded_scenes, motion_exact
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -30,7 +30,7 @@ class R5DGS_OT_exact_mode(actions.NeedsScene, bpy.types.Operator):
         return super().poll(context)
 
     def execute(self, context):
-        collection = objects.active_collection(context)
+        collection = loaded_scenes.active_collection(context)
         if self.action == "OFF" or (self.action == "TOGGLE" and collection.r5dgs_exact.enabled):
             motion_exact.switch_off(context, collection)
             self.report({"INFO"}, f"{collection.name}: objects move as wholes")

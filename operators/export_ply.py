@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_frames, export_gaussians, objects, running, selection
+from ..r5dgs_addon import export_frames, export_gaussians, loaded_scenes, running, selection
 
 
 class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
@@ -30,7 +30,7 @@ class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if not objects.scene_collections():  # one that is only instanced is exported, too
+        if not loaded_scenes.scene_collections():  # one that is only instanced is exported, too
             cls.poll_message_set(selection.NO_SCENE)
             return False
         return True

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..r5dgs_addon import actions, export_scene, objects, picture, running
+from ..r5dgs_addon import actions, export_scene, loaded_scenes, picture, running
 from ..r5dgs_core import errors
 
 
@@ -26,7 +26,7 @@ class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Opera
     def suggest(self, context):
         if not self.filepath:
             try:
-                source = picture.scene_path(objects.active_collection(context))
+                source = picture.scene_path(loaded_scenes.active_collection(context))
                 self.filepath = str(source.with_name(f"{source.stem}_edited.r5dgs"))
             except errors.R5dgsError:
                 self.filepath = "edited.r5dgs"
@@ -34,7 +34,7 @@ class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Opera
 
     def steps(self, context):
         target = self.target_file(".r5dgs")
-        return export_scene.steps(context, objects.active_collection(context), target, exact=self.exact)
+        return export_scene.steps(context, loaded_scenes.active_collection(context), target, exact=self.exact)
 
 
 CLASSES = (R5DGS_OT_export_scene,)

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, FloatProperty
 
-from ..r5dgs_addon import actions, amounts, motion_extrapolate, motion_physics, objects
+from ..r5dgs_addon import actions, amounts, loaded_scenes, motion_extrapolate, motion_physics
 from ..r5dgs_core import errors
 
 
@@ -20,11 +20,11 @@ class R5DGS_OT_extrapolate_until(actions.NeedsScene, bpy.types.Operator):
     )
 
     def invoke(self, context, event):
-        self.t_end = objects.active_collection(context).r5dgs.t_end
+        self.t_end = loaded_scenes.active_collection(context).r5dgs.t_end
         return context.window_manager.invoke_props_dialog(self)
 
     def execute(self, context):
-        collection = objects.active_collection(context)
+        collection = loaded_scenes.active_collection(context)
         t_end = self.t_end if self.properties.is_property_set("t_end") else collection.r5dgs.t_end
         if t_end < collection.r5dgs.t_max:
             self.report({"WARNING"}, f"Before the last observed time, {collection.r5dgs.t_max:g}: nothing extrapolated")

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import actions, objects, timeline
+from ..r5dgs_addon import actions, loaded_scenes, timeline
 
 
 class R5DGS_OT_fit_timeline(actions.NeedsScene, bpy.types.Operator):
@@ -13,7 +13,7 @@ class R5DGS_OT_fit_timeline(actions.NeedsScene, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context):
-        times = timeline.of_collection(objects.active_collection(context))
+        times = timeline.of_collection(loaded_scenes.active_collection(context))
         timeline.fit(context.scene, times)
         frames = f"{context.scene.frame_start} to {context.scene.frame_end}"
         self.report({"INFO"}, f"Frames {frames}, observed until {round(times.frame(times.t_max))}")

@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import amounts, displays, keyframes, motion_physics, objects, running
+from ..r5dgs_addon import amounts, displays, keyframes, loaded_scenes, motion_physics, objects, running
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
@@ -111,7 +111,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         self.report({"INFO"}, f"{path.name}: {amounts.of(len(scene.means), 'Gaussian')}, {amounts.of(named, 'object')}")
         if named == 0:
             self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
-        too_fast = motion_physics.too_fast(objects.members(collection, "ANCHOR"))
+        too_fast = motion_physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
         if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..r5dgs_addon import actions, objects, table
+from ..r5dgs_addon import actions, loaded_scenes, table
 
 
 class R5DGS_OT_remove_alias(actions.OfObject, bpy.types.Operator):
@@ -19,7 +19,7 @@ class R5DGS_OT_remove_alias(actions.OfObject, bpy.types.Operator):
         found = self.found(context)
         entry = None if found is None else table.entry_of(*found)
         words = [] if entry is None else [alias.name for alias in entry.aliases]
-        if entry is None or not objects.is_own(found[0]) or self.word not in words:
+        if entry is None or not loaded_scenes.is_own(found[0]) or self.word not in words:
             self.report({"WARNING"}, f"No such word to remove: '{self.word}'")
             return {"CANCELLED"}
         entry.aliases.remove(words.index(self.word))

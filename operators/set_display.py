@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, displays, objects
+from ..r5dgs_addon import actions, displays, loaded_scenes
 
 
 class R5DGS_OT_set_display(actions.NeedsScene, bpy.types.Operator):
@@ -19,13 +19,13 @@ class R5DGS_OT_set_display(actions.NeedsScene, bpy.types.Operator):
     def poll(cls, context):
         if not super().poll(context):
             return False
-        if not objects.is_own(objects.active_collection(context)):
+        if not loaded_scenes.is_own(loaded_scenes.active_collection(context)):
             cls.poll_message_set("This R5DGS scene is linked from another file: set its display there")
             return False
         return True
 
     def execute(self, context):
-        displays.show(objects.active_collection(context), self.display)
+        displays.show(loaded_scenes.active_collection(context), self.display)
         return {"FINISHED"}
 
 

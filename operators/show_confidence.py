@@ -6,11 +6,11 @@ from bpy.props import EnumProperty
 from ..r5dgs_addon import (
     actions,
     amounts,
+    loaded_scenes,
     motion_confidence,
     motion_extrapolate,
     motion_objects,
     motion_physics,
-    objects,
 )
 from ..r5dgs_core import errors
 
@@ -31,8 +31,8 @@ class R5DGS_OT_show_confidence(actions.NeedsScene, bpy.types.Operator):
     action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
 
     def execute(self, context):
-        collection = objects.active_collection(context)
-        everyone = objects.members(collection, "ANCHOR")
+        collection = loaded_scenes.active_collection(context)
+        everyone = loaded_scenes.members(collection, "ANCHOR")
         selected = motion_objects.chosen(context) if context.selected_objects else []
         shown = [anchor for anchor in selected or everyone if motion_confidence.helper_of(anchor) is not None]
         if self.action == "HIDE" or (self.action == "TOGGLE" and shown):

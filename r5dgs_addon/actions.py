@@ -2,7 +2,7 @@
 
 from bpy.props import IntProperty, StringProperty
 
-from . import objects, selection, table
+from . import loaded_scenes, selection, table
 
 
 class NeedsScene:
@@ -10,7 +10,7 @@ class NeedsScene:
 
     @classmethod
     def poll(cls, context):
-        if objects.active_collection(context) is None:
+        if loaded_scenes.active_collection(context) is None:
             cls.poll_message_set(selection.NO_SCENE)
             return False
         return True

@@ -19,7 +19,7 @@ from . import (
     engine_settings,
     engine_stereo,
     engine_view,
-    objects,
+    loaded_scenes,
     picture,
     render_notes,
     viewport,
@@ -77,7 +77,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
 
     def _render_view(self, depsgraph: bpy.types.Depsgraph, view: str, eye: views.Eye | None) -> None:
         scene, layer = depsgraph.scene, depsgraph.view_layer
-        if not objects.scene_collections():
+        if not loaded_scenes.scene_collections():
             raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
         inverse = engine_color.wait_for_inverse(scene, self.test_break)
         objections = engine_color.objections(scene)

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core.scene import view_inverse
-from . import clouds, engine_color, engine_view, objects, windows
+from . import clouds, engine_color, engine_view, loaded_scenes, windows
 
 ENOUGH_DB = 40.0  # below it, the loss is worth a warning
 _CELL = 0.02  # of the extent of what is loaded
@@ -69,7 +69,7 @@ def _measure_shown() -> None:
 
 
 def _collections(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    return list(objects.shown(scene))
+    return list(loaded_scenes.shown(scene))
 
 
 def _key(scene: bpy.types.Scene, collections: list[bpy.types.Collection]) -> _Key:
@@ -78,7 +78,9 @@ def _key(scene: bpy.types.Scene, collections: list[bpy.types.Collection]) -> _Ke
 
 def _colors(collections: list[bpy.types.Collection]) -> tuple[np.ndarray, np.ndarray]:
     """Display colours of cells and their weights. [N, 3], [N]"""
-    data = {cloud.data for one in collections for cloud in objects.members(one, "CLOUD") if cloud.data is not None}
+    data = {
+        cloud.data for one in collections for cloud in loaded_scenes.members(one, "CLOUD") if cloud.data is not None
+    }
     read = functools.partial(_read, [cloud for cloud in data if len(cloud.points)])
     places, colors, sizes = (
         read("position", "vector", 3),

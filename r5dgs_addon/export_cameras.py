@@ -9,7 +9,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import camera_files, cameras, carried
 from ..r5dgs_core.scene.camera_files import View
-from . import amounts, export_frames, export_gaussians, objects, timeline, views, visible
+from . import amounts, export_frames, export_gaussians, loaded_scenes, timeline, views, visible
 from .running import Outcome, Step, Steps
 
 FORMATS = (
@@ -41,10 +41,10 @@ def steps(
         SceneFileError: A file cannot be written.
     """
     scene, found, notes = context.scene, [], []
-    collection = objects.active_collection(context)
+    collection = loaded_scenes.active_collection(context)
     if axes == "FILE" and collection is None:
         raise errors.ConfigError("export: expected a loaded scene for the axes 'Scene File', found none; choose others")
-    origin = objects.origin(collection)
+    origin = loaded_scenes.origin(collection)
     if origin.any() and axes != "FILE":
         notes.append(export_gaussians.relative_note(origin, "the axes 'Scene File' give cameras of that world"))
     frames, folders = export_frames.frames_of(scene, every, step), _folders(scene)

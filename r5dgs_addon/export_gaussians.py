@@ -10,7 +10,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, carried, ply, point_edits, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
 from ..r5dgs_core.scene.scene import Scene
-from . import amounts, cloud_points, export_frames, look, objects, picture, visible
+from . import amounts, cloud_points, export_frames, loaded_scenes, look, picture, visible
 from .running import Outcome, Step, Steps
 
 AXES = (
@@ -113,7 +113,7 @@ def splats_of(
         if wanted is not None and one.object not in wanted and one.parent not in wanted:
             continue
         scene, turn = sources.scene(one.collection), world_to(axes, one.world)
-        sources.origins.add(tuple(objects.origin(one.collection).tolist()))
+        sources.origins.add(tuple(loaded_scenes.origin(one.collection).tolist()))
         matrix, names = turn @ one.matrix, [*names, one.object.name]
         for note in cloud_points.of(one.object, depsgraph, one.collection.r5dgs.gaussians).notes:
             sources.note(note)
@@ -222,7 +222,7 @@ def ply_steps(
 
 def relative_note(origin: np.ndarray, more: str) -> str:
     """A note that exported positions are relative to the origin of a scene. [3]"""
-    return f"Positions are relative to {objects.origin_text(origin)} of the data set's world; {more}"
+    return f"Positions are relative to {loaded_scenes.origin_text(origin)} of the data set's world; {more}"
 
 
 def _shared_origin(sources: Sources) -> np.ndarray | None:

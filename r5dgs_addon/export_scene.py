@@ -9,7 +9,18 @@ import numpy as np
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import cameras, edited, point_edits, scene_file
 from ..r5dgs_core.scene.scene import Scene, SceneObject
-from . import amounts, cloud_points, export_frames, look, motion_physics, objects, picture, table, timeline, visible
+from . import (
+    amounts,
+    cloud_points,
+    export_frames,
+    loaded_scenes,
+    look,
+    motion_physics,
+    picture,
+    table,
+    timeline,
+    visible,
+)
 from .running import Outcome, Step, Steps
 
 TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
@@ -103,7 +114,7 @@ def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list
 
 
 def _refuse_sources(path: Path) -> None:
-    for collection in objects.scene_collections():
+    for collection in loaded_scenes.scene_collections():
         try:
             own = picture.scene_path(collection)
         except errors.R5dgsError:
@@ -152,7 +163,7 @@ def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allow
 def _members(collection: bpy.types.Collection) -> tuple[list[_Member], dict[int, tuple[str, int]]]:
     """The clouds of a scene; copies of an object are objects of their own, whose names and originals come second."""
     found, names = [], {}
-    clouds = [obj for obj in objects.members(collection, "CLOUD") if obj.type == "POINTCLOUD"]
+    clouds = [obj for obj in loaded_scenes.members(collection, "CLOUD") if obj.type == "POINTCLOUD"]
     clouds.sort(key=lambda obj: (obj.r5dgs.start, len(obj.name), obj.name))
     free = max([entry.object_id for entry in collection.r5dgs.table] + [0]) + 1
     anchors: dict[tuple[int, int], list[bpy.types.Object | None]] = {}

@@ -6,7 +6,7 @@ so that a saved file can still go back. Nothing but objects of loaded scenes is 
 
 import bpy
 
-from . import objects, selection
+from . import loaded_scenes, selection
 
 
 def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
@@ -25,7 +25,7 @@ def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
     shown_here = set(layer.objects)
     hidden = set()
     for collection in selection.scenes(context):
-        for obj in objects.members(collection, "CLOUD", "ANCHOR"):
+        for obj in loaded_scenes.members(collection, "CLOUD", "ANCHOR"):
             item = (collection, obj.r5dgs.object_id)
             hide = item not in wanted
             if hide and obj.r5dgs.role == "CLOUD" and (obj in shown_here or obj.library is None):

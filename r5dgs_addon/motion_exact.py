@@ -18,7 +18,7 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.motion import columns
 from ..r5dgs_core.scene import point_edits, residuals, scene_file
 from ..r5dgs_core.scene.residuals import Residuals
-from . import clouds, objects, picture, remembered, timeline
+from . import clouds, loaded_scenes, picture, remembered, timeline
 
 BIND = clouds.BIND
 PARTS = (
@@ -90,7 +90,7 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
         SceneFileError: The file cannot be read.
         ConfigError: Nothing in it bends, or its points lie in another .blend file.
     """
-    if collection.library is not None or any(c.data.library for c in objects.members(collection, "CLOUD")):
+    if collection.library is not None or any(c.data.library for c in loaded_scenes.members(collection, "CLOUD")):
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
     bending = residuals_of(collection, again=True)
     if len(bending.rows) == 0:
@@ -108,7 +108,7 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
 def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
     """Bring the points back to their bind state, and listen no more where no other scene needs it."""
     state = collection.r5dgs_exact
-    for cloud in objects.members(collection, "CLOUD"):
+    for cloud in loaded_scenes.members(collection, "CLOUD"):
         _give_back(cloud.data)
     if state.enabled and not state.locked:
         context.scene.render.use_lock_interface = False
@@ -125,7 +125,7 @@ def apply(collection: bpy.types.Collection, frame: float) -> None:
     file = _file_of(collection)
     t = timeline.of_collection(collection).time(frame)
     done = set()
-    for cloud in objects.members(collection, "CLOUD"):
+    for cloud in loaded_scenes.members(collection, "CLOUD"):
         if cloud.data in done or cloud.data.library is not None:
             continue
         done.add(cloud.data)
@@ -279,7 +279,7 @@ def _give_back(cloud: bpy.types.PointCloud) -> None:
 
 
 def _exact_scenes() -> list[bpy.types.Collection]:
-    return [collection for collection in objects.scene_collections() if collection.r5dgs_exact.enabled]
+    return [collection for collection in loaded_scenes.scene_collections() if collection.r5dgs_exact.enabled]
 
 
 @persistent
@@ -295,7 +295,7 @@ def _follow_edits(scene, depsgraph=None):
     if not updated:
         return
     for collection in _exact_scenes():
-        members = objects.members(collection, "CLOUD")
+        members = loaded_scenes.members(collection, "CLOUD")
         if any((one in updated or one.data in updated) and _is_edited(one.data) for one in members):
             _try(collection, scene.frame_current_final)
 

@@ -17,7 +17,7 @@ from ..r5dgs_core.motion import models, rotations
 from ..r5dgs_core.motion.keyframes import Keys
 from ..r5dgs_core.scene import scene_file
 from ..r5dgs_core.scene.scene import Scene
-from . import compat, keyframes, motion_confidence, motion_curves, motion_physics, objects, timeline
+from . import compat, keyframes, loaded_scenes, motion_confidence, motion_curves, motion_physics, timeline
 
 MOST_STEPS = 1024  # of integration over as long as was observed: beyond are orbits about places far out of sight
 
@@ -43,7 +43,7 @@ class Plan:
 
 def scene_of(anchor: bpy.types.Object) -> bpy.types.Collection | None:
     """The loaded scene that an object belongs to."""
-    for collection in objects.scene_collections():
+    for collection in loaded_scenes.scene_collections():
         if anchor.name in collection.all_objects and collection.all_objects[anchor.name] == anchor:
             return collection
     return None
@@ -181,7 +181,7 @@ def extrapolate_until(
     """
     times = timeline.of_collection(collection)
     timeline.check_end(collection.name, replace(times, t_end=t_end))
-    anchors = [anchor for anchor in objects.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
+    anchors = [anchor for anchor in loaded_scenes.members(collection, "ANCHOR") if motion_physics.has_motion(anchor)]
     kept = [anchor for anchor in anchors if motion_physics.hand_edited(anchor, times)]
     plans = _plans([anchor for anchor in anchors if anchor not in kept], t_end)
     for plan in plans:

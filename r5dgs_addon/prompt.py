@@ -12,7 +12,7 @@ import bpy
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import lookup, scene_file
-from . import objects, phrases, picture, remembered, selection, table, windows
+from . import loaded_scenes, phrases, picture, remembered, selection, table, windows
 
 HISTORY = 12  # prompts kept
 ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
@@ -121,7 +121,9 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
 
 def _instances(found: set[bpy.types.Collection]) -> list[str]:
     """Notes on scenes that are instanced: their objects are found, and cannot be selected one by one."""
-    instanced = {one: empties for one, empties in objects.shown(bpy.context.scene).items() if one in found and empties}
+    instanced = {
+        one: empties for one, empties in loaded_scenes.shown(bpy.context.scene).items() if one in found and empties
+    }
     return [
         f"{one.name} is an instance: Select takes {' and '.join(empty.name for empty in empties)} as a whole"
         for one, empties in instanced.items()

@@ -3,7 +3,7 @@
 import bpy
 from bpy.app.handlers import persistent
 
-from . import cloud_points, objects, visible
+from . import cloud_points, loaded_scenes, visible
 
 _reported: set[str] = set()  # since the render began; an animation is one render
 
@@ -25,7 +25,7 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
     held = sorted({obj.name for obj in others if visible.is_held_out(obj, None, depsgraph)})
     if held:
         notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
-    return notes + [note for one in objects.shown(scene) for note in cloud_points.notes(one)]
+    return notes + [note for one in loaded_scenes.shown(scene) for note in cloud_points.notes(one)]
 
 
 def report(engine: bpy.types.RenderEngine, notes: list[str]) -> None:

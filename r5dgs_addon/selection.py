@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import objects, table
+from . import loaded_scenes, table
 
 Wanted = tuple[bpy.types.Collection, int]  # a loaded scene and the id of one of its objects
 NO_SCENE = "Load an R5DGS scene first"
@@ -17,10 +17,10 @@ def obstacle(context: bpy.types.Context) -> str:
 
 def scenes(context: bpy.types.Context) -> list[bpy.types.Collection]:
     """The loaded scenes in the active Blender scene, the active one first, instanced ones among them."""
-    active = objects.active_collection(context)
+    active = loaded_scenes.active_collection(context)
     if active is None:
         return []
-    return [active] + [found for found in objects.shown(context.scene) if found != active]
+    return [active] + [found for found in loaded_scenes.shown(context.scene) if found != active]
 
 
 def find(context: bpy.types.Context, scene: str, object_id: int) -> Wanted | None:
@@ -79,10 +79,10 @@ def select(context: bpy.types.Context, wanted: list[Wanted], mode: str) -> list[
     if mode == "SET":
         for chosen in context.selected_objects:
             chosen.select_set(False)
-    missed, best, instanced = [], None, objects.shown(context.scene)
+    missed, best, instanced = [], None, loaded_scenes.shown(context.scene)
     for collection in dict.fromkeys(collection for collection, _ in wanted):
         instancers = instanced.get(collection)
-        for obj in instancers or objects.members(collection, "CLOUD", "ANCHOR"):
+        for obj in instancers or loaded_scenes.members(collection, "CLOUD", "ANCHOR"):
             first = next(one for one in wanted if one[0] == collection)
             item = first if instancers else (collection, obj.r5dgs.object_id)
             if item not in wanted:

@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import cloud_points, clouds, objects, timeline
+from . import cloud_points, clouds, loaded_scenes, timeline
 
 FLAT = 1e-6  # smallest scale of a map over its largest
 
@@ -198,7 +198,7 @@ def _seen(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, space: bpy.type
 
 def _homes() -> dict[bpy.types.Object, bpy.types.Collection]:
     """The loaded scene that each object lies in."""
-    return {obj: collection for collection in objects.scene_collections() for obj in collection.all_objects}
+    return {obj: collection for collection in loaded_scenes.scene_collections() for obj in collection.all_objects}
 
 
 def _by_root(obj: bpy.types.Object) -> bpy.types.Collection | None:
@@ -206,7 +206,7 @@ def _by_root(obj: bpy.types.Object) -> bpy.types.Collection | None:
     while obj.parent is not None:
         obj = obj.parent
         if obj.r5dgs.role == "ROOT":
-            return next((c for c in objects.scene_collections() if c.r5dgs.root == obj), None)
+            return next((c for c in loaded_scenes.scene_collections() if c.r5dgs.root == obj), None)
     return None
 
 

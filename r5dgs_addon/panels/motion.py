@@ -3,7 +3,7 @@
 import bpy
 
 from ...r5dgs_core import errors
-from .. import motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, objects, windows
+from .. import loaded_scenes, motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, windows
 from . import sidebar
 
 
@@ -30,7 +30,7 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
             column.operator("r5dgs.replace_motion", icon="PASTEDOWN")
             column.operator("r5dgs.duplicate_object", icon="DUPLICATE")
             column.operator("r5dgs.delete_object", icon="TRASH")
-        _scene(layout, objects.active_collection(context))
+        _scene(layout, loaded_scenes.active_collection(context))
 
 
 def _physics(layout, anchor) -> None:
@@ -78,7 +78,7 @@ def _scene(layout, collection) -> None:
     """What concerns all objects."""
     column = layout.column(align=True)
     column.operator("r5dgs.extrapolate_until", icon="PREVIEW_RANGE")
-    shown = any(motion_confidence.helper_of(anchor) for anchor in objects.members(collection, "ANCHOR"))
+    shown = any(motion_confidence.helper_of(anchor) for anchor in loaded_scenes.members(collection, "ANCHOR"))
     column.operator("r5dgs.show_confidence", text="Hide Confidence" if shown else "Show Confidence", icon="CURVE_PATH")
     exact = collection.r5dgs_exact
     text = "Exact Mode Is On" if exact.enabled else "Exact Mode"

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import isolation, look, objects, table
+from .. import isolation, loaded_scenes, look, table
 from . import sidebar
 
 OTHERS = (("r5dgs.duplicate_object", "Duplicate", "DUPLICATE"), ("r5dgs.delete_object", "Delete", "TRASH"))
@@ -51,7 +51,7 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
 
     def draw(self, context):
         layout = self.layout
-        collection = objects.active_collection(context)
+        collection = loaded_scenes.active_collection(context)
         state = collection.r5dgs
         layout.template_list("R5DGS_UL_objects", "", state, "table", state, "row", rows=5)
         row = layout.row(align=True)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import isolation, objects, prompt, selection, table, windows
+from .. import isolation, loaded_scenes, prompt, selection, table, windows
 from . import sidebar
 
 
@@ -76,7 +76,7 @@ def _current_names(session) -> dict[tuple[str, int], str]:
     wanted = {match.scene for match in session.matches}
     return {
         (collection.name, object_id): name
-        for collection in objects.scene_collections()
+        for collection in loaded_scenes.scene_collections()
         if collection.name in wanted
         for object_id, name in table.names(collection).items()
     }

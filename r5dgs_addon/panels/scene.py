@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import amounts, cloud_points, displays, objects, timeline, trust, windows
+from .. import amounts, cloud_points, displays, loaded_scenes, timeline, trust, windows
 from . import sidebar
 
 
@@ -15,7 +15,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
     def draw(self, context):
         layout = self.layout
         layout.operator("r5dgs.load_scene", text="Load R5DGS Scene", icon="IMPORT")
-        collection = objects.active_collection(context)
+        collection = loaded_scenes.active_collection(context)
         if collection is None:
             layout.label(text="No scene loaded", icon="INFO")
             return
@@ -29,8 +29,8 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             icon="OUTLINER_COLLECTION",
         )
         column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
-        if (origin := objects.origin(collection)).any():
-            column.label(text=f"Relative to {objects.origin_text(origin)}", icon="EMPTY_AXIS")
+        if (origin := loaded_scenes.origin(collection)).any():
+            column.label(text=f"Relative to {loaded_scenes.origin_text(origin)}", icon="EMPTY_AXIS")
         if t > times.t_max + 1e-6:
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
         else:

@@ -1,6 +1,6 @@
 """What all panels of the tab R5DGS have in common."""
 
-from .. import objects
+from .. import loaded_scenes
 
 TAB = "R5DGS"
 
@@ -18,4 +18,4 @@ class WithScene(Sidebar):
 
     @classmethod
     def poll(cls, context):
-        return objects.active_collection(context) is not None
+        return loaded_scenes.active_collection(context) is not None

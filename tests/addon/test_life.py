@@ -235,10 +235,10 @@ def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene
     names = [obj.name for collection in (first, second, third) for obj in collection.all_objects]
     assert len(names) == len(set(names))
     assert plays(blender, first, scene_path) and plays(blender, second, other)
-    objects = motions.addon("objects")
+    loaded_scenes = motions.addon("loaded_scenes")
     for collection in (first, second, third):
-        blender.context.view_layer.objects.active = objects.members(collection, "CLOUD")[0]
-        assert objects.active_collection(blender.context) == collection
+        blender.context.view_layer.objects.active = loaded_scenes.members(collection, "CLOUD")[0]
+        assert loaded_scenes.active_collection(blender.context) == collection
     blender.ops.r5dgs.set_display(display="POINTS")
     assert third.r5dgs.display == "POINTS" and plays(blender, third, scene_path)
 

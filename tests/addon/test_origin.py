@@ -25,8 +25,8 @@ def scene_path(tmp_path):
 
 
 @pytest.fixture
-def objects(blender):
-    return importlib.import_module("r5dgs.r5dgs_addon.objects")
+def loaded_scenes(blender):
+    return importlib.import_module("r5dgs.r5dgs_addon.loaded_scenes")
 
 
 @pytest.fixture
@@ -35,12 +35,12 @@ def view(blender, loaded, scene_path):
     return place_camera(blender, loaded, scene_file.read(scene_path).cameras[0])
 
 
-def test_a_far_scene_is_shown_near_blenders_origin(blender, loaded, scene_path, objects):
+def test_a_far_scene_is_shown_near_blenders_origin(blender, loaded, scene_path, loaded_scenes):
     scene = scene_file.read(scene_path)
     root = loaded.r5dgs.root
     assert np.abs(np.array(root.matrix_world)[:3, 3]).max() == 0
-    assert objects.origin(loaded).tolist() == ORIGIN.tolist()
-    clouds = sorted(objects.members(loaded, "CLOUD"), key=lambda obj: obj.r5dgs.start)
+    assert loaded_scenes.origin(loaded).tolist() == ORIGIN.tolist()
+    clouds = sorted(loaded_scenes.members(loaded, "CLOUD"), key=lambda obj: obj.r5dgs.start)
     points = np.concatenate([points_of(obj) for obj in clouds])
     np.testing.assert_array_equal(points, scene.means)
 
@@ -51,24 +51,26 @@ def points_of(obj):
     return points.reshape(-1, 3)
 
 
-def test_the_origin_is_kept_by_the_blend_to_the_bit(blender, loaded, objects, tmp_path):
+def test_the_origin_is_kept_by_the_blend_to_the_bit(blender, loaded, loaded_scenes, tmp_path):
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
-    assert objects.origin(collection).tolist() == ORIGIN.tolist()
+    assert loaded_scenes.origin(collection).tolist() == ORIGIN.tolist()
 
 
 @pytest.mark.parametrize("value", ["here", [1.0, 2.0], [1.0, float("nan"), 2.0], 3])
-def test_a_broken_property_counts_as_none(loaded, objects, value):
-    del loaded.r5dgs.root[objects.ORIGIN]  # Blender 4.3 loses memory if a property with a description changes its type
-    loaded.r5dgs.root[objects.ORIGIN] = value
-    assert objects.origin(loaded).tolist() == [0, 0, 0]
+def test_a_broken_property_counts_as_none(loaded, loaded_scenes, value):
+    del loaded.r5dgs.root[
+        loaded_scenes.ORIGIN
+    ]  # Blender 4.3 loses memory if a property with a description changes its type
+    loaded.r5dgs.root[loaded_scenes.ORIGIN] = value
+    assert loaded_scenes.origin(loaded).tolist() == [0, 0, 0]
 
 
-def test_the_panel_tells_the_origin_in_one_line(blender, loaded, objects):
+def test_the_panel_tells_the_origin_in_one_line(blender, loaded, loaded_scenes):
     panel = importlib.import_module("r5dgs.r5dgs_addon.panels.scene").R5DGS_PT_scene
     assert f"Relative to {TEXT}" in layouts.draw(blender, panel)
-    del loaded.r5dgs.root[objects.ORIGIN]
+    del loaded.r5dgs.root[loaded_scenes.ORIGIN]
     assert not [line for line in layouts.draw(blender, panel) if "Relative" in line]
 
 

@@ -1,0 +1,87 @@
+"""The loaded scenes of a .blend: their collections, which of them a Blender scene shows, members and origin."""
+
+import bpy
+import numpy as np
+
+ORIGIN = "r5dgs_origin"  # custom property of the root: other properties of Blender hold float32
+
+
+def scene_collections() -> list[bpy.types.Collection]:
+    """All collections that hold a loaded R5DGS scene."""
+    return [collection for collection in bpy.data.collections if collection.r5dgs.is_scene]
+
+
+def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.Object]]:
+    """Loaded scenes in a Blender scene.
+
+    Returns:
+        The objects that instance each of them; none for a scene whose own objects are in the Blender scene, which come
+        first.
+    """
+    inside = set(scene.collection.children_recursive)
+    loaded = scene_collections()
+    result: dict[bpy.types.Collection, list[bpy.types.Object]] = {one: [] for one in loaded if one in inside}
+    outside = set(loaded) - inside
+    if outside:  # else the objects need not be looked through
+        known: dict[bpy.types.Collection, set[bpy.types.Collection]] = {}  # panels call this at each redraw
+        for obj in scene.collection.all_objects:
+            own = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+            if own is None:
+                continue
+            if own not in known:
+                known[own] = _instanced(obj) & outside
+            for collection in known[own]:
+                result.setdefault(collection, []).append(obj)
+    return result
+
+
+def _instanced(obj: bpy.types.Object) -> set[bpy.types.Collection]:
+    """Collections that an object instances, also through instances in them."""
+    found: set[bpy.types.Collection] = set()
+    waiting = [obj]
+    while waiting:
+        instancer = waiting.pop()
+        collection = instancer.instance_collection if instancer.instance_type == "COLLECTION" else None
+        if collection is not None and collection not in found:
+            found.update((collection, *collection.children_recursive))
+            waiting.extend(collection.all_objects)
+    return found
+
+
+def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None:
+    """The loaded scene that the active object belongs to or instances, else the first one in the Blender scene."""
+    candidates = shown(context.scene)
+    active = context.view_layer.objects.active
+    if active is not None:
+        for collection, instancers in candidates.items():
+            if active in instancers or collection.all_objects.get(active.name) == active:
+                return collection
+    return next(iter(candidates), None)
+
+
+def is_own(collection: bpy.types.Collection) -> bool:
+    """Whether a loaded scene belongs to the open .blend: neither linked from another one nor an override of that."""
+    return collection.library is None and collection.override_library is None
+
+
+def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Object]:
+    """Objects of a loaded scene that have one of these roles."""
+    return [obj for obj in collection.all_objects if obj.r5dgs.role in roles]
+
+
+def origin(collection: bpy.types.Collection | None) -> np.ndarray:
+    """The point of the data set's world from which a loaded scene's positions are measured. [3] float64
+
+    Zero near the world's origin, without a scene, and after the root or its property was removed.
+    """
+    root = None if collection is None else collection.r5dgs.root
+    try:
+        found = np.array(root[ORIGIN], np.float64) if root is not None and ORIGIN in root else np.zeros(3)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    return found if found.shape == (3,) and np.isfinite(found).all() else np.zeros(3)
+
+
+def origin_text(origin: np.ndarray) -> str:
+    """An origin for messages and labels, such as "(5000002, -3500000, 1500002)"."""
+    return f"({', '.join(f'{value:.15g}' for value in origin)})"
