@@ -2,7 +2,7 @@
 
 A reader takes a `Guard` and enters it around each item (a frame, an image, an array). `STRICT`, the default, lets the
 first error through. A `Collector` keeps errors and lets the reader go on without the item, so that `check` and the
-reader have the same rules.
+reader have the same rules. `UNREAD` replaces a value whose error was kept.
 """
 
 from __future__ import annotations
@@ -11,13 +11,47 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn, TypeVar
 
 from . import errors
 
+T = TypeVar("T")
 ERROR, WARNING = "error", "warning"
+MOST_FINDINGS = 10_000  # of one file, so that a hostile one cannot fill the memory
 Guard = Callable[[], AbstractContextManager[Any]]
-STRICT: Guard = contextlib.nullcontext
+_NOTHING = contextlib.nullcontext()
+
+
+def _let_through() -> AbstractContextManager[None]:
+    return _NOTHING  # one for all, as readers enter it for each entry of a row
+
+
+STRICT: Guard = _let_through
+
+
+class _Unread:
+    """Value whose error was kept. Each use of it raises, which a `Collector` drops; only ``is`` may be applied."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __eq__(self, other: object) -> NoReturn:
+        raise TypeError("the value could not be read")
+
+    def __bool__(self) -> NoReturn:
+        raise TypeError("the value could not be read")
+
+    def __array__(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError("the value could not be read")
+
+
+UNREAD: Any = _Unread()
+
+
+def attempt(guard: Guard, read: Callable[[], T]) -> T:
+    """Return the result of a function, or `UNREAD` if the guard kept an error of it."""
+    with guard():
+        return read()
+    return UNREAD
 
 
 @dataclass(frozen=True)
@@ -79,6 +113,7 @@ class Collector:
     def __init__(self, codes: dict[str, Code], fallback: str):
         self.codes, self.fallback = codes, fallback
         self.findings: list[Finding] = []
+        self._known: set[Finding] = set()
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
@@ -97,7 +132,7 @@ class Collector:
                 raise
 
     def add(self, code: str, message: str) -> None:
-        """Keep a fault.
+        """Keep a fault; of more than `MOST_FINDINGS`, only that there are more.
 
         Args:
             code: Its code.
@@ -111,6 +146,9 @@ class Collector:
         place, _, problem = body.strip().rstrip(".").partition(": ")
         if not problem:
             place, problem = place, kind.meaning
+        if len(self._known) == MOST_FINDINGS:
+            problem, remedy = f"more than {MOST_FINDINGS} faults; the others are not listed", ""
         finding = Finding(code, kind.severity, place, problem, remedy.strip() or kind.remedy)
-        if finding not in self.findings:
+        if finding not in self._known and len(self._known) <= MOST_FINDINGS:
+            self._known.add(finding)
             self.findings.append(finding)

@@ -54,9 +54,9 @@ def dump(scene: Scene) -> dict[str, Any]:
     return {"features": [asdict(ORIGIN)], "origin": scene.origin.tolist()}
 
 
-def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
+def fields(top: scene_json.Row) -> dict[str, Any]:
     """The fields of `Scene` that belong to the features of a checked file. Raises as `check` does."""
-    return {"origin": scene_json.numbers(data, "origin", (3,), place)} if ORIGIN.name in _names(data) else {}
+    return {"origin": top.numbers("origin", (3,))} if ORIGIN.name in _names(top.data) else {}
 
 
 def skipped(data: dict[str, Any]) -> list[str]:
@@ -83,7 +83,7 @@ def check(data: dict[str, Any], place: str) -> None:
         raise errors.SceneFileError(f"{place}: expected format_version {wanted}, found {found!r:.60}; {remedy}")
     if found == 1:
         return
-    listed = scene_json.each(data, "features", _read, place)
+    listed = scene_json.Row(data, place).each("features", _read)
     names = [feature.name for feature in listed]
     if len(set(names)) != len(names):
         raise errors.SceneFileError(f"{place}: features: expected each name once, found {names!s:.60}")
@@ -100,10 +100,10 @@ def _names(data: dict[str, Any]) -> list[str]:
     return [row["name"] for row in data["features"]] if data["format_version"] > 1 else []
 
 
-def _read(row: dict[str, Any], place: str) -> Feature:
-    name, since = (scene_json.get(row, key, str, place) for key in ("name", "since"))
+def _read(row: scene_json.Row) -> Feature:
+    name, since, place = row.get("name", str), row.get("since", str), row.place
     if not _NAME.fullmatch(name):
         raise errors.SceneFileError(f"{place}: name: expected letters a-z, digits and underscores, found {name!r:.60}")
     if not _RELEASE.fullmatch(since):
         raise errors.SceneFileError(f"{place}: since: expected a release such as '0.2.0', found {since!r:.60}")
-    return Feature(name, scene_json.get(row, "required", bool, place), since)
+    return Feature(name, row.get("required", bool), since)

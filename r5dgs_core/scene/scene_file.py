@@ -17,9 +17,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from .. import errors, findings, strict_json
-from . import features, files, meanings, scene_json, validation
+from . import array_shapes, features, files, meanings, scene_json, validation
 from .archive import Archive, Header, most_content
-from .scene import Scene
+from .scene import DTYPES, EMBEDDINGS, Scene
 
 FORMAT = "r5dgs scene"
 JSON_MEMBER = "scene.json"
@@ -30,53 +30,9 @@ _QUATS = ("quats", "residual_quats")
 _READ_BEFORE = 1e-7  # float32 rounding of what was read
 _QUATS_AT_ONCE = 1 << 15  # what the processor's cache holds
 _HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
-_MEMORY_DTYPES: dict[str, type] = {
-    "means": np.float32,
-    "quats": np.float32,
-    "log_scales": np.float32,
-    "opacity_logits": np.float32,
-    "sh": np.float32,
-    "object_ids": np.int32,
-    "motion_ids": np.int32,
-    "track_times": np.float64,
-    "track_poses": np.float64,
-    "background_sh": np.float32,
-    "identities": np.float16,
-    "classifier_weight": np.float32,
-    "classifier_bias": np.float32,
-    "residual_rows": np.int32,
-    "residual_offsets": np.float32,
-    "residual_quats": np.float32,
-    "residual_log_scales": np.float32,
-    "dynamics": np.float32,
-    "canonical_means": np.float32,
-    "shading": np.float32,
-    "shading_rest": np.float32,
-    "embeddings": np.float32,
-    "vocabulary_embeddings": np.float32,
-    "canonical_embeddings": np.float32,
-    "view_embeddings": np.float32,
-}
 _TRACKS = ("track_times", "track_poses")  # left out where nothing moves
-_OPTIONAL = (
-    *_TRACKS,
-    "identities",
-    "classifier_weight",
-    "classifier_bias",
-    "residual_rows",
-    "residual_offsets",
-    "residual_quats",
-    "residual_log_scales",
-    "dynamics",
-    "canonical_means",
-    "shading",
-    "shading_rest",
-    "embeddings",
-    "vocabulary_embeddings",
-    "canonical_embeddings",
-    "view_embeddings",
-)
-_STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in _MEMORY_DTYPES.items()}
+_REQUIRED = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "background_sh")
+_STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in DTYPES.items()}
 for _name in FIXED_POINT:
     _STORED_DTYPES[_name].add("<i2")
 for _name in _HALF:
@@ -112,12 +68,14 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
 
     Args:
         path: The file.
-        guard: As of `validation.check`.
+        guard: Entered around each array, entry and rule, for callers that want all faults (`findings`). What it keeps
+            an error of is `findings.UNREAD` in the result.
     """
     with Archive(Path(path)) as archive:
-        scene = _read_zip(archive)
+        scene = _read_zip(archive, guard)
     validation.check(scene, str(path), guard)
-    _warn_of_lost_detail(scene, path)
+    with guard():
+        _warn_of_lost_detail(scene, path)
     return scene
 
 
@@ -133,15 +91,13 @@ def read_meanings(path: str | Path) -> meanings.Meanings | None:
     """Return only the stored embeddings of a scene; None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
-        data = _read_json(archive)
-        json_place = f"{place}: {JSON_MEMBER}"
-        headers = _read_headers(archive, data, validation.EMBEDDINGS)
-        ids = tuple(scene_json.each(data, "objects", lambda row, at: scene_json.get(row, "id", int, at), json_place))
-        vocabulary = tuple(scene_json.words(data, "vocabulary", json_place))
-        table = scene_json.table(data, json_place)
-        shapes = {name: header.shape for name, header in headers.items()}
-        validation.check_meaning_shapes(shapes, len(ids), len(vocabulary), table, place)
-        arrays = _read_arrays(archive, headers, validation.EMBEDDINGS)
+        top = _read_json(archive)
+        headers = _read_headers(archive, top, EMBEDDINGS)
+        ids = top.each("objects", lambda row: row.get("id", int))
+        vocabulary = top.words("vocabulary")
+        table = scene_json.table(top)
+        array_shapes.check_meanings(_shapes(headers), len(ids), len(vocabulary), table, place)
+        arrays = _read_arrays(archive, headers, EMBEDDINGS)
     validation.check_meanings(arrays, table, place)
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
@@ -179,12 +135,12 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
     """Write the zip; returns False if it compresses so well that a reader would take it for a bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
-        arrays = [name for name in _MEMORY_DTYPES if getattr(scene, name) is not None and name not in still]
+        arrays = [name for name in DTYPES if getattr(scene, name) is not None and name not in still]
         head = {"format": FORMAT, "format_version": features.version(scene), "arrays": arrays, **features.dump(scene)}
         text = scene_json.dump(scene, head)
         _add(archive, JSON_MEMBER, text, compression)
         for name in arrays:
-            array, dtype = getattr(scene, name), _MEMORY_DTYPES[name]
+            array, dtype = getattr(scene, name), DTYPES[name]
             buffer = io.BytesIO()
             stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
             np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
@@ -242,70 +198,105 @@ def _decode(name: str, array: np.ndarray) -> np.ndarray:
             norms = np.linalg.norm(values, axis=-1, keepdims=True)
             values = np.divide(values, norms, out=values, where=np.abs(norms - 1) < 1e-3)
         return values.astype(np.float32)
-    return array.astype(_MEMORY_DTYPES[name])
+    return array.astype(DTYPES[name])
 
 
-def _read_zip(archive: Archive) -> Scene:
-    data = _read_json(archive)
-    place, json_place = archive.place, f"{archive.place}: {JSON_MEMBER}"
-    if skipped := features.skipped(data):
-        _log.warning("%s: skipped what this release cannot read: %s", json_place, ", ".join(skipped))
-    headers = _read_headers(archive, data, _MEMORY_DTYPES)
-    fields = scene_json.fields(data, json_place) | features.fields(data, json_place)
-    shapes = {name: header.shape for name, header in headers.items()}
-    still = not set(shapes) & set(_TRACKS)
-    if still:
-        shapes |= {"track_times": (1,), "track_poses": (len(fields["groups"]), 1, 7)}
-    for name in _TRACKS:
-        if name not in shapes:
-            raise errors.SceneFileError(f"{json_place}: arrays: expected both of {' and '.join(_TRACKS)}, or none")
-    count = scene_json.get(data, "gaussians", int, json_place)
-    if shapes["means"][:1] != (count,):
-        raise errors.SceneFileError(
-            f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {shapes['means']}"
-        )
+def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
+    top = _read_json(archive, guard)
+    place = archive.place
+    headers = _read_headers(archive, top, DTYPES, guard)
+    fields = scene_json.fields(top)
+    with guard():
+        fields |= features.fields(top)
+        if skipped := features.skipped(top.data):
+            _log.warning("%s: skipped what this release cannot read: %s", top.place, ", ".join(skipped))
+    shapes = _shapes(headers)
+    still = not set(headers) & set(_TRACKS)
+    with guard():
+        if still:
+            shapes |= {"track_times": (1,), "track_poses": (len(fields["groups"]), 1, 7)}
+        for name in _TRACKS:
+            if name not in headers and not still:
+                raise errors.SceneFileError(f"{top.place}: arrays: expected both of {' and '.join(_TRACKS)}, or none")
+    with guard():
+        count = top.get("gaussians", int)
+        found = shapes["means"]
+        if count is not findings.UNREAD and found[:1] != (count,):
+            shapes["means"] = findings.UNREAD
+            raise errors.SceneFileError(
+                f"{place}: means.npy: expected {count} rows as in {JSON_MEMBER}, found shape {found}"
+            )
     objects, groups, vocabulary, table = (fields[name] for name in ("objects", "groups", "vocabulary", "lookup"))
-    validation.check_shapes(shapes, objects, groups, vocabulary, table, place)
-    arrays = _read_arrays(archive, headers, _MEMORY_DTYPES)
+    sound = array_shapes.check(shapes, objects, groups, vocabulary, table, place, guard)
+    arrays = _read_arrays(archive, headers.keys() & sound, DTYPES, guard)
+    arrays |= dict.fromkeys(headers.keys() - sound, findings.UNREAD)
     if still:
-        arrays["track_times"] = np.array([fields["t_max"]])
-        arrays["track_poses"] = np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
+        arrays["track_times"] = findings.attempt(guard, lambda: np.array([fields["t_max"]], np.float64))
+        arrays["track_poses"] = findings.attempt(
+            guard, lambda: np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
+        )
     return Scene(**arrays, **fields)  # type: ignore[arg-type]
 
 
-def _read_json(archive: Archive) -> dict[str, Any]:
+def _read_json(archive: Archive, guard: findings.Guard = findings.STRICT) -> scene_json.Row:
+    """Content of the JSON member. It is `findings.UNREAD` if the guard keeps an error of it as JSON; a file of another
+    kind or version always raises, as its arrays may mean something else."""
     where = f"{archive.place}: {JSON_MEMBER}"
     if JSON_MEMBER not in archive:
         raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found; this is another kind of zip")
+    data = findings.attempt(guard, lambda: _parse_json(archive, where))
+    if data is not findings.UNREAD:
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise errors.SceneFileError(
+                f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file'
+            )
+        features.check(data, where)
+    return scene_json.Row(data, where, guard)
+
+
+def _parse_json(archive: Archive, where: str) -> Any:
     if archive.size(JSON_MEMBER) > strict_json.MOST_BYTES:
         raise errors.SceneFileError(
             f"{where}: expected at most {strict_json.MOST_BYTES >> 20} MiB, found {archive.size(JSON_MEMBER) >> 20} MiB"
         )
     memory = min(strict_json.MOST_MEMORY, most_content(archive.compressed_size(JSON_MEMBER)))
     remedy = "bake or copy the file again"
-    data = strict_json.parse(archive.read(JSON_MEMBER), where, errors.SceneFileError, remedy, memory=memory)
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        raise errors.SceneFileError(f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file')
-    features.check(data, where)
-    return data
+    return strict_json.parse(archive.read(JSON_MEMBER), where, errors.SceneFileError, remedy, memory=memory)
 
 
-def _read_headers(archive: Archive, data: dict[str, Any], names: Iterable[str]) -> dict[str, Header]:
-    """Headers of some arrays that a file has.
+def _read_headers(
+    archive: Archive, top: scene_json.Row, names: Iterable[str], guard: findings.Guard = findings.STRICT
+) -> dict[str, Header]:
+    """Headers of some arrays that a file has; `findings.UNREAD` for one whose error the guard keeps.
 
-    An optional one is absent where scene.json does not list it, so that a lost one is noticed.
+    An optional one is absent if scene.json does not list it, so that a lost one is noticed.
     """
-    listed = set(scene_json.words(data, "arrays", f"{archive.place}: {JSON_MEMBER}"))
-    wanted = [name for name in names if name in listed or name not in _OPTIONAL]
-    for name in wanted:
-        if f"{name}.npy" not in archive:
+    listed = top.words("arrays")
+    if listed is findings.UNREAD:
+        listed = [name for name in names if f"{name}.npy" in archive]
+    wanted = [name for name in names if name in listed or name in _REQUIRED]
+    lost = [name for name in wanted if f"{name}.npy" not in archive]
+    for name in lost:
+        with guard():
             raise errors.SceneFileError(f"{archive.place}: {name}.npy: expected in a .r5dgs file, not found")
-    return {name: archive.header(f"{name}.npy", _STORED_DTYPES[name]) for name in wanted}
+    headers: dict[str, Header] = dict.fromkeys(wanted, findings.UNREAD)
+    for name in [name for name in wanted if name not in lost]:
+        headers[name] = findings.attempt(guard, lambda name=name: archive.header(f"{name}.npy", _STORED_DTYPES[name]))
+    return headers
 
 
-def _read_arrays(archive: Archive, there: Collection[str], names: Iterable[str]) -> dict[str, np.ndarray | None]:
+def _shapes(headers: dict[str, Header]) -> dict[str, tuple[int, ...]]:
+    return {name: findings.UNREAD if header is findings.UNREAD else header.shape for name, header in headers.items()}
+
+
+def _read_arrays(
+    archive: Archive, there: Collection[str], names: Iterable[str], guard: findings.Guard = findings.STRICT
+) -> dict[str, np.ndarray | None]:
     """Arrays in their dtypes of memory, None for those that a file does not have."""
+
+    def read_one(name: str) -> np.ndarray:
+        return _decode(name, archive.array(f"{name}.npy", _STORED_DTYPES[name]))
+
     return {
-        name: _decode(name, archive.array(f"{name}.npy", _STORED_DTYPES[name])) if name in there else None
-        for name in names
+        name: findings.attempt(guard, lambda name=name: read_one(name)) if name in there else None for name in names
     }

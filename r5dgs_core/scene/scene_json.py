@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import __version__, errors, strict_json
+from .. import __version__, errors, findings, strict_json
 from ..motion.models import MotionModel
 from .cameras import Camera
 from .meanings import POOLINGS, EncoderCard, Table, View
@@ -81,138 +82,194 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
     return data
 
 
-def fields(data: dict[str, Any], place: str) -> dict[str, Any]:
+@dataclass(slots=True)
+class Row:
+    """An object of the JSON member; each wrong entry is a fault of its own.
+
+    Attributes:
+        data: The object.
+        place: File, member and way to the object, for messages.
+        guard: Entered around each entry; an entry whose error it keeps is `findings.UNREAD`.
+    """
+
+    data: dict[str, Any]
+    place: str
+    guard: findings.Guard = findings.STRICT
+
+    def get(self, key: str, kind: type) -> Any:
+        """The value of a key, of the wanted JSON type; whole numbers pass for float."""
+        with self.guard():
+            value = self.data.get(key)
+            if kind is float and isinstance(value, int) and not isinstance(value, bool):
+                value = float(value)
+            if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
+                found = "nothing" if key not in self.data else repr(value)[:60]
+                raise errors.SceneFileError(f"{self.place}: {key}: expected {kind.__name__}, found {found}")
+            return value
+        return findings.UNREAD
+
+    def optional(self, key: str, kind: type) -> Any:
+        """As `get`; None if the key is missing or null."""
+        return None if self.lacks(key) else self.get(key, kind)
+
+    def has(self, key: str) -> bool:
+        """True if there is such a key."""
+        return self.data is not findings.UNREAD and key in self.data
+
+    def lacks(self, key: str) -> bool:
+        """True if a key is missing or null."""
+        return self.data is not findings.UNREAD and self.data.get(key) is None
+
+    def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Finite numbers of a given shape, float64."""
+        with self.guard():
+            value = self.data.get(key)
+            try:
+                array = np.array(value, np.float64)
+            except (TypeError, ValueError):
+                array = np.zeros(0)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise errors.SceneFileError(
+                    f"{self.place}: {key}: expected finite numbers of shape {shape}, found {value!r}"
+                )
+            return array
+        return findings.UNREAD
+
+    def floats(self, key: str, count: int) -> Any:
+        """A tuple of so many finite numbers."""
+        values = self.numbers(key, (count,))
+        return values if values is findings.UNREAD else tuple(values.tolist())
+
+    def words(self, key: str) -> tuple[str, ...]:
+        """A list of strings."""
+        with self.guard():
+            words = self.get(key, list)
+            for word in words:
+                if not isinstance(word, str):
+                    raise errors.SceneFileError(f"{self.place}: {key}: expected words, found {word!r}")
+            return tuple(words)
+        return findings.UNREAD
+
+    def each(self, key: str, reader: Callable[[Row], Any]) -> tuple[Any, ...]:
+        """The objects of a list, each through ``reader``."""
+        rows = self.get(key, list)
+        if rows is findings.UNREAD:
+            return rows
+        for i, row in enumerate(rows):
+            with self.guard():
+                if not isinstance(row, dict):
+                    raise errors.SceneFileError(f"{self.place}: {key}[{i}]: expected an object, found {row!r}")
+        places = (f"{self.place}: {key}[{i}]" for i in range(len(rows)))
+        return tuple(
+            reader(Row(row, place, self.guard)) if isinstance(row, dict) else findings.UNREAD
+            for row, place in zip(rows, places, strict=True)
+        )
+
+
+def fields(top: Row) -> dict[str, Any]:
     """The fields of `Scene` that are not arrays of the zip. Raises `SceneFileError` naming place and key."""
-    light = data.get("light_direction")
     return {
-        "name": get(data, "name", str, place),
-        "objects": tuple(each(data, "objects", _read_object, place)),
-        "groups": tuple(each(data, "groups", _read_group, place)),
-        "t_max": get(data, "t_max", float, place),
-        "frames_per_unit": get(data, "frames_per_unit", float, place),
-        "world_convention": get(data, "world_convention", str, place),
-        "cameras": tuple(each(data, "cameras", _read_camera, place)),
-        "light_direction": None if light is None else numbers(data, "light_direction", (3,), place),
-        "vocabulary": tuple(words(data, "vocabulary", place)),
-        "lookup": table(data, place),
-        "provenance": get(data, "provenance", dict, place),
-        "needs": tuple(each(data, "needs", lambda row, place: dict(row), place)),
-        "near_plane": get(data, "near_plane", float, place) if "near_plane" in data else NEAR_PLANE,
-        "harmonics_turn": get(data, "harmonics_turn", bool, place) if "harmonics_turn" in data else True,
+        "name": top.get("name", str),
+        "objects": top.each("objects", _read_object),
+        "groups": top.each("groups", _read_group),
+        "t_max": top.get("t_max", float),
+        "frames_per_unit": top.get("frames_per_unit", float),
+        "world_convention": top.get("world_convention", str),
+        "cameras": top.each("cameras", _read_camera),
+        "light_direction": None if top.lacks("light_direction") else top.numbers("light_direction", (3,)),
+        "vocabulary": top.words("vocabulary"),
+        "lookup": table(top),
+        "provenance": top.get("provenance", dict),
+        "needs": top.each("needs", lambda row: dict(row.data)),
+        "near_plane": top.get("near_plane", float) if top.has("near_plane") else NEAR_PLANE,
+        "harmonics_turn": top.get("harmonics_turn", bool) if top.has("harmonics_turn") else True,
     }
 
 
-def table(data: dict[str, Any], place: str) -> Table | None:
-    """What is said about the embeddings, None in files that say nothing. Raises as `fields` does."""
-    if data.get("lookup") is None:
+def table(top: Row) -> Table | None:
+    """Metadata of the embeddings; None in files without it. Raises as `fields` does."""
+    if top.lacks("lookup"):
         return None
-    found, place = get(data, "lookup", dict, place), f"{place}: lookup"
-    encoder = get(found, "encoder", dict, place)
-    card = EncoderCard(
-        kind=get(encoder, "kind", str, place),
-        name=get(encoder, "name", str, place),
-        digest=get(encoder, "digest", str, place),
-        dimension=get(encoder, "dimension", int, place),
-        templates=tuple(words(encoder, "templates", place)),
-        scale=get(encoder, "scale", float, place),
-    )
-    pooling = get(found, "pooling", str, place)
-    if pooling not in POOLINGS:
-        raise errors.SceneFileError(f"{place}: pooling: expected one of {POOLINGS}, found {pooling!r}")
-    rows = each(found, "objects", lambda row, place: row, place)
+    found = Row(top.get("lookup", dict), f"{top.place}: lookup", top.guard)
+    if found.data is findings.UNREAD:
+        return findings.UNREAD
+    encoder = Row(found.get("encoder", dict), found.place, found.guard)
     return Table(
-        encoder=card,
-        canonical=tuple(words(found, "canonical", place)),
-        views=tuple(tuple(each(row, "views", _read_view, place)) for row in rows),
-        thresholds=tuple(None if row.get("threshold") is None else get(row, "threshold", float, place) for row in rows),
-        margin=get(found, "margin", float, place),
-        pooling=pooling,
+        encoder=EncoderCard(
+            kind=encoder.get("kind", str),
+            name=encoder.get("name", str),
+            digest=encoder.get("digest", str),
+            dimension=encoder.get("dimension", int),
+            templates=encoder.words("templates"),
+            scale=encoder.get("scale", float),
+        ),
+        pooling=findings.attempt(top.guard, lambda: _pooling(found)),
+        canonical=found.words("canonical"),
+        views=found.each("objects", lambda row: row.each("views", _read_view)),
+        thresholds=found.each("objects", lambda row: row.optional("threshold", float)),
+        margin=found.get("margin", float),
     )
 
 
-def get(data: dict[str, Any], key: str, kind: type, place: str) -> Any:
-    """The value of a key, of the wanted JSON type; whole numbers pass for float."""
-    value = data.get(key)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
-        found = "nothing" if key not in data else repr(value)[:60]
-        raise errors.SceneFileError(f"{place}: {key}: expected {kind.__name__}, found {found}")
-    return value
+def _pooling(found: Row) -> str:
+    pooling = found.get("pooling", str)
+    if pooling not in POOLINGS:
+        raise errors.SceneFileError(f"{found.place}: pooling: expected one of {POOLINGS}, found {pooling!r}")
+    return pooling
 
 
-def each(data: dict[str, Any], key: str, reader: Callable[[dict[str, Any], str], Any], place: str) -> list[Any]:
-    """The objects of a list, each through ``reader``, which is also told the place."""
-    rows = get(data, key, list, place)
-    for i, row in enumerate(rows):
-        if not isinstance(row, dict):
-            raise errors.SceneFileError(f"{place}: {key}[{i}]: expected an object, found {row!r}")
-    return [reader(row, f"{place}: {key}[{i}]") for i, row in enumerate(rows)]
-
-
-def numbers(data: dict[str, Any], key: str, shape: tuple[int, ...], place: str) -> np.ndarray:
-    """Finite numbers of a given shape, float64."""
-    try:
-        array = np.array(data.get(key), np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise errors.SceneFileError(
-            f"{place}: {key}: expected finite numbers of shape {shape}, found {data.get(key)!r}"
-        )
-    return array
-
-
-def words(data: dict[str, Any], key: str, place: str) -> list[str]:
-    """A list of strings."""
-    words = get(data, key, list, place)
-    for word in words:
-        if not isinstance(word, str):
-            raise errors.SceneFileError(f"{place}: {key}: expected words, found {word!r}")
-    return words
-
-
-def _read_object(row: dict[str, Any], place: str) -> SceneObject:
-    r, g, b = numbers(row, "color", (3,), place).tolist()
+def _read_object(row: Row) -> SceneObject:
     return SceneObject(
-        id=get(row, "id", int, place),
-        name=get(row, "name", str, place),
-        aliases=tuple(words(row, "aliases", place)),
-        caption=get(row, "caption", str, place),
-        color=(r, g, b),
-        start=get(row, "start", int, place),
-        count=get(row, "count", int, place),
+        color=row.floats("color", 3),
+        id=row.get("id", int),
+        name=row.get("name", str),
+        aliases=row.words("aliases"),
+        caption=row.get("caption", str),
+        start=row.get("start", int),
+        count=row.get("count", int),
     )
 
 
-def _read_group(row: dict[str, Any], place: str) -> MotionGroup:
-    try:
-        model = MotionModel.from_dict(get(row, "model", dict, place))
-    except ValueError as error:
-        raise errors.SceneFileError(f"{place}: model: {error}") from error
-    follows = row.get("follows")
+def _read_group(row: Row) -> MotionGroup:
     return MotionGroup(
-        id=get(row, "id", int, place),
-        object_id=get(row, "object_id", int, place),
-        role=get(row, "role", str, place),
-        anchor_index=get(row, "anchor_index", int, place),
-        pivot=numbers(row, "pivot", (3,), place),
-        model=model,
-        follows=None if follows is None else get(row, "follows", int, place),
-        follow_matrix=None if row.get("follow_matrix") is None else numbers(row, "follow_matrix", (3, 3), place),
-        rigid_rms=get(row, "rigid_rms", float, place),
-        rigid_max=get(row, "rigid_max", float, place),
-        seen=None if row.get("seen") is None else _interval(numbers(row, "seen", (2,), place)),
+        model=findings.attempt(row.guard, lambda: _model(row)),
+        id=row.get("id", int),
+        object_id=row.get("object_id", int),
+        role=row.get("role", str),
+        anchor_index=row.get("anchor_index", int),
+        pivot=row.numbers("pivot", (3,)),
+        follows=row.optional("follows", int),
+        follow_matrix=None if row.lacks("follow_matrix") else row.numbers("follow_matrix", (3, 3)),
+        rigid_rms=row.get("rigid_rms", float),
+        rigid_max=row.get("rigid_max", float),
+        seen=None if row.lacks("seen") else row.floats("seen", 2),
     )
 
 
-def _read_view(row: dict[str, Any], place: str) -> View:
-    left, top, right, bottom = (0.0,) * 4 if row.get("box") is None else numbers(row, "box", (4,), place).tolist()
+def _model(row: Row) -> MotionModel:
+    try:
+        return MotionModel.from_dict(row.get("model", dict))
+    except ValueError as error:
+        raise errors.SceneFileError(f"{row.place}: model: {error}") from error
+
+
+def _read_camera(row: Row) -> Camera:
+    entries = {
+        "width": row.get("width", int),
+        "height": row.get("height", int),
+        "intrinsics": row.numbers("intrinsics", (3, 3)),
+        "T_cam_world": row.numbers("T_cam_world", (4, 4)),
+        "name": row.get("name", str),
+    }
+    return findings.UNREAD if any(entry is findings.UNREAD for entry in entries.values()) else Camera(**entries)
+
+
+def _read_view(row: Row) -> View:
     return View(
-        source=get(row, "source", str, place),
-        threshold=get(row, "threshold", float, place),
-        t=None if row.get("t") is None else get(row, "t", float, place),
-        box=None if row.get("box") is None else (left, top, right, bottom),
+        box=None if row.lacks("box") else row.floats("box", 4),
+        source=row.get("source", str),
+        threshold=row.get("threshold", float),
+        t=row.optional("t", float),
     )
 
 
@@ -242,20 +299,6 @@ def _view_tree(view: View) -> dict[str, Any]:
     place = {} if view.box is None else {"box": [float(edge) for edge in view.box]}
     when = {} if view.t is None else {"t": float(view.t)}
     return {"source": view.source, "threshold": float(view.threshold), **when, **place}
-
-
-def _interval(values: np.ndarray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
-
-
-def _read_camera(row: dict[str, Any], place: str) -> Camera:
-    return Camera(
-        width=get(row, "width", int, place),
-        height=get(row, "height", int, place),
-        intrinsics=numbers(row, "intrinsics", (3, 3), place),
-        T_cam_world=numbers(row, "T_cam_world", (4, 4), place),
-        name=get(row, "name", str, place),
-    )
 
 
 def _plain(value: Any) -> Any:

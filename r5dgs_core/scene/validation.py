@@ -8,18 +8,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from .. import errors, findings
-from ..motion.models import MotionModel
-from . import cameras
+from . import array_shapes, cameras
 from .meanings import Table
 from .playback import runs
-from .scene import IDENTITY_DIM, ROLES, MotionGroup, Scene, SceneObject
+from .scene import DTYPES, EMBEDDINGS, ROLES, MotionGroup, Scene
 
-SH_BASES = (1, 4, 9, 16)
-EMBEDDINGS = ("embeddings", "vocabulary_embeddings", "canonical_embeddings", "view_embeddings")
+_fail = array_shapes.fail
 _UNIT_TOLERANCE = 1e-3
 
 # Largest numbers that a scene may hold: single precision can square them, and no motion overflows within its times.
@@ -65,204 +64,101 @@ _MODEL_LIMITS = {
     "frequency": _SPIN,
 }
 _MOST_ID = np.iinfo(np.int32).max
-_DTYPES = {
-    "means": np.float32,
-    "quats": np.float32,
-    "log_scales": np.float32,
-    "opacity_logits": np.float32,
-    "sh": np.float32,
-    "object_ids": np.int32,
-    "motion_ids": np.int32,
-    "track_times": np.float64,
-    "track_poses": np.float64,
-    "background_sh": None,
-    "identities": None,
-    "classifier_weight": np.float32,
-    "classifier_bias": np.float32,
-    "residual_rows": np.int32,
-    "residual_offsets": np.float32,
-    "residual_quats": np.float32,
-    "residual_log_scales": np.float32,
-    "dynamics": np.float32,
-    "canonical_means": np.float32,
-    "shading": np.float32,
-    "shading_rest": np.float32,
-    "light_direction": None,
-    "origin": np.float64,
-}
+_CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # in memory any floats, which writing converts
+_DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}
+_ARRAYS = (*DTYPES, "light_direction", "origin")
 
 
 def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> None:
     """Raise `SceneFileError` with ``place``, the member and the expected content if the scene is inconsistent.
 
     Args:
-        scene: The scene.
+        scene: The scene; fields may be `findings.UNREAD` if the guard kept their errors.
         place: For messages.
-        guard: Entered around each array, object, motion group and camera, for callers that want all faults.
+        guard: Entered around each array, rule, object, motion group and camera, for callers that want all faults.
     """
-    for name in (*_DTYPES, *EMBEDDINGS):
-        array = getattr(scene, name)
-        if array is not None and not isinstance(array, np.ndarray):
-            _fail(place, name, "a numpy array", type(array).__name__)
-    arrays = {name: array for name in (*_DTYPES, *EMBEDDINGS) if (array := getattr(scene, name)) is not None}
-    shapes = {name: array.shape for name, array in arrays.items()}
-    check_shapes(shapes, scene.objects, scene.groups, scene.vocabulary, scene.lookup, place)
+    given = {name: array for name in _ARRAYS if (array := getattr(scene, name)) is not None}
+    for name, array in given.items():
+        with guard():
+            if not isinstance(array, np.ndarray) and array is not findings.UNREAD:
+                _fail(place, name, "a numpy array", type(array).__name__)
+    arrays = {name: array for name, array in given.items() if isinstance(array, np.ndarray)}
+    shapes = {name: arrays[name].shape if name in arrays else findings.UNREAD for name in given}
+    array_shapes.check(shapes, scene.objects, scene.groups, scene.vocabulary, scene.lookup, place, guard)
     for name, dtype in _DTYPES.items():
-        if name in arrays and dtype is not None and arrays[name].dtype != dtype:
-            _fail(place, name, f"dtype {np.dtype(dtype)}", arrays[name].dtype)
+        with guard():
+            if name in arrays and arrays[name].dtype != dtype:
+                _fail(place, name, f"dtype {np.dtype(dtype)}", arrays[name].dtype)
     for name in _LIMITS:
         with guard():
             if name in arrays:
                 check_range(name, arrays[name], place)
-    with guard():
-        check_meanings({name: getattr(scene, name) for name in EMBEDDINGS}, scene.lookup, place)
-    with guard():
-        _check_ids(scene, place)
-    for rule in (_check_residuals, _check_units, _check_times):
-        with guard():
-            rule(scene, place)
-    _check_objects(scene, place, guard)
-    object_ids = {item.id for item in scene.objects}
-    for row, group in enumerate(scene.groups):
-        with guard():
-            _check_group(scene, place, row, group, object_ids)
-    for camera in scene.cameras:
+    check_meanings({name: arrays.get(name) for name in EMBEDDINGS}, scene.lookup, place, guard)
+    for check_part in (_check_ids, _check_residuals, _check_units, _check_times, _check_objects):
+        check_part(scene, place, guard)
+    object_ids = findings.attempt(guard, lambda: {item.id for item in scene.objects})
+    for row, group in enumerate(_listed(scene.groups)):
+        if group is not findings.UNREAD:
+            _check_group(scene, place, row, group, object_ids, guard)
+    for camera in _listed(scene.cameras):
         with guard():
             try:
-                cameras.check(camera)
+                if camera is not findings.UNREAD:
+                    cameras.check(camera)
             except (TypeError, ValueError) as error:
                 raise errors.SceneFileError(f"{place}: {error}") from error
 
 
-def _check_ids(scene: Scene, place: str) -> None:
-    if (scene.classifier_weight is None) != (scene.classifier_bias is None):
-        _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
-    groups = len(scene.groups)
-    stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
-    if len(stray):
-        _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
-    if not scene.groups:
-        _fail(place, "groups", "group 0, which is pinned", "none")
-    if scene.world_convention not in cameras.WORLD_TO_BLENDER:
-        _fail(place, "world_convention", f"one of {sorted(cameras.WORLD_TO_BLENDER)}", repr(scene.world_convention))
+def _listed(values: Sequence[Any]) -> Sequence[Any]:
+    """The items of a field; none if it could not be read."""
+    return () if values is findings.UNREAD else values
 
 
-def check_shapes(
-    shapes: Mapping[str, tuple[int, ...]],
-    objects: Sequence[SceneObject],
-    groups: Sequence[MotionGroup],
-    vocabulary: Sequence[str],
+def _check_ids(scene: Scene, place: str, guard: findings.Guard) -> None:
+    with guard():
+        if (scene.classifier_weight is None) != (scene.classifier_bias is None):
+            _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
+    with guard():
+        groups = len(scene.groups)
+        stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
+        if len(stray):
+            _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
+    with guard():
+        if len(scene.groups) == 0:
+            _fail(place, "groups", "group 0, which is pinned", "none")
+    with guard():
+        if scene.world_convention not in cameras.WORLD_TO_BLENDER:
+            _fail(place, "world_convention", f"one of {sorted(cameras.WORLD_TO_BLENDER)}", repr(scene.world_convention))
+
+
+def check_meanings(
+    arrays: Mapping[str, np.ndarray | None],
     table: Table | None,
     place: str,
+    guard: findings.Guard = findings.STRICT,
 ) -> None:
-    """Raise `SceneFileError` if the shapes of a scene's arrays do not fit each other or the rest of the scene.
-
-    Args:
-        shapes: Shapes by name, at least of the arrays that every scene has.
-        objects, groups, vocabulary, table: Fields of `Scene`, the last one `Scene.lookup`.
-        place: For messages.
-    """
-    count, knots, strays = (_length(shapes, name) for name in ("means", "track_times", "residual_rows"))
-    classes = sum(item.id >= 0 for item in objects)
-    for name in ("sh", "background_sh"):
-        rank = 3 if name == "sh" else 2
-        if len(shapes[name]) != rank or shapes[name][-2] not in SH_BASES:
-            wanted = f"({count}, K, 3)" if name == "sh" else "(K, 3)"
-            _fail(place, name, f"{wanted} with K one of {SH_BASES}", shapes[name])
-    expected = {
-        "means": (count, 3),
-        "quats": (count, 4),
-        "log_scales": (count, 3),
-        "opacity_logits": (count,),
-        "sh": (count, shapes["sh"][1], 3),
-        "object_ids": (count,),
-        "motion_ids": (count,),
-        "track_times": (knots,),
-        "track_poses": (len(groups), knots, 7),
-        "background_sh": (shapes["background_sh"][0], 3),
-        "identities": (count, IDENTITY_DIM),
-        "classifier_weight": (classes, IDENTITY_DIM),
-        "classifier_bias": (classes,),
-        "residual_rows": (strays,),
-        "residual_offsets": (strays, knots, 3),
-        "residual_quats": (strays, knots, 4),
-        "residual_log_scales": (strays, knots, 3),
-        "dynamics": (count, 12),
-        "canonical_means": (count, 3),
-        "shading": (count, 3),
-        "shading_rest": (count,),
-        "light_direction": (3,),
-        "origin": (3,),
-    }
-    for name, shape in expected.items():
-        if shapes.get(name, shape) != shape:
-            _fail(place, name, f"shape {shape}", shapes[name])
-    check_meaning_shapes(shapes, len(objects), len(vocabulary), table, place)
-
-
-def check_meaning_shapes(
-    shapes: Mapping[str, tuple[int, ...]], objects: int, words: int, table: Table | None, place: str
-) -> None:
-    """Raise `SceneFileError` if the shapes of stored embeddings do not fit each other or their table.
-
-    Args:
-        shapes: Shapes by name; only `EMBEDDINGS` are checked.
-        objects: Rows of the table of objects.
-        words: Words of the vocabulary.
-        table: Encoder, thresholds and views of the embeddings.
-        place: For messages.
-    """
-    there = {name: shapes[name] for name in EMBEDDINGS if name in shapes}
-    lengths = {shape[-1] for shape in there.values() if shape}
-    if table is not None:
-        lengths.add(table.encoder.dimension)
-        absent = [name for name in EMBEDDINGS if name not in there]
-        if absent:
-            _fail(place, absent[0], "an array beside 'lookup'", "none")
-    elif "canonical_embeddings" in there or "view_embeddings" in there:
-        _fail(place, "lookup", "an entry beside 'canonical_embeddings' and 'view_embeddings'", "none")
-    if len(lengths) > 1:
-        _fail(place, "embeddings", "vectors of one length", sorted(lengths))
-    views = there.get("view_embeddings", ())
-    most = views[1] if len(views) > 1 else 0
-    expected = {
-        "embeddings": (objects, None),
-        "vocabulary_embeddings": (words, None),
-        "canonical_embeddings": (0 if table is None else len(table.canonical), None),
-        "view_embeddings": (objects, most, None),
-    }
-    for name, shape in there.items():
-        wanted = expected[name]
-        if len(shape) != len(wanted) or any(n is not None and n != m for n, m in zip(wanted, shape, strict=True)):
-            _fail(place, name, f"shape {wanted}", shape)
-    if table is not None and (len(table.views) != objects or any(len(own) > most for own in table.views)):
-        _fail(place, "lookup", f"{objects} objects of at most {most} views", [len(own) for own in table.views][:5])
-
-
-def check_meanings(arrays: Mapping[str, np.ndarray | None], table: Table | None, place: str) -> None:
     """Raise `SceneFileError` if numbers of stored embeddings or of their table are out of range.
 
     Args:
         arrays: `EMBEDDINGS` by name.
         table: Encoder, thresholds and views of the embeddings.
         place: For messages.
+        guard: Entered around each array and rule.
     """
     for name, array in arrays.items():
-        if array is not None:
-            _check_range(place, name, array, _LARGE)
+        with guard():
+            if array is not None:
+                _check_range(place, name, array, _LARGE)
     if table is None:
         return
-    thresholds = [each for each in table.thresholds if each is not None]
-    thresholds += [view.threshold for own in table.views for view in own]
-    if not all(abs(each) <= _LARGE for each in (*thresholds, table.margin, table.encoder.scale)):
-        _fail(place, "lookup", f"thresholds, margin and scale up to {_LARGE:g}", "others")
-    if any("{}" not in template for template in table.encoder.templates):
-        _fail(place, "lookup", "templates with '{}' for the phrase", table.encoder.templates)
-
-
-def _length(shapes: Mapping[str, tuple[int, ...]], name: str) -> int:
-    """Rows of an array; 0 without it."""
-    return next(iter(shapes.get(name, ())), 0)
+    with guard():
+        thresholds = [each for each in table.thresholds if each is not None]
+        thresholds += [view.threshold for own in table.views for view in own]
+        if not all(abs(each) <= _LARGE for each in (*thresholds, table.margin, table.encoder.scale)):
+            _fail(place, "lookup", f"thresholds, margin and scale up to {_LARGE:g}", "others")
+    with guard():
+        if any("{}" not in template for template in table.encoder.templates):
+            _fail(place, "lookup", "templates with '{}' for the phrase", table.encoder.templates)
 
 
 def check_range(name: str, values: np.ndarray, place: str) -> None:
@@ -292,59 +188,69 @@ def _check_range(
         _fail(place, name, f"finite numbers up to {most:g}", f"{values[first]:g} in row {first[0]}")
 
 
-def _fail(place: str, member: str, expected: str, found: object) -> None:
-    raise errors.SceneFileError(f"{place}: {member}: expected {expected}, found {found}")
-
-
-def _check_residuals(scene: Scene, place: str) -> None:
+def _check_residuals(scene: Scene, place: str, guard: findings.Guard) -> None:
     rows = scene.residual_rows
     parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
-    if any((part is None) != (rows is None) for part in parts):
-        _fail(place, "residual_rows", "all four members residual_*, or none of them", "some of them")
-    if scene.canonical_means is not None and scene.dynamics is None:
-        _fail(place, "dynamics", "an array beside 'canonical_means'", "none")
-    if rows is None or scene.residual_offsets is None or scene.residual_log_scales is None:
-        return
-    if len(rows) and (rows[0] < 0 or rows[-1] >= len(scene.means) or (rows[1:] <= rows[:-1]).any()):
-        _fail(place, "residual_rows", f"increasing rows below {len(scene.means)}", "others")
+    with guard():
+        if any((part is None) != (rows is None) for part in parts):
+            _fail(place, "residual_rows", "all four members residual_*, or none of them", "some of them")
+    with guard():
+        if scene.canonical_means is not None and scene.dynamics is None:
+            _fail(place, "dynamics", "an array beside 'canonical_means'", "none")
+    with guard():
+        count = len(scene.means)
+        if rows is not None and len(rows) and (rows[0] < 0 or rows[-1] >= count or (rows[1:] <= rows[:-1]).any()):
+            _fail(place, "residual_rows", f"increasing rows below {count}", "others")
     for name in ("residual_offsets", "residual_log_scales"):
-        if (getattr(scene, name)[:, -1] != 0).any():
-            _fail(place, name, "zero at t_max (residuals are relative to the bind state)", "something else")
+        with guard():
+            array = getattr(scene, name)
+            if array is not None and (array[:, -1] != 0).any():
+                _fail(place, name, "zero at t_max (residuals are relative to the bind state)", "something else")
 
 
-def _check_units(scene: Scene, place: str) -> None:
-    turns = np.zeros((0, 4)) if scene.residual_quats is None else scene.residual_quats.reshape(-1, 4)
-    poses = scene.track_poses[..., :4].reshape(-1, 4)
-    for name, array in (("quats", scene.quats), ("track_poses", poses), ("residual_quats", turns)):
-        norms = np.linalg.norm(array.astype(np.float64), axis=-1)
-        off = np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE)
-        if len(off):
-            _fail(place, name, "unit quaternions wxyz", f"norm {norms[off[0]]:.6g} in row {off[0]}")
-    if scene.light_direction is not None and abs(np.linalg.norm(scene.light_direction) - 1) > _UNIT_TOLERANCE:
-        _fail(place, "light_direction", "a unit vector", scene.light_direction)
-    if scene.shading_rest is not None and scene.shading is None:
-        _fail(place, "shading", "an array beside 'shading_rest'", "none")
-    if scene.shading is not None and scene.light_direction is None:
-        _fail(place, "light_direction", "a unit vector beside 'shading'", "none")
+def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
+    for name in ("quats", "track_poses", "residual_quats"):
+        with guard():
+            array = getattr(scene, name)
+            if array is None:
+                continue
+            norms = np.linalg.norm(array[..., :4].reshape(-1, 4).astype(np.float64), axis=-1)
+            off = np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE)
+            if len(off):
+                _fail(place, name, "unit quaternions wxyz", f"norm {norms[off[0]]:.6g} in row {off[0]}")
+    light = scene.light_direction
+    with guard():
+        if light is not None and abs(np.linalg.norm(light) - 1) > _UNIT_TOLERANCE:
+            _fail(place, "light_direction", "a unit vector", light)
+    with guard():
+        if scene.shading_rest is not None and scene.shading is None:
+            _fail(place, "shading", "an array beside 'shading_rest'", "none")
+    with guard():
+        if scene.shading is not None and light is None:
+            _fail(place, "light_direction", "a unit vector beside 'shading'", "none")
 
 
-def _check_times(scene: Scene, place: str) -> None:
+def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
     times = scene.track_times
-    if len(times) == 0 or not (np.diff(times) >= _LEAST_STEP).all():
-        _fail(place, "track_times", f"at least one time, increasing by {_LEAST_STEP:g} or more", times)
-    if not np.isfinite(scene.t_max) or times[-1] != scene.t_max:
-        _fail(place, "t_max", f"the last of track_times, {times[-1]!r}", repr(scene.t_max))
-    if not 1 / _MOST_TIME <= scene.frames_per_unit <= _MOST_TIME:
-        _fail(place, "frames_per_unit", f"a positive number up to {_MOST_TIME:g}", scene.frames_per_unit)
-    if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
-        _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
-    last = scene.track_poses[:, -1]
-    off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
-    if off.any():
-        g = int(np.flatnonzero(off)[0])
-        _fail(
-            place, f"track_poses of group {g}", "the identity at t_max (poses are relative to the bind state)", last[g]
-        )
+    with guard():
+        if len(times) == 0 or not (np.diff(times) >= _LEAST_STEP).all():
+            _fail(place, "track_times", f"at least one time, increasing by {_LEAST_STEP:g} or more", times)
+    with guard():
+        if not np.isfinite(scene.t_max) or times[-1] != scene.t_max:
+            _fail(place, "t_max", f"the last of track_times, {times[-1]!r}", repr(scene.t_max))
+    with guard():
+        if not 1 / _MOST_TIME <= scene.frames_per_unit <= _MOST_TIME:
+            _fail(place, "frames_per_unit", f"a positive number up to {_MOST_TIME:g}", scene.frames_per_unit)
+    with guard():
+        if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
+            _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
+    with guard():
+        last = scene.track_poses[:, -1]
+        off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
+        if off.any():
+            row = int(np.flatnonzero(off)[0])
+            wanted = "the identity at t_max (poses are relative to the bind state)"
+            _fail(place, f"track_poses of group {row}", wanted, last[row])
 
 
 def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
@@ -356,70 +262,84 @@ def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
         names = [item.name for item in scene.objects]
         if len(set(names)) != len(names):
             _fail(place, "objects", "unique names", f"{Counter(names).most_common(1)[0][0]!r} twice")
-    with guard():
-        _check_ranges(scene, place)
-    for item in scene.objects:
+    _check_ranges(scene, place, guard)
+    for item in _listed(scene.objects):
         with guard():
             if not all(0 <= channel <= 1 for channel in item.color):
                 _fail(place, f"object {item.name!r}", "a color of numbers from 0 to 1", item.color)
+        with guard():
             rows = scene.motion_ids[item.start : item.start + item.count]
             if any(later[2] <= earlier[2] for earlier, later in pairwise(runs(rows))):
                 _fail(place, f"motion_ids of object {item.name!r}", "increasing ids within the object", "another order")
 
 
-def _check_ranges(scene: Scene, place: str) -> None:
+def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
     position = 0
-    for item in scene.objects:
-        if item.start != position or item.count < 0 or item.start + item.count > len(scene.object_ids):
-            _fail(place, f"object {item.name!r}", f"a range that starts at {position}", f"{item.start} + {item.count}")
-        rows = scene.object_ids[item.start : item.start + item.count]
-        if (rows != item.id).any():
-            _fail(place, f"object {item.name!r}", f"object_ids {item.id} in its range", sorted(set(rows.tolist()))[:5])
-        position += item.count
-    if position != len(scene.object_ids):
-        _fail(place, "objects", f"ranges that cover {len(scene.object_ids)} Gaussians", f"{position} covered")
+    for item in _listed(scene.objects):
+        start, position = position, findings.UNREAD
+        with guard():
+            position = item.start + item.count
+            if item.start != start or item.count < 0 or position > len(scene.object_ids):
+                _fail(place, f"object {item.name!r}", f"a range that starts at {start}", f"{item.start} + {item.count}")
+        with guard():
+            rows = scene.object_ids[item.start : item.start + item.count]
+            if (rows != item.id).any():
+                found = sorted(set(rows.tolist()))[:5]
+                _fail(place, f"object {item.name!r}", f"object_ids {item.id} in its range", found)
+    with guard():
+        if position != len(scene.object_ids):
+            _fail(place, "objects", f"ranges that cover {len(scene.object_ids)} Gaussians", f"{position} covered")
 
 
-def _check_group(scene: Scene, place: str, row: int, group: MotionGroup, object_ids: set[int]) -> None:
-    where = f"motion group {row}"
-    if group.id != row:
-        _fail(place, where, f"id {row}", group.id)
-    if group.role not in ROLES:
-        _fail(place, where, f"a role out of {ROLES}", repr(group.role))
-    if group.object_id not in object_ids:
-        _fail(place, where, "an object of the table", group.object_id)
-    if not -1 <= group.anchor_index < len(scene.means):
-        _fail(place, where, f"an anchor_index below {len(scene.means)}, or -1", group.anchor_index)
-    if np.shape(group.pivot) != (3,) or not (np.abs(group.pivot) <= cameras.FARTHEST).all():
-        _fail(place, where, f"a pivot of three numbers up to {cameras.FARTHEST:g}", group.pivot)
-    if not (0 <= group.rigid_rms <= cameras.FARTHEST and 0 <= group.rigid_max <= cameras.FARTHEST):
-        _fail(place, where, f"rigid residuals from 0 to {cameras.FARTHEST:g}", (group.rigid_rms, group.rigid_max))
-    _check_model(group.model, f"{place}: {where}: model")
-    if group.seen is not None and not group.seen[0] <= group.seen[1]:
-        _fail(place, where, "'seen' as first and last time, in order", group.seen)
+def _check_group(
+    scene: Scene, place: str, row: int, group: MotionGroup, object_ids: set[int], guard: findings.Guard
+) -> None:
+    where, farthest = f"motion group {row}", cameras.FARTHEST
+    with guard():
+        if group.id != row:
+            _fail(place, where, f"id {row}", group.id)
+    with guard():
+        if group.role not in ROLES:
+            _fail(place, where, f"a role out of {ROLES}", repr(group.role))
+    with guard():
+        if group.object_id not in object_ids:
+            _fail(place, where, "an object of the table", group.object_id)
+    with guard():
+        if not -1 <= group.anchor_index < len(scene.means):
+            _fail(place, where, f"an anchor_index below {len(scene.means)}, or -1", group.anchor_index)
+    with guard():
+        if np.shape(group.pivot) != (3,) or not (np.abs(group.pivot) <= farthest).all():
+            _fail(place, where, f"a pivot of three numbers up to {farthest:g}", group.pivot)
+    with guard():
+        if not (0 <= group.rigid_rms <= farthest and 0 <= group.rigid_max <= farthest):
+            _fail(place, where, f"rigid residuals from 0 to {farthest:g}", (group.rigid_rms, group.rigid_max))
+    _check_model(group, f"{place}: {where}: model", guard)
+    with guard():
+        if group.seen is not None and not group.seen[0] <= group.seen[1]:
+            _fail(place, where, "'seen' as first and last time, in order", group.seen)
     if row == 0:
-        poses = scene.track_poses[0]
-        if (
-            group.role != "pinned"
-            or not group.model.is_static
-            or group.follows is not None
-            or (poses != poses[-1]).any()
-        ):
-            _fail(place, where, "role 'pinned', a static model and no motion", repr(group.role))
+        with guard():
+            still = group.model.is_static and not (scene.track_poses[0] != scene.track_poses[0, -1]).any()
+            if group.role != "pinned" or not still or group.follows is not None:
+                _fail(place, where, "role 'pinned', a static model and no motion", repr(group.role))
     if group.follows is None:
         return
-    if not 0 <= group.follows < len(scene.groups) or scene.groups[group.follows].follows is not None:
-        _fail(place, where, "to follow a group that follows none", group.follows)
-    matrix = group.follow_matrix
-    if matrix is None or matrix.shape != (3, 3) or not (np.abs(matrix) <= _LARGE).all():
-        _fail(place, where, f"a follow_matrix (3, 3) of numbers up to {_LARGE:g}", group.follow_matrix)
+    with guard():
+        if not 0 <= group.follows < len(scene.groups) or scene.groups[group.follows].follows is not None:
+            _fail(place, where, "to follow a group that follows none", group.follows)
+    with guard():
+        matrix = group.follow_matrix
+        if matrix is None or matrix.shape != (3, 3) or not (np.abs(matrix) <= _LARGE).all():
+            _fail(place, where, f"a follow_matrix (3, 3) of numbers up to {_LARGE:g}", matrix)
 
 
-def _check_model(model: MotionModel, place: str) -> None:
+def _check_model(group: MotionGroup, place: str, guard: findings.Guard) -> None:
     """Raise `SceneFileError` with the name of a rate that playback cannot use."""
     for name, limit in _MODEL_LIMITS.items():
-        value = np.max(np.abs(getattr(model, name)))
-        if not value <= limit:
-            _fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
-    if model.radius < _LEAST_LENGTH or model.fade_time < _LEAST_STEP:
-        _fail(place, "radius and fade_time", f"{_LEAST_LENGTH:g} and {_LEAST_STEP:g} or more", "less")
+        with guard():
+            value = np.max(np.abs(getattr(group.model, name)))
+            if not value <= limit:
+                _fail(place, name, f"numbers up to {limit:g}", f"{value:g}")
+    with guard():
+        if group.model.radius < _LEAST_LENGTH or group.model.fade_time < _LEAST_STEP:
+            _fail(place, "radius and fade_time", f"{_LEAST_LENGTH:g} and {_LEAST_STEP:g} or more", "less")

@@ -1,0 +1,172 @@
+"""Checks that the shapes of a scene's arrays fit each other and the rest of the scene."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import NoReturn
+
+from .. import errors, findings
+from .meanings import Table
+from .scene import EMBEDDINGS, IDENTITY_DIM, MotionGroup, SceneObject
+
+SH_BASES = (1, 4, 9, 16)
+_PER_GAUSSIAN = ("quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids")  # beside means
+_Shape = tuple[int | None, ...]  # None: any length
+
+
+def check(
+    shapes: Mapping[str, tuple[int, ...]],
+    objects: Sequence[SceneObject],
+    groups: Sequence[MotionGroup],
+    vocabulary: Sequence[str],
+    table: Table | None,
+    place: str,
+    guard: findings.Guard = findings.STRICT,
+) -> set[str]:
+    """Raise `SceneFileError` if the shapes of a scene's arrays do not fit each other or the rest of the scene.
+
+    Args:
+        shapes: Shapes by name, at least of the arrays that every scene has; `findings.UNREAD` for unknown ones.
+        objects, groups, vocabulary, table: Fields of `Scene`, the last one `Scene.lookup`.
+        place: For messages.
+        guard: Entered around each array.
+
+    Returns:
+        Names of the arrays whose shapes fit.
+    """
+    count, knots, strays = _gaussians(shapes), _length(shapes, "track_times"), _length(shapes, "residual_rows")
+    classes = _number(guard, lambda: sum(item.id >= 0 for item in objects))
+    bases: dict[str, int] = {}
+    for name, rank in (("sh", 3), ("background_sh", 2)):
+        with guard():
+            shape = shapes[name]
+            if shape is not findings.UNREAD and (len(shape) != rank or shape[-2] not in SH_BASES):
+                wanted = f"({count}, K, 3)" if name == "sh" else "(K, 3)"
+                fail(place, name, f"{wanted} with K one of {SH_BASES}", shape)
+            bases[name] = shape[-2]
+    expected: dict[str, _Shape] = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "opacity_logits": (count,),
+        "sh": (count, bases.get("sh"), 3),
+        "object_ids": (count,),
+        "motion_ids": (count,),
+        "track_times": (knots,),
+        "track_poses": (_number(guard, lambda: len(groups)), knots, 7),
+        "background_sh": (bases.get("background_sh"), 3),
+        "identities": (count, IDENTITY_DIM),
+        "classifier_weight": (classes, IDENTITY_DIM),
+        "classifier_bias": (classes,),
+        "residual_rows": (strays,),
+        "residual_offsets": (strays, knots, 3),
+        "residual_quats": (strays, knots, 4),
+        "residual_log_scales": (strays, knots, 3),
+        "dynamics": (count, 12),
+        "canonical_means": (count, 3),
+        "shading": (count, 3),
+        "shading_rest": (count,),
+        "light_direction": (3,),
+        "origin": (3,),
+    }
+    bad_harmonics = {"sh", "background_sh"} - set(bases)
+    known = {name: shape for name, shape in shapes.items() if name in expected and name not in bad_harmonics}
+    sound = _fitting({name: known[name] for name in expected if name in known}, expected, place, guard)
+    words = _number(guard, lambda: len(vocabulary))
+    return sound | check_meanings(shapes, _number(guard, lambda: len(objects)), words, table, place, guard)
+
+
+def check_meanings(
+    shapes: Mapping[str, tuple[int, ...]],
+    objects: int | None,
+    words: int | None,
+    table: Table | None,
+    place: str,
+    guard: findings.Guard = findings.STRICT,
+) -> set[str]:
+    """Raise `SceneFileError` if the shapes of stored embeddings do not fit each other or their table.
+
+    Args:
+        shapes: Shapes by name; only `EMBEDDINGS` are checked.
+        objects: Rows of the table of objects, None if unknown.
+        words: Words of the vocabulary, None if unknown.
+        table: Encoder, thresholds and views of the embeddings.
+        place: For messages.
+        guard: Entered around each array and rule.
+
+    Returns:
+        Names of the arrays whose shapes fit.
+    """
+    there = {name: shapes[name] for name in EMBEDDINGS if name in shapes}
+    known = {name: shape for name, shape in there.items() if shape is not findings.UNREAD}
+    lengths = {shape[-1] for shape in known.values() if shape}
+    with guard():
+        if table is not None:
+            lengths.add(table.encoder.dimension)
+            absent = [name for name in EMBEDDINGS if name not in there]
+            if absent:
+                fail(place, absent[0], "an array beside 'lookup'", "none")
+        elif "canonical_embeddings" in there or "view_embeddings" in there:
+            fail(place, "lookup", "an entry beside 'canonical_embeddings' and 'view_embeddings'", "none")
+    with guard():
+        if len(lengths) > 1:
+            fail(place, "embeddings", "vectors of one length", sorted(lengths))
+    views = known.get("view_embeddings", ())
+    most = views[1] if len(views) > 1 else 0
+    expected: dict[str, _Shape] = {
+        "embeddings": (objects, None),
+        "vocabulary_embeddings": (words, None),
+        "canonical_embeddings": (_number(guard, lambda: 0 if table is None else len(table.canonical)), None),
+        "view_embeddings": (objects, most, None),
+    }
+    sound = _fitting(known, expected, place, guard)
+    with guard():
+        if table is not None and objects is not None and "view_embeddings" in known:
+            found = [len(own) for own in table.views]
+            if len(found) != objects or any(own > most for own in found):
+                fail(place, "lookup", f"{objects} objects of at most {most} views", found[:5])
+    return sound
+
+
+def _fitting(
+    shapes: Mapping[str, tuple[int, ...]], expected: Mapping[str, _Shape], place: str, guard: findings.Guard
+) -> set[str]:
+    """Names of the known shapes that are as expected. Raises `SceneFileError` with the first other one."""
+    sound = set()
+    for name, shape in shapes.items():
+        if shape is findings.UNREAD:
+            continue
+        with guard():
+            wanted = expected[name]
+            if len(shape) != len(wanted) or any(n is not None and n != m for n, m in zip(wanted, shape, strict=True)):
+                fail(place, name, f"shape {wanted}", shape)
+            sound.add(name)
+    return sound
+
+
+def _gaussians(shapes: Mapping[str, tuple[int, ...]]) -> int | None:
+    """Number of Gaussians: the rows of means; if these are unknown, those of most other arrays."""
+    if shapes.get("means") is not findings.UNREAD:
+        return _length(shapes, "means")
+    rows = Counter(
+        _length(shapes, name) for name in _PER_GAUSSIAN if shapes.get(name, findings.UNREAD) is not findings.UNREAD
+    )
+    return max(rows, key=rows.__getitem__, default=None)
+
+
+def _length(shapes: Mapping[str, tuple[int, ...]], name: str) -> int | None:
+    """Rows of an array: 0 without it, None if its shape is unknown."""
+    shape = shapes.get(name, ())
+    return None if shape is findings.UNREAD else next(iter(shape), 0)
+
+
+def _number(guard: findings.Guard, count: Callable[[], int]) -> int | None:
+    """A number of items, None if they could not be read."""
+    number = findings.attempt(guard, count)
+    return None if number is findings.UNREAD else number
+
+
+def fail(place: str, member: str, expected: str, found: object) -> NoReturn:
+    """Raise `SceneFileError` for a member that is not as expected."""
+    raise errors.SceneFileError(f"{place}: {member}: expected {expected}, found {found}")
