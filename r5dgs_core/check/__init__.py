@@ -53,14 +53,14 @@ def _check_file(path: Path) -> list[Finding]:
 
         collect = Collector(CODES, "P01")
         with collect():
-            ply.read(path)
+            ply.read(path, collect)
         return collect.findings
     if suffix == ".toml":
         from ..train import config
 
         collect = Collector(CODES, "C01")
         with collect():
-            config.load(path)
+            config.load(path, guard=collect)
         return collect.findings
     raise errors.ConfigError(
         f"{path}: expected a data set, run folder, .r5dgs, .ply or .toml file, found another kind of file"

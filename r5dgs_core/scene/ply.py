@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from .. import errors
+from .. import errors, findings
 from ..motion import rotations
 from . import files, validation
 
@@ -96,15 +96,21 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.n
     return path
 
 
-def read(path: str | Path) -> Splats:
-    """Read a PLY of Gaussians; ascii and both byte orders. Raises `SceneFileError` naming what is missing."""
+def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:
+    """Read a PLY of Gaussians; ascii and both byte orders. Raises `SceneFileError` naming what is missing.
+
+    Args:
+        path: The file.
+        guard: Entered around each statement of the header, row of text and group of columns, for callers that want all
+            faults (`findings`). What it keeps an error of is `findings.UNREAD` in the result.
+    """
     path = Path(path)
     try:
         with open(path, "rb") as stream:
-            table = _read_vertices(stream, str(path))
+            table = _read_vertices(stream, str(path), guard)
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be read: {error}") from error
-    return _to_splats(table, str(path))
+    return _to_splats(table, str(path), guard)
 
 
 def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
@@ -125,11 +131,14 @@ def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
     return columns
 
 
-def _read_header(stream: BinaryIO, place: str) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]]]:
+def _read_header(
+    stream: BinaryIO, place: str, guard: findings.Guard
+) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]]]:
     """Format, and per element its name, count and properties (name, numpy type; "list" for lists)."""
     if stream.readline(8).strip() != b"ply":
         raise errors.SceneFileError(f"{place}: expected a PLY file, found another kind (no 'ply' in the first line)")
     layout, elements = "", []
+    fault = None
     while True:
         raw = stream.readline(_HEADER_LIMIT)
         if not raw.endswith(b"\n") or stream.tell() > 1 << 22:
@@ -148,95 +157,119 @@ def _read_header(stream: BinaryIO, place: str) -> tuple[str, list[tuple[str, int
         elif words[0] == "property" and elements and words[1:2] == ["list"] and len(words) == 5:
             elements[-1][2].append((words[4], "list"))
         else:
-            raise errors.SceneFileError(f"{place}: header: expected a PLY statement, found {' '.join(words)!r}")
+            fault = errors.SceneFileError(f"{place}: header: expected a PLY statement, found {' '.join(words)!r}")
+            with guard():
+                raise fault
+    if fault:
+        raise fault  # which was kept: without a statement, the places of the numbers are unknown
     if not layout:
         raise errors.SceneFileError(f"{place}: header: expected one of the formats {', '.join(_ORDERS)}, found none")
     return layout, elements
 
 
-def _read_vertices(stream: BinaryIO, place: str) -> np.ndarray:
-    """The vertex element as a structured array."""
-    layout, elements = _read_header(stream, place)
+def _read_vertices(stream: BinaryIO, place: str, guard: findings.Guard) -> np.ndarray:
+    """The vertex element as a structured array; without rows if the guard keeps an error of them."""
+    layout, elements = _read_header(stream, place, guard)
     for name, count, properties in elements:
         if any(kind == "list" for _, kind in properties):
             raise errors.SceneFileError(f"{place}: expected the vertices first and without lists, found {name!r}")
         if len({column for column, _ in properties}) != len(properties):
             raise errors.SceneFileError(f"{place}: element {name}: expected unique property names")
         dtype = np.dtype([(column, _ORDERS[layout] + kind) for column, kind in properties])
-        least = 2 * len(properties) - 1 if layout == "ascii" else dtype.itemsize  # bytes of a row
-        left = os.fstat(stream.fileno()).st_size - stream.tell()
-        if count and (not properties or count * least > left + 1):  # the last line may lack its end
-            raise errors.SceneFileError(
-                f"{place}: element {name}: expected {count} rows of at least {least} bytes, found {left} bytes; "
-                "the file is truncated"
-            )
-        if layout == "ascii":
-            table = _read_ascii(stream, count, dtype, f"{place}: element {name}")
-        else:
-            data = stream.read(count * dtype.itemsize)
-            if len(data) != count * dtype.itemsize:
-                raise errors.SceneFileError(
-                    f"{place}: element {name}: expected {count} rows of {dtype.itemsize} bytes, "
-                    f"found {len(data)} bytes; the file is truncated"
-                )
-            table = np.frombuffer(data, dtype) if count else np.empty(0, dtype)
+        table = np.empty(0, dtype)
+        with guard() if name == "vertex" else findings.STRICT():
+            table = _read_rows(stream, layout, count, dtype, f"{place}: element {name}", guard)
         if name == "vertex":
             return table
     raise errors.SceneFileError(f"{place}: expected an element 'vertex', found {[e[0] for e in elements]}")
 
 
-def _read_ascii(stream: BinaryIO, count: int, dtype: np.dtype, place: str) -> np.ndarray:
-    table = np.empty(count, dtype)
+def _read_rows(
+    stream: BinaryIO, layout: str, count: int, dtype: np.dtype, place: str, guard: findings.Guard
+) -> np.ndarray:
+    columns = len(dtype.names or ())
+    least = 2 * columns - 1 if layout == "ascii" else dtype.itemsize  # bytes of a row
+    left = os.fstat(stream.fileno()).st_size - stream.tell()
+    if count and (not columns or count * least > left + 1):  # the last line may lack its end
+        raise errors.SceneFileError(
+            f"{place}: expected {count} rows of at least {least} bytes, found {left} bytes; the file is truncated"
+        )
+    if layout == "ascii":
+        return _read_ascii(stream, count, dtype, place, guard)
+    data = stream.read(count * dtype.itemsize)
+    if len(data) != count * dtype.itemsize:
+        raise errors.SceneFileError(
+            f"{place}: expected {count} rows of {dtype.itemsize} bytes, found {len(data)} bytes; the file is truncated"
+        )
+    return np.frombuffer(data, dtype) if count else np.empty(0, dtype)
+
+
+def _read_ascii(stream: BinaryIO, count: int, dtype: np.dtype, place: str, guard: findings.Guard) -> np.ndarray:
+    table = np.zeros(count, dtype)
     names = dtype.names or ()
     limit = _LONGEST_NUMBER * (len(names) + 1)
     for row in range(count):
-        words = stream.readline(limit).split()
-        if len(words) != len(names):
-            raise errors.SceneFileError(f"{place}: row {row}: expected {len(names)} numbers, found {len(words)}")
-        try:
-            table[row] = tuple(float(word) for word in words)
-        except (ValueError, OverflowError) as error:
-            raise errors.SceneFileError(f"{place}: row {row}: expected numbers, found {words[:4]}") from error
+        line = stream.readline(limit)
+        words = line.split()
+        with guard():
+            if len(words) != len(names):
+                raise errors.SceneFileError(f"{place}: row {row}: expected {len(names)} numbers, found {len(words)}")
+            try:
+                table[row] = tuple(float(word) for word in words)
+            except (ValueError, OverflowError) as error:
+                raise errors.SceneFileError(f"{place}: row {row}: expected numbers, found {words[:4]}") from error
+        if not line:
+            break
     return table
 
 
-def _to_splats(table: np.ndarray, place: str) -> Splats:
+def _to_splats(table: np.ndarray, place: str, guard: findings.Guard) -> Splats:
     names = table.dtype.names or ()
 
     def stack(columns: list[str]) -> np.ndarray:
-        missing = [column for column in columns if column not in names]
-        if missing:
-            raise errors.SceneFileError(
-                f"{place}: expected the columns of a Gaussian splat, not found: {', '.join(missing)}"
-            )
-        with np.errstate(over="ignore"):  # what is beyond single precision becomes infinite
-            values = np.stack([table[column].astype(np.float32) for column in columns], axis=-1)
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
-            raise errors.SceneFileError(f"{place}: row {row}: expected finite {columns[0]}.., found NaN or infinity")
-        return values
+        there = [column for column in columns if column in names]
+        with guard():
+            if there != columns:
+                missing = ", ".join(column for column in columns if column not in names)
+                raise errors.SceneFileError(f"{place}: expected the columns of a Gaussian splat, not found: {missing}")
+        with guard():
+            with np.errstate(over="ignore"):  # what is beyond single precision becomes infinite
+                values = np.stack([table[column].astype(np.float32) for column in there], axis=-1)
+            if not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
+                raise errors.SceneFileError(f"{place}: row {row}: expected finite {there[0]}.., found NaN or infinity")
+            if there == columns:
+                return values
+        return findings.UNREAD
 
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in (0, 9, 24, 45):
-        raise errors.SceneFileError(f"{place}: expected 0, 9, 24 or 45 columns f_rest_*, found {rest}")
-    sh = stack([f"f_dc_{c}" for c in range(3)])[:, None]
-    if rest:
-        channels = stack([f"f_rest_{i}" for i in range(rest)]).reshape(len(table), 3, rest // 3)
-        sh = np.concatenate([sh, channels.transpose(0, 2, 1)], axis=1)
-    encoding = sum(name.startswith("obj_dc_") for name in names)
-    quats = stack([f"rot_{i}" for i in range(4)]).astype(np.float64)
+    def harmonics() -> np.ndarray:
+        if not higher:
+            return np.ascontiguousarray(base[:, None])
+        channels = rest.reshape(len(table), 3, -1).transpose(0, 2, 1)
+        return np.ascontiguousarray(np.concatenate([base[:, None], channels], axis=1))
+
+    higher, encoding = (sum(name.startswith(start) for name in names) for start in ("f_rest_", "obj_dc_"))
+    with guard():
+        if higher not in (0, 9, 24, 45):
+            raise errors.SceneFileError(f"{place}: expected 0, 9, 24 or 45 columns f_rest_*, found {higher}")
+    base = stack([f"f_dc_{c}" for c in range(3)])
+    rest = stack([f"f_rest_{i}" for i in range(higher)]) if higher else base
+    quats = stack([f"rot_{i}" for i in range(4)])
     splats = Splats(
         means=stack(list("xyz")),
-        quats=rotations.normalize(quats).astype(np.float32),
+        quats=findings.attempt(guard, lambda: rotations.normalize(quats.astype(np.float64)).astype(np.float32)),
         log_scales=stack([f"scale_{i}" for i in range(3)]),
-        opacity_logits=stack(["opacity"])[:, 0],
-        sh=np.ascontiguousarray(sh),
+        opacity_logits=findings.attempt(guard, lambda: stack(["opacity"])[:, 0]),
+        sh=findings.attempt(guard, harmonics),
         identities=stack([f"obj_dc_{i}" for i in range(encoding)]) if encoding else None,
-        object_ids=_whole(table["obj_id"], f"{place}: obj_id") if "obj_id" in names else None,
+        object_ids=findings.attempt(guard, lambda: _whole(table["obj_id"], f"{place}: obj_id"))
+        if "obj_id" in names
+        else None,
     )
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "identities"):
-        if getattr(splats, name) is not None:
-            validation.check_range(name, getattr(splats, name), place)
+        with guard():
+            if getattr(splats, name) is not None:
+                validation.check_range(name, getattr(splats, name), place)
     return splats
 
 

@@ -275,13 +275,17 @@ def _read_headers(
     if listed is findings.UNREAD:
         listed = [name for name in names if f"{name}.npy" in archive]
     wanted = [name for name in names if name in listed or name in _REQUIRED]
-    lost = [name for name in wanted if f"{name}.npy" not in archive]
-    for name in lost:
+    headers: dict[str, Header] = {}
+    for name in wanted:
         with guard():
-            raise errors.SceneFileError(f"{archive.place}: {name}.npy: expected in a .r5dgs file, not found")
-    headers: dict[str, Header] = dict.fromkeys(wanted, findings.UNREAD)
-    for name in [name for name in wanted if name not in lost]:
-        headers[name] = findings.attempt(guard, lambda name=name: archive.header(f"{name}.npy", _STORED_DTYPES[name]))
+            if f"{name}.npy" not in archive:
+                headers[name] = findings.UNREAD
+                raise errors.SceneFileError(f"{archive.place}: {name}.npy: expected in a .r5dgs file, not found")
+    for name in wanted:
+        if name not in headers:
+            headers[name] = findings.attempt(
+                guard, lambda name=name: archive.header(f"{name}.npy", _STORED_DTYPES[name])
+            )
     return headers
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from .. import findings
 from ..errors import ConfigError, UsageError
 from .presets import PRESETS
 from .sections import (
@@ -76,35 +77,50 @@ class Config:
         return self.replace(**_parsed(overrides))
 
 
-def from_dict(values: dict[str, Any]) -> Config:
+def from_dict(values: dict[str, Any], guard: findings.Guard = findings.STRICT) -> Config:
     """Build a configuration from nested dictionaries; omitted keys keep their defaults.
+
+    Args:
+        values: Keys by section.
+        guard: Entered around each key and rule, for callers that want all faults (`findings`). A value whose error it
+            keeps is `findings.UNREAD`.
 
     Raises:
         ConfigError: A section or key is unknown (the nearest name is suggested), or a value is of the wrong type.
     """
-    config = _built(values)
-    _validate(config)
+    config = _built(values, guard)
+    _validate(config, guard)
     return config
 
 
-def _built(values: dict[str, Any]) -> Config:
+def _built(values: dict[str, Any], guard: findings.Guard = findings.STRICT) -> Config:
     """A configuration whose single keys are checked, but not how they go together."""
     sections = {f.name: f for f in dataclasses.fields(Config)}
     hints = get_type_hints(Config)
     built: dict[str, Any] = {}
     for section, keys in values.items():
-        if section not in sections:
-            raise ConfigError(f"[{section}]: unknown section{_suggest(section, sections)}")
-        if not isinstance(keys, dict):
-            raise ConfigError(f"{section}: expected a section with keys, got {keys!r}")
-        kind = hints[section]
-        types = get_type_hints(kind)
-        known = {f.name for f in dataclasses.fields(kind)}
-        for key in keys:
+        with guard():
+            if section not in sections:
+                raise ConfigError(f"[{section}]: unknown section{_suggest(section, sections)}")
+            if not isinstance(keys, dict):
+                raise ConfigError(f"{section}: expected a section with keys, got {keys!r}")
+            built[section] = _section(section, keys, hints[section], guard)
+    return Config(**built)
+
+
+def _section(section: str, keys: dict[str, Any], kind: type, guard: findings.Guard) -> Any:
+    types = get_type_hints(kind)
+    known = {f.name for f in dataclasses.fields(kind)}
+    for key in keys:
+        with guard():
             if key not in known:
                 raise ConfigError(f"{section}.{key}: unknown key{_suggest(key, known)}")
-        built[section] = kind(**{key: _check(f"{section}.{key}", value, types[key]) for key, value in keys.items()})
-    return Config(**built)
+    found = {}
+    for key in [key for key in keys if key in known]:
+        found[key] = findings.UNREAD
+        with guard():
+            found[key] = _check(f"{section}.{key}", keys[key], types[key])
+    return kind(**found)
 
 
 def require_needs(overrides: Sequence[str]) -> None:
@@ -115,13 +131,19 @@ def require_needs(overrides: Sequence[str]) -> None:
     _parsed(overrides)
 
 
-def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = None) -> Config:
+def load(
+    path: Path | None,
+    overrides: Sequence[str] = (),
+    preset: str | None = None,
+    guard: findings.Guard = findings.STRICT,
+) -> Config:
     """Read a TOML file (or none) and apply ``section.key=value`` overrides, values written as in TOML.
 
     Args:
         path: The file, or None.
         overrides: These win over the file.
         preset: Name of one of `PRESETS`; the file and the overrides win over it.
+        guard: As of `from_dict`.
 
     Raises:
         ConfigError: The file is missing or not TOML, the preset is unknown, or a key or value cannot be used.
@@ -145,7 +167,7 @@ def load(path: Path | None, overrides: Sequence[str] = (), preset: str | None = 
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
     if preset is not None:
         values = _merge_under(values, PRESETS[preset])
-    return from_dict(_merge(values, _parsed(overrides)))
+    return from_dict(_merge(values, _parsed(overrides)), guard)
 
 
 def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
@@ -222,25 +244,32 @@ def _check(name: str, value: Any, kind: type) -> Any:
     return value
 
 
-def _validate(config: Config) -> None:
+def _validate(config: Config, guard: findings.Guard) -> None:
     """Raise `ConfigError` naming the first keys whose values exclude each other."""
-    if config.train.representation == "field" and config.needs.rotation == "off":
-        raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
-    everything = config.train.representation == "field" and config.field.movers in ("all", "measured")
-    if config.init.placement == "random" and (not everything or config.field.tracks_share > 0):
-        raise ConfigError(
-            "init.placement: random places nothing on objects, so it needs train.representation='field', "
-            "field.movers='all' or 'measured', and field.tracks_share=0"
-        )
+    with guard():
+        if config.train.representation == "field" and config.needs.rotation == "off":
+            raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
+    with guard():
+        everything = config.train.representation == "field" and config.field.movers in ("all", "measured")
+        if config.init.placement == "random" and (not everything or config.field.tracks_share > 0):
+            raise ConfigError(
+                "init.placement: random places nothing on objects, so it needs train.representation='field', "
+                "field.movers='all' or 'measured', and field.tracks_share=0"
+            )
     for need, name in _CONTRADICTED.items():
-        section, key = name.split(".")
-        if getattr(config.needs, need) == "on" and not getattr(getattr(config, section), key):
-            found = getattr(getattr(config, section), key)
-            raise ConfigError(f"needs.{need} is on, but {name} is {found!r}; leave one of them out")
+        with guard():
+            found = _value(config, name)
+            if getattr(config.needs, need) == "on" and not found:
+                raise ConfigError(f"needs.{need} is on, but {name} is {found!r}; leave one of them out")
     for need, name, value in _EXCLUDED:
-        section, key = name.split(".")
-        if getattr(config.needs, need) == "on" and getattr(getattr(config, section), key) == value:
-            raise ConfigError(f"needs.{need} is on, but {name} is {value!r}; leave one of them out")
+        with guard():
+            if getattr(config.needs, need) == "on" and _value(config, name) == value:
+                raise ConfigError(f"needs.{need} is on, but {name} is {value!r}; leave one of them out")
+
+
+def _value(config: Config, name: str) -> Any:
+    section, key = name.split(".")
+    return getattr(getattr(config, section), key)
 
 
 # What may not be switched off where the need is said to be there.
