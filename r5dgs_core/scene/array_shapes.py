@@ -35,7 +35,8 @@ def check(
     Returns:
         Names of the arrays whose shapes fit.
     """
-    count, knots, strays = _gaussians(shapes), _length(shapes, "track_times"), _length(shapes, "residual_rows")
+    count = _gaussians(shapes)
+    knots, strays = (_length(shapes, name, rank=1) for name in ("track_times", "residual_rows"))
     classes = _number(guard, lambda: sum(item.id >= 0 for item in objects))
     bases: dict[str, int] = {}
     for name, rank in (("sh", 3), ("background_sh", 2)):
@@ -53,13 +54,13 @@ def check(
         "sh": (count, bases.get("sh"), 3),
         "object_ids": (count,),
         "motion_ids": (count,),
-        "track_times": (knots,),
+        "track_times": (_length(shapes, "track_times"),),
         "track_poses": (_number(guard, lambda: len(groups)), knots, 7),
         "background_sh": (bases.get("background_sh"), 3),
         "identities": (count, IDENTITY_DIM),
         "classifier_weight": (classes, IDENTITY_DIM),
         "classifier_bias": (classes,),
-        "residual_rows": (strays,),
+        "residual_rows": (_length(shapes, "residual_rows"),),
         "residual_offsets": (strays, knots, 3),
         "residual_quats": (strays, knots, 4),
         "residual_log_scales": (strays, knots, 3),
@@ -155,10 +156,10 @@ def _gaussians(shapes: Mapping[str, tuple[int, ...]]) -> int | None:
     return max(rows, key=rows.__getitem__, default=None)
 
 
-def _length(shapes: Mapping[str, tuple[int, ...]], name: str) -> int | None:
-    """Rows of an array: 0 without it, None if its shape is unknown."""
-    shape = shapes.get(name, ())
-    return None if shape is findings.UNREAD else next(iter(shape), 0)
+def _length(shapes: Mapping[str, tuple[int, ...]], name: str, rank: int | None = None) -> int | None:
+    """Rows of an array: 0 without it, None if its shape is unknown or not of the rank."""
+    shape = shapes.get(name, (0,))
+    return None if shape is findings.UNREAD or len(shape) != (rank or len(shape)) else next(iter(shape), 0)
 
 
 def _number(guard: findings.Guard, count: Callable[[], int]) -> int | None:

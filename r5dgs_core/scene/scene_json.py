@@ -247,8 +247,11 @@ def _read_group(row: Row) -> MotionGroup:
 
 
 def _model(row: Row) -> MotionModel:
+    tree = row.get("model", dict)
+    if tree is findings.UNREAD:
+        return findings.UNREAD
     try:
-        return MotionModel.from_dict(row.get("model", dict))
+        return MotionModel.from_dict(tree)
     except ValueError as error:
         raise errors.SceneFileError(f"{row.place}: model: {error}") from error
 

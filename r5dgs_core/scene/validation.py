@@ -244,7 +244,7 @@ def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
     with guard():
         if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
-    with guard():
+    with guard(), np.errstate(invalid="ignore"):  # of infinite means, which are a fault of their own
         last = scene.track_poses[:, -1]
         off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
         if off.any():
@@ -274,7 +274,7 @@ def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
 
 
 def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
-    position = 0
+    position = findings.UNREAD if scene.objects is findings.UNREAD else 0
     for item in _listed(scene.objects):
         start, position = position, findings.UNREAD
         with guard():
@@ -322,10 +322,12 @@ def _check_group(
             still = group.model.is_static and not (scene.track_poses[0] != scene.track_poses[0, -1]).any()
             if group.role != "pinned" or not still or group.follows is not None:
                 _fail(place, where, "role 'pinned', a static model and no motion", repr(group.role))
-    if group.follows is None:
+    if group.follows is None or group.follows is findings.UNREAD:
         return
     with guard():
-        if not 0 <= group.follows < len(scene.groups) or scene.groups[group.follows].follows is not None:
+        known = 0 <= group.follows < len(scene.groups)
+        leader = scene.groups[group.follows].follows if known else findings.UNREAD
+        if not known or (leader is not None and leader is not findings.UNREAD):
             _fail(place, where, "to follow a group that follows none", group.follows)
     with guard():
         matrix = group.follow_matrix
