@@ -4,6 +4,8 @@ Preferences are read and written in Blender's main thread alone; other threads g
 search for a Python touches none of Blender's data, so it runs where there is time for it.
 """
 
+import functools
+import logging
 import os
 import sys
 import threading
@@ -15,6 +17,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import __package__ as base_package
+from ..r5dgs_core import errors, user_settings
 from . import pythons, worker_check
 
 ENVIRONMENT = "R5DGS_PYTHON"
@@ -23,6 +26,7 @@ TRUSTED_ENVIRONMENT = "R5DGS_TRUSTED_FOLDERS"
 INSTALLED = "text"  # in place of a folder: the package of a small text encoder
 ROOT = Path(__file__).resolve().parent.parent
 
+log = logging.getLogger(__name__)
 _found: str | None = None  # what the search found in this session, "" for nothing; None before it
 _chosen: "Choice | None" = None  # what the preferences said last
 
@@ -38,7 +42,8 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
 
     worker_python: StringProperty(
         name="Worker Python",
-        description="Python with torch and numba that renders pictures; searched for in the usual places where empty",
+        description="Python with torch and numba that renders pictures. If empty: that of 'r5dgs config --user', or "
+        "the first suitable one in the usual places",
         subtype="FILE_PATH",
         update=_remember,
     )
@@ -74,6 +79,8 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "worker_python")
         if os.environ.get(ENVIRONMENT):
             layout.label(text=f"{ENVIRONMENT} is set and wins: {os.environ[ENVIRONMENT]}", icon="INFO")
+        elif not self.worker_python and (named := _of_user_settings()):
+            layout.label(text=f"From 'r5dgs config --user': {named}", icon="INFO")
         elif not self.worker_python and self.found_python:
             layout.label(text=f"Found: {self.found_python}", icon="INFO")
         layout.prop(self, "worker_timeout")
@@ -98,7 +105,8 @@ class Choice:
     """The preferences as other threads need them. Any thread may use it.
 
     Attributes:
-        chosen: The environment's, or the user's; "" for the first one found that will do.
+        chosen: That of the environment, of the preferences or of ``r5dgs config --user``, in this order; "" for the
+            first one found that will do.
         kept: What an earlier search found; "" for nothing.
         beside: Folders that are the extension's own, where the search begins.
         timeout_s: Seconds to wait for an answer of the worker.
@@ -148,6 +156,7 @@ def choice() -> Choice:
     chosen = os.environ.get(ENVIRONMENT, "").strip()
     if not chosen and preferences is not None:
         chosen = preferences.worker_python.strip()
+    chosen = chosen or _of_user_settings()
     _chosen = Choice(
         chosen=_absolute(chosen) if chosen else "",
         kept=preferences.found_python if preferences is not None else "",
@@ -156,6 +165,20 @@ def choice() -> Choice:
         trusted=_trusted(preferences),
     )
     return _chosen
+
+
+def _of_user_settings() -> str:
+    """``worker_python`` of ``r5dgs config --user``; "" if it is not set, or if the file is faulty, with a warning."""
+    try:
+        return user_settings.read().get("worker_python", "")
+    except errors.ConfigError as error:
+        _warn_once(str(error))
+        return ""
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    log.warning("worker: %s", message)
 
 
 def worker_python() -> str:

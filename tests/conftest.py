@@ -17,6 +17,14 @@ hypothesis.settings.register_profile("r5dgs", deadline=None, max_examples=50)
 hypothesis.settings.load_profile("r5dgs")
 
 
+@pytest.fixture(autouse=True)
+def no_user_settings(monkeypatch, tmp_path_factory):
+    """Settings of the user who runs the tests are not read or changed: every test has an empty folder for them."""
+    folder = tmp_path_factory.mktemp("settings")
+    for variable in ("XDG_CONFIG_HOME", "APPDATA"):
+        monkeypatch.setenv(variable, str(folder))
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Counts of what tests draw at random."""
     group = parser.getgroup("r5dgs")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core import errors
+from r5dgs_core import errors, user_settings
 from r5dgs_core.scene import scene_file
 from tests import scenes
 from tests.addon import patience
@@ -206,6 +206,28 @@ def test_what_was_found_is_remembered_until_it_is_forgotten_or_gone(preferences,
     assert preferences.worker_python() == places[1] and len(looked) == 3
     monkeypatch.setenv("R5DGS_PYTHON", "/chosen/python")
     assert preferences.worker_python() == "/chosen/python" and len(looked) == 3
+
+
+def test_the_users_settings_name_the_python_after_the_preferences_and_before_the_search(
+    preferences, pythons, monkeypatch, tmp_path, caplog
+):
+    kept = types.SimpleNamespace(worker_python="", found_python="", trusted_folders="", worker_timeout=7)
+    monkeypatch.setattr(preferences, "get", lambda: kept)
+    monkeypatch.setattr(pythons, "find", lambda *_, **__: sys.executable)
+    named = fake_python(tmp_path / "named")
+    place = user_settings.write("worker_python", named)
+    assert preferences.worker_python() == named
+    kept.found_python = sys.executable
+    assert preferences.worker_python() == named
+    kept.worker_python = "/preferred/python"
+    assert preferences.worker_python() == "/preferred/python"
+    kept.worker_python = ""
+    place.write_text("worker_python = 3")
+    for _ in range(2):
+        assert preferences.worker_python() == sys.executable
+    assert [str(place) in record.getMessage() for record in caplog.records] == [True]
+    user_settings.path().unlink()
+    assert preferences.worker_python() == sys.executable
 
 
 def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, pythons, monkeypatch):

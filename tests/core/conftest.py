@@ -10,14 +10,6 @@ from tests import datasets as tiny_datasets
 from tests import pictures, scenes
 
 
-@pytest.fixture(autouse=True)
-def no_user_settings(monkeypatch, tmp_path_factory):
-    """Settings of the user who runs the tests are not read or changed: every test has an empty folder for them."""
-    folder = tmp_path_factory.mktemp("settings")
-    for variable in ("XDG_CONFIG_HOME", "APPDATA"):
-        monkeypatch.setenv(variable, str(folder))
-
-
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """The data set of `tests/datasets.py` with masks."""
