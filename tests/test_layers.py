@@ -81,7 +81,7 @@ ALLOWED = {
         "exit_status",
     },
 }
-LIGHT = GROUND | {"motion", "scene"}
+LIGHT = GROUND | {"motion", "scene", "user_settings"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
@@ -271,7 +271,7 @@ sys.meta_path.insert(0, Blocker(blocked))
 
 IMPORT_LIGHT_TIER = """
 sys.path.insert(0, root)
-import r5dgs_core.errors, r5dgs_core.strict_json
+import r5dgs_core.errors, r5dgs_core.strict_json, r5dgs_core.user_settings
 seen = []
 for name in ("motion", "scene"):
     package = importlib.import_module(f"r5dgs_core.{name}")
