@@ -70,8 +70,20 @@ def hold_run_around(path: Path) -> contextlib.AbstractContextManager[object]:
         CheckpointError: As of `hold`.
     """
     path = Path(path).absolute()
-    run = next((folder for folder in (path, *path.parents) if (folder / input_paths.RUN_FILE).is_file()), None)
+    run = next((folder for folder in (path, *path.parents) if _is_run(folder)), None)
     return contextlib.nullcontext() if run is None else hold(run)
+
+
+def _is_run(folder: Path) -> bool:
+    """Return True for a folder whose ``run.json`` is ours or damaged; other programs have files of that name, too."""
+    path = folder / input_paths.RUN_FILE
+    if not path.is_file():
+        return False
+    try:
+        content = strict_json.read(path, CheckpointError)
+    except CheckpointError:
+        return True
+    return isinstance(content, dict) and {"format_version", "dataset"} <= content.keys()
 
 
 def writes(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:

@@ -165,9 +165,17 @@ WRITERS = {
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_every_command_that_writes_into_a_run_folder_waits_for_no_one(tmp_path, name):
-    (tmp_path / checkpoint.RUN_FILE).write_text("{}")
+    (tmp_path / checkpoint.RUN_FILE).write_text('{"format_version": 1, "dataset": "data"}')
     with folder_lock.hold(tmp_path), pytest.raises(CheckpointError, match="in use by"):
         WRITERS[name](tmp_path)
+
+
+@pytest.mark.parametrize(("text", "ours"), [('{"jobs": 3}', False), ("[]", False), ('{"format_version": 1', True)])
+def test_a_run_file_of_another_program_makes_no_run_folder_and_a_damaged_one_does(tmp_path, text, ours):
+    (tmp_path / checkpoint.RUN_FILE).write_text(text)
+    (tmp_path / "deep").mkdir()
+    with folder_lock.hold_run_around(tmp_path / "deep" / "a.r5dgs"):
+        assert (tmp_path / folder_lock.LOCK_FILE).exists() == ours
 
 
 def test_what_is_written_elsewhere_and_what_is_read_needs_no_lock(tmp_path, trained):
