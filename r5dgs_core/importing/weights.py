@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..errors import CheckpointError
+from ..model import plain_tensors
 
 
 @dataclass(frozen=True)
@@ -112,28 +113,12 @@ def load(path: Path) -> Weights:
     for name, value in content.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
             raise CheckpointError(f"{path}: {name!r}: expected a tensor, found {type(value).__name__}")
-        if not _is_plain(value):
-            found = f"{value.dtype}, {value.layout}, {value.device}".replace("torch.", "")
-            raise CheckpointError(
-                f"{path}: {name!r:.60}: expected a dense tensor of real numbers, found one of {found}"
-            )
+        if fault := plain_tensors.fault(value.detach()):
+            raise CheckpointError(f"{path}: {name!r:.60}: {fault}")
         tensors[name] = value.detach().to(torch.float32)
         if not torch.isfinite(tensors[name]).all():
             raise CheckpointError(f"{path}: '{name}': expected finite numbers, found NaN or infinity")
     return Weights(path, tensors)
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    """Return True for a dense tensor in memory, with a place of its own for each of its real numbers."""
-    return (
-        type(tensor) in (Tensor, torch.nn.Parameter)
-        and not tensor.is_nested
-        and not tensor.is_quantized
-        and not tensor.is_complex()
-        and tensor.layout == torch.strided
-        and tensor.device.type == "cpu"
-        and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
-    )
 
 
 def _reason(error: Exception) -> str:

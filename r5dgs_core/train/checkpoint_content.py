@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError
+from ..model import plain_tensors
 from ..model.gaussians import PARAMETERS
 
 FORMAT_VERSION = 1
@@ -102,9 +103,8 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
     """Raise CheckpointError if a tensor is not plain memory, or two do not fit each other."""
     lengths: dict[str, int] = {}
     for name, tensor in tensors.items():
-        if not _is_plain(tensor):
-            kind = f"{tensor.dtype}, {tensor.layout}, {tensor.device}".replace("torch.", "")
-            raise CheckpointError(f"'{name}': expected a dense tensor of real numbers, found one of {kind}")
+        if fault := plain_tensors.fault(tensor, _DTYPES):
+            raise CheckpointError(f"'{name}': {fault}")
         shape = _SHAPES.get(name)
         if shape is None:
             continue
@@ -119,29 +119,6 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
             raise CheckpointError(f"'{name}': expected another type of number than {tensor.dtype}")
     if len(tensors["observed"]) != max(0, lengths["B"] - 1) and "discovery.labels" not in tensors:
         raise CheckpointError(f"'observed': expected {lengths['B'] - 1} rows, found {len(tensors['observed'])}")
-
-
-def _is_plain(tensor: Tensor) -> bool:
-    """Return True for a dense tensor of which no two elements share memory."""
-    return (
-        type(tensor) is Tensor
-        and not tensor.is_nested
-        and tensor.layout == torch.strided
-        and tensor.device.type == "cpu"
-        and tensor.dtype in _DTYPES
-        and (tensor.numel() == 0 or not _overlaps(tensor))
-    )
-
-
-def _overlaps(tensor: Tensor) -> bool:
-    """Return True if two elements share memory, as those of an axis with stride 0 do."""
-    end = 1
-    for stride, length in sorted(zip(tensor.stride(), tensor.shape, strict=True)):
-        if length > 1:
-            if stride < end:
-                return True
-            end = stride * length
-    return False
 
 
 def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:

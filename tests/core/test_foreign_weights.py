@@ -16,6 +16,7 @@ ODD = {
     "meta": PLAIN.to("meta"),
     "stride_0": torch.zeros(1).expand(1 << 40),
     "complex": PLAIN.to(torch.complex64),
+    "overlapping": torch.zeros(20).as_strided((3, 4), (1, 2)),
 }
 
 
