@@ -76,17 +76,7 @@ def rasterize_splats(
 
 
 def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
-    """Everything that projection needs, in the order of the constants in `cpu_projection`. [26] float64
-
-    Raises:
-        ValueError: The image has more tiles along a side than can be counted.
-    """
-    most = cpu_projection.MOST_TILES * cpu_projection.TILE
-    if max(camera.width, camera.height) > most:
-        raise ValueError(
-            f"camera: expected an image of at most {most} px along each side, got {camera.width} x {camera.height}; "
-            "remedy: draw it in parts"
-        )
+    """Everything that projection needs, in the order of the constants in `cpu_projection`. [26] float64"""
     k, T = camera.intrinsics, camera.T_cam_world
     return np.array(
         [
