@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.raster import warm_up
+from r5dgs_core.raster import warming
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.train import bake, config, run
@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    warm_up()
+    warming.warm_up()
     settings = config.load(None, args.set)
     dataset = datasets.read(args.data)
     removed = held_out([v.t for v in dataset.train], args.every, args.offset, args.sparse)

@@ -42,7 +42,7 @@ import workloads
 from workloads import Workload
 
 from r5dgs_core import errors
-from r5dgs_core.raster import rasterize_splats, scene_render, splatting
+from r5dgs_core.raster import backends, rasterize_splats, scene_render
 from r5dgs_core.scene import playback, scene_file
 
 COLUMNS = ("workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb")
@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         for backend in options.backends:
             on_gpu = backend == "cuda" and torch.cuda.is_available()
-            splatting.choose_backend(backend, torch.zeros(1, device="cuda" if on_gpu else "cpu"))
+            backends.choose_backend(backend, torch.zeros(1, device="cuda" if on_gpu else "cpu"))
         chosen = _choose(options)
         peers = [load_peer(name) for name in options.peer]
     except (ValueError, OSError, errors.R5dgsError) as error:

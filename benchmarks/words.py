@@ -22,7 +22,7 @@ import numpy as np
 
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
-from r5dgs_core.semantics import encoders, lookup_table, query
+from r5dgs_core.semantics import encoder_registry, encoders, lookup_table, query
 
 NAMES = {
     "kitchen": ("mug", "lemon", "apple", "donut", "cutting board", "bowl"),
@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--encoder", default="text", help="folder, or text")
     parser.add_argument("--json", type=Path, help="where the rows go")
     args = parser.parse_args()
-    encoder = Remembering(encoders.open_encoder(args.encoder))
+    encoder = Remembering(encoder_registry.open_encoder(args.encoder))
     rows = [measure(name, encoder) for name in NAMES]
     total: dict[str, Any] = {key: sum(row[key] for row in rows) for key in rows[0] if isinstance(rows[0][key], int)}
     print(

@@ -6,6 +6,7 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..r5dgs_addon import amounts, capture, capture_objects, capture_views, running
+from ..r5dgs_addon.capture_settings import CaptureSettings
 
 
 def _items(identifiers, descriptions):
@@ -92,14 +93,14 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
     )
     object_collection: StringProperty(name="Object Collection", description="Collection that holds the objects")
 
-    def settings(self) -> capture.CaptureSettings:
+    def settings(self) -> CaptureSettings:
         """The properties as settings; a frame range that was not set is the scene's."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(capture.CaptureSettings)}
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(CaptureSettings)}
         values["directory"] = self.target_folder()
         for name in ("frame_start", "frame_end"):
             if not self.properties.is_property_set(name):
                 values[name] = None
-        return capture.CaptureSettings(**values)
+        return CaptureSettings(**values)
 
     def suggest(self, context):
         return bool(self.directory)

@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
@@ -16,9 +15,7 @@ import numpy as np
 from ..r5dgs_core import errors
 from . import capture_files
 from .capture_overrides import Overrides
-
-if TYPE_CHECKING:
-    from .capture import CaptureSettings
+from .capture_settings import CaptureSettings
 
 OBJECT_INDEX = (".IndexOB.X", ".Object Index.X")  # Blender 4, Blender 5
 SWITCHED_OFF = (

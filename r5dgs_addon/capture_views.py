@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
@@ -13,9 +13,7 @@ from mathutils import Matrix
 
 from ..r5dgs_core import errors
 from .capture_overrides import Overrides
-
-if TYPE_CHECKING:
-    from .capture import CaptureSettings
+from .capture_settings import CaptureSettings
 
 RIGS = ("AUTO", "NONE", "ARC", "RING", "HEMISPHERE")
 MIN_OWN_CAMERAS = 3  # fewer observed cameras than this say nothing about depth, so AUTO adds a rig

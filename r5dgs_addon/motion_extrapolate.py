@@ -276,3 +276,13 @@ def clear(anchor: bpy.types.Object, place: motion_curves.Place) -> None:
     owned = compat.channels(place.action, place.slot)
     for curve in curves.values():
         owned.remove(curve)
+
+
+def register():
+    """Have a change of an anchor's fields re-extrapolate it."""
+    motion_physics.call_on_change(re_extrapolate)
+
+
+def unregister():
+    """Undo `register`."""
+    motion_physics.call_on_change(None)

@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import bpy
@@ -44,6 +44,7 @@ FIELDS = {  # beside the point and the axis that it turns about, `motion_pivot`
     "free_top": ("velocity", "acceleration", "angular_velocity"),
 }
 _POWERS = {"velocity": 1, "acceleration": 2, "angular_velocity": 1, "angular_acceleration": 2, "frequency": 1}
+_re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by the service above this module
 _LEAST_MOMENT = 1e-3  # of the largest moment of inertia: what a flat or thin body is given
 
 
@@ -54,12 +55,16 @@ def units_per_second(state: bpy.types.PropertyGroup) -> float:
 
 
 def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
-    """Re-extrapolate an anchor whose fields have changed, where that is wanted: their ``update``."""
-    if state.at_once:
-        from . import motion_extrapolate  # which stands on this module
-
+    """Re-extrapolate an anchor whose fields have changed if its user wants that: their ``update``."""
+    if state.at_once and _re_extrapolate is not None:
         with contextlib.suppress(errors.R5dgsError):  # the panel says why
-            motion_extrapolate.re_extrapolate([state.id_data])
+            _re_extrapolate([state.id_data])
+
+
+def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | None) -> None:
+    """Set the function that `write_at_once` calls with the anchor, None for no function."""
+    global _re_extrapolate
+    _re_extrapolate = re_extrapolate
 
 
 def _vector(name: str):

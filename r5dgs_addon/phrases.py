@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene.meanings import EncoderCard
+from ..r5dgs_core.scene.lookup_table import EncoderCard
 from . import preferences, worker
 
 KEY = "phrases"  # what `worker.busy` knows its jobs by

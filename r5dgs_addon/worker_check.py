@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import bpy
 
 from . import windows
 
-if TYPE_CHECKING:  # the worker needs the preferences, and those need this module
-    from . import worker
 
-_job: worker.Job | None = None
+class TestJob(Protocol):
+    """The part of a `worker.Job` that is drawn here; the worker itself stands on the preferences, which draw this."""
+
+    @property
+    def doing(self) -> str:
+        """What it waits for, in a few words."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """True once it has ended."""
+        ...
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since its start."""
+        ...
+
+
+_job: TestJob | None = None
 _result: tuple[str, str] = ("", "NONE")  # text and icon
 
 
-def begin(job: worker.Job) -> None:
+def begin(job: TestJob) -> None:
     """Show the progress of a test."""
     global _job, _result
     _job, _result = job, ("", "NONE")

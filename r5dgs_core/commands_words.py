@@ -14,7 +14,7 @@ from . import commands, errors, folder_lock, input_paths, strict_json, terminal,
 
 if TYPE_CHECKING:
     from .scene.lookup import Match
-    from .scene.meanings import EncoderCard
+    from .scene.lookup_table import EncoderCard
     from .scene.scene import Scene, SceneObject
 
 log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def run_lookup(
     input_paths.check_scene(path)
     from .progress import make
     from .scene import scene_file
-    from .semantics import encoders, lookup_table
+    from .semantics import encoder_registry, lookup_table
 
     commands.use_threads(threads)
     scene = scene_file.read(path)
@@ -64,7 +64,7 @@ def run_lookup(
     extra = [] if words is None else _read_words(words)
     with make(progress_kind) as progress:
         progress({"event": "prepare", "text": f"encoder {encoder}"})
-        opened = encoders.open_encoder(encoder)
+        opened = encoder_registry.open_encoder(encoder)
         made = lookup_table.make(
             scene,
             opened,
@@ -240,9 +240,9 @@ def _user_encoder(card: EncoderCard) -> Any:
     found = user_settings.read().get("encoder")
     if found is None:
         return None
-    from .semantics import encoders, query
+    from .semantics import encoder_registry, query
 
-    opened = encoders.open_encoder(found)
+    opened = encoder_registry.open_encoder(found)
     try:
         query.check(card, opened.card, found)
     except errors.BackendError as error:
@@ -255,13 +255,13 @@ def _encoder_for(scene: Scene, encoder: str | None, unknown: Sequence[str], path
     """The encoder where one is given and needed, checked against the table's even where it is not."""
     if encoder is None:
         return None
-    from .semantics import encoders, query
+    from .semantics import encoder_registry, query
 
     if scene.lookup is None:
         raise errors.BackendError(
             f"{path}: has no lookup table; make one with this encoder: r5dgs lookup {path} --encoder {encoder}"
         )
-    opened = encoders.open_encoder(encoder)
+    opened = encoder_registry.open_encoder(encoder)
     query.check(scene.lookup.encoder, opened.card, str(path))
     return opened if unknown else None
 

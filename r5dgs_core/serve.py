@@ -41,7 +41,7 @@ from . import serve_requests as asked
 from .scene import playback, quality, scene_file
 from .scene.cameras import Camera
 from .scene.scene import Scene
-from .semantics import encoders, query
+from .semantics import encoder_registry, encoders, query
 
 if TYPE_CHECKING:
     from .raster import scene_render
@@ -326,7 +326,7 @@ class Server:
         where = asked.path_of(request.get("encoder"), "encoder")
         if self._encoder is None or self._encoder[0] != where:
             self._encoder = None  # its memory first
-            self._encoder = where, encoders.open_encoder(where)
+            self._encoder = where, encoder_registry.open_encoder(where)
         return self._encoder[1]
 
     def _loaded(self) -> list[Scene]:

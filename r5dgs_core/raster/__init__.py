@@ -3,6 +3,5 @@
 from . import environment as environment  # first, as it checks what numba reads when it is imported
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 from .splatting import rasterize, rasterize_splats
-from .warming import warm_up
 
-__all__ = ["RasterSettings", "RasterStats", "RenderOutput", "SplatImage", "rasterize", "rasterize_splats", "warm_up"]
+__all__ = ["RasterSettings", "RasterStats", "RenderOutput", "SplatImage", "rasterize", "rasterize_splats"]

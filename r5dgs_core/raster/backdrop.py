@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..scene.cameras import Camera
-from . import cpu, cpu_blending, cpu_projection, cpu_tiles, splatting
+from . import backends, cpu, cpu_blending, cpu_projection, cpu_tiles, splatting
 from .compile import run
 from .settings import RasterSettings, SplatImage
 
@@ -49,7 +49,7 @@ class Backdrop:
         settings: RasterSettings | None = None,
     ):
         splatting.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
-        splatting.choose_backend("cpu", means)
+        backends.choose_backend("cpu", means)
         settings = settings or RasterSettings()
         self._lock = threading.Lock()
         self._camera = camera
@@ -103,7 +103,7 @@ class Backdrop:
             ValueError, BackendError: As `rasterize_splats` does; the backdrop stays as it was.
         """
         splatting.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
-        splatting.choose_backend("cpu", means)
+        backends.choose_backend("cpu", means)
         expected = self._channels.shape[1]
         if channels.shape[1] != expected:
             raise ValueError(f"channels: expected {expected} as in the backdrop, got {channels.shape[1]}")

@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 
-_SOURCES = ("raster/*.py", "model/spherical_harmonics.py", "train/losses.py", "train/posing.py")
+_SHARED = ("raster/*.py", "model/spherical_harmonics.py", "scene/harmonics.py")  # helpers and frozen constants
 _OURS = re.compile("r5dgs-[0-9a-f]{12}")
 _KEPT_S = 28 * 24 * 3600.0
 _SYSTEM_USERS = (0, 65534)  # root, and what root's files belong to inside a container of the user
@@ -51,13 +51,18 @@ _threads = max(1, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 def kernel(function) -> Any:
-    """Compile at the first call, without the interpreter lock, and keep the machine code for the next process."""
+    """Compile at the first call, without the interpreter lock, and keep the machine code for the next process.
+
+    The machine code belongs to the state of the file that defines ``function`` and of `shared_sources`: a kernel
+    outside this package may freeze constants and call helpers of these files alone.
+    """
     with _lock:
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         folder = _cache_folder(before)
-        numba.config.CACHE_DIR = folder or before  # type: ignore[attr-defined]
+        own = None if folder is None else os.path.join(folder, _digest([Path(function.__code__.co_filename)]))
+        numba.config.CACHE_DIR = own or before  # type: ignore[attr-defined]
         try:
-            compiled = numba.njit(cache=folder is not None, **_OPTIONS)(function)
+            compiled = numba.njit(cache=own is not None, **_OPTIONS)(function)
             _watch.kernels.add(compiled)
             return compiled
         finally:
@@ -191,17 +196,15 @@ if hasattr(os, "register_at_fork"):
 
 @functools.cache
 def _cache_folder(chosen: str) -> str | None:
-    """Folder for machine code, apart for each state of the kernels; None where no place can be written.
+    """Folder for machine code, apart for each state of the shared sources; None if no place can be written.
 
-    Numba looks only at the file of the compiled function, not at those of the functions it calls and of the constants
-    that it freezes, hence the digest.
+    Numba looks only at time and size of the file of the compiled function, not at the files of the functions it calls
+    and of the constants that it freezes, hence the digest.
     """
-    digest = hashlib.sha256()
-    for source in sources():
-        digest.update(source.read_bytes())
+    digest = _digest(shared_sources())
     tried = []
     for base in _bases(chosen):
-        folder = base / f"r5dgs-{digest.hexdigest()[:12]}"
+        folder = base / f"r5dgs-{digest}"
         is_new = not folder.exists()
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -246,10 +249,18 @@ def _danger(folder: Path) -> str | None:
     return None
 
 
-def sources() -> list[Path]:
-    """Files that machine code is made of: kernels, helpers, and modules whose constants they freeze."""
+def shared_sources() -> list[Path]:
+    """Files that the machine code of any kernel may be made of, beside its own: helpers and frozen constants."""
     core = Path(__file__).parents[1]
-    return sorted(path for pattern in _SOURCES for path in core.glob(pattern))
+    return sorted(path for pattern in _SHARED for path in core.glob(pattern))
+
+
+def _digest(sources: Iterable[Path]) -> str:
+    """First 12 hexadecimal digits of the SHA-256 of files."""
+    digest = hashlib.sha256()
+    for source in sources:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _remove_old(base: Path) -> None:

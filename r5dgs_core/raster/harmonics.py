@@ -14,6 +14,7 @@ import torch
 from ..model import spherical_harmonics
 from ..scene import cameras
 from ..scene.cameras import Camera
+from . import backends
 
 _WORTH_A_THREAD = 2000  # Gaussians
 _ROWS_WORTH_A_THREAD = 64  # of a sky
@@ -87,9 +88,7 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
     if spherical_harmonics.degree_of(len(sh)) == 0:
         color = np.clip(spherical_harmonics.dc_to_rgb(sh[0]), 0, 1)
         return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
-    from . import splatting  # late, as it imports this module
-
-    if not splatting.numba_is_there():
+    if not backends.numba_is_there():
         return np.clip(spherical_harmonics.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)
     from . import compile as compilation
     from . import cpu_sky
@@ -123,9 +122,7 @@ class _Poses:
 
 def _fits_kernels(*tensors: torch.Tensor | None) -> bool:
     given = [tensor for tensor in tensors if tensor is not None]
-    from . import splatting  # late, as it imports this module
-
-    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and splatting.numba_is_there()
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and backends.numba_is_there()
 
 
 def _plain_colors(

@@ -8,7 +8,7 @@ from scipy import sparse
 from torch import Tensor
 
 from ..scene.cameras import Camera
-from . import splatting
+from . import backends, splatting
 from .settings import RasterSettings
 
 TOGETHER = 32  # segments in one backward pass, so that many take no more memory than some
@@ -53,7 +53,7 @@ def segment_weights(
         )
     settings = settings or RasterSettings()
     splatting.check_splats(*fixed, fixed[0], camera, None, None)
-    chosen = splatting.choose_backend(backend, fixed[0])
+    chosen = backends.choose_backend(backend, fixed[0])
     if chosen != "cpu":
         return _by_gradients(fixed, camera, segments, count, settings, chosen)
     from . import cpu

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
-import logging
 import math
 from typing import Any
 
 import torch
 
-from .. import errors
 from ..scene import cameras
 from ..scene.cameras import Camera
-from . import harmonics
-from .settings import BACKENDS, RasterSettings, RasterStats, RenderOutput, SplatImage
-
-log = logging.getLogger(__name__)
+from . import backends, cuda, harmonics, reference
+from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 
 
 def rasterize_splats(
@@ -65,15 +59,13 @@ def rasterize_splats(
     if not isinstance(settings, RasterSettings):
         raise TypeError(f"settings: expected RasterSettings, got {type(settings).__name__}")
     check_splats(means, quats, scales, opacities, channels, camera, background, labels)
-    chosen = choose_backend(backend, means)
+    chosen = backends.choose_backend(backend, means)
     if background is not None:
         background = background.to(means.dtype)
-    if chosen == "reference":
-        from . import reference as implementation
-    elif chosen == "cpu":
+    if chosen == "cpu":
         from . import cpu as implementation
     else:
-        from . import cuda as implementation
+        implementation = reference if chosen == "reference" else cuda
     return implementation.rasterize_splats(
         means, quats, scales, opacities, channels, camera, background, labels, settings, stats
     )
@@ -159,50 +151,6 @@ def seen_colors(gaussians: Any, camera: Camera, *, fused: bool = True) -> torch.
         fused: Whether the kernels of the `cpu` backend may be used where they can.
     """
     return harmonics.seen_colors(gaussians.means, gaussians.sh, camera.center, fused=fused)
-
-
-def choose_backend(backend: str, means: torch.Tensor) -> str:
-    """Name of the backend that draws tensors like ``means`` when ``backend`` is asked for. Raises BackendError."""
-    if backend not in BACKENDS:
-        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
-    if backend == "auto":
-        if means.device.type == "cpu" and means.dtype == torch.float32 and numba_is_there():
-            return "cpu"
-        if means.device.type == "cpu" and means.dtype == torch.float32:
-            log.warning("rasterizer: numba is not installed, using the slow reference; remedy: pip install numba")
-        if means.device.type == "cuda" and means.dtype == torch.float32:
-            from . import cuda
-
-            reason = cuda.obstacle(means.device, means.dtype)
-            if reason is None:
-                return "cuda"
-            _warn_once(f"rasterizer: using the slow reference on the GPU, as backend 'cuda' cannot draw: {reason}")
-        return "reference"
-    if backend == "cuda":
-        from . import cuda
-
-        reason = cuda.obstacle(means.device, means.dtype)
-        if reason is not None:
-            raise errors.BackendError(f"rasterizer 'cuda': {reason}")
-    if backend == "cpu":
-        if not numba_is_there():
-            raise errors.BackendError("rasterizer 'cpu': numba is not installed; remedy: pip install numba")
-        if means.device.type != "cpu" or means.dtype != torch.float32:
-            raise errors.BackendError(
-                f"rasterizer 'cpu': expected float32 tensors on the CPU, got {means.dtype} on {means.device}; "
-                "remedy: convert them, or use backend='reference'"
-            )
-    return backend
-
-
-def numba_is_there() -> bool:
-    """Whether kernels can be compiled here; numba itself is not imported for the answer."""
-    return importlib.util.find_spec("numba") is not None
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    log.warning(message)
 
 
 def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:

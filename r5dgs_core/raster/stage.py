@@ -18,7 +18,7 @@ import torch
 
 from ..scene.cameras import Camera
 from ..scene.scene import NEAR_PLANE, Scene
-from . import coverage, posed_scene, rasterize, scene_render, splatting
+from . import backends, coverage, posed_scene, rasterize, scene_render
 from .scene_render import Instance
 from .settings import RasterSettings, RenderOutput
 
@@ -183,7 +183,7 @@ class Stage:
         return scene_render.tensor(scene_render.behind(scene, turned))
 
     def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
-        if not splatting.numba_is_there():
+        if not backends.numba_is_there():
             return False
         moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
         return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)

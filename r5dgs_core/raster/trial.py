@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..scene.cameras import Camera
-from . import rasterize_splats, splatting, warming
+from . import backends, rasterize_splats, warming
 
 GAUSSIANS = 20_000
 SIZE = 400
@@ -49,7 +49,7 @@ def run() -> Trial:
     T_cam_world[2, 3] = 3.0
     half = SIZE / 2
     camera = Camera(SIZE, SIZE, np.array([[2.2 * half, 0, half], [0, 2.2 * half, half], [0, 0, 1]]), T_cam_world)
-    if splatting.numba_is_there():
+    if backends.numba_is_there():
         warming.warm_up(gradients=False)
     milliseconds = []
     with torch.no_grad():
@@ -61,7 +61,7 @@ def run() -> Trial:
 
 
 def _device() -> str:
-    if not splatting.numba_is_there():
+    if not backends.numba_is_there():
         return "CPU without kernels"
     from . import compile as compilation
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..data import dataset as datasets
-from ..raster import RasterSettings, scene_render, splatting
+from ..raster import RasterSettings, backends, scene_render
 from ..scene import playback
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
@@ -61,7 +61,7 @@ def measure(
     else:
         truths = []
         absent.append("raster: PSNR against true images needs a data set")
-    used = splatting.choose_backend(backend, scene_render.tensor(scene.means))
+    used = backends.choose_backend(backend, scene_render.tensor(scene.means))
     base = RasterSettings(near_plane=scene.near_plane)
 
     def draw(changes: dict[str, float]) -> list[np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..motion.models import MotionModel
 from .cameras import Camera
-from .meanings import Table
+from .lookup_table import Table
 
 ROLES = ("pinned", "body", "shadow")
 IDENTITY_DIM = 16  # numbers of an identity encoding (Gaussian Grouping)

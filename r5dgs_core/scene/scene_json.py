@@ -13,7 +13,7 @@ import numpy as np
 from .. import __version__, errors, findings, strict_json
 from ..motion.models import MotionModel
 from .cameras import Camera
-from .meanings import POOLINGS, EncoderCard, Table, View
+from .lookup_table import POOLINGS, EncoderCard, Table, View
 from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import errors, findings
 from . import array_shapes, cameras
-from .meanings import Table
+from .lookup_table import Table
 from .playback import runs
 from .scene import DTYPES, EMBEDDINGS, ROLES, MotionGroup, Scene
 

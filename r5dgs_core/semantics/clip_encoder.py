@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .. import errors
-from ..scene.meanings import EncoderCard
+from ..scene.lookup_table import EncoderCard
 from . import encoders
 
 TEMPLATES = ("{}", "a photo of a {}", "a render of a {}")

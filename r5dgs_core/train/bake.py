@@ -24,7 +24,7 @@ from ..errors import CheckpointError, DatasetError
 from ..model import spherical_harmonics
 from ..motion import rotations
 from ..motion.models import MotionModel
-from ..scene import residuals, visibility
+from ..scene import residuals, scene_file, visibility
 from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 from . import (
     checkpoint,
@@ -37,6 +37,7 @@ from . import (
     point_baking,
     probing,
     representation,
+    representation_registry,
     simplify_motion,
     track_checks,
     views,
@@ -275,8 +276,8 @@ def _observed(
     if "labels" in tensors:
         labels = tensors["labels"].numpy()
     else:  # an unfinished run has none yet
-        labels = representation.group_classes(state.representation, tensors)[g["motion_ids"]]
-    motion = representation.observed_motion(
+        labels = representation_registry.group_classes(state.representation, tensors)[g["motion_ids"]]
+    motion = representation_registry.observed_motion(
         state.representation, tensors, present, state.observed.numpy(), labels, run.config
     )
     g |= motion.gaussians or {}
@@ -466,8 +467,6 @@ def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, override
     Raises:
         CheckpointError, ConfigError, DatasetError, SceneFileError: As their messages say.
     """
-    from ..scene import scene_file
-
     run = checkpoint.open_run(folder)
     configs.require_needs(overrides)
     run = dataclasses.replace(run, config=run.config.override(overrides))

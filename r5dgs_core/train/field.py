@@ -34,7 +34,6 @@ from . import field_baking, field_fitting, gating, posing, rigidity, shading
 from .config import Config
 from .field_motion import Clock, Motion
 from .groups import ObservedMotion
-from .tracks_representation import TracksRepresentation
 
 log = logging.getLogger(__name__)
 
@@ -301,23 +300,24 @@ def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
 
 
 def from_tracks(
-    source: TracksRepresentation, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
+    tracks: Tracks, light: Tensor, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
 ) -> FieldRepresentation:
     """A field that goes on from tracks: fitted to their motion, with the Gaussians brought to one time.
 
     Args:
-        source: The trained tracks.
+        tracks: The trained tracks.
+        light: The trained light of the shading. [3]
         gaussians: Changed in place: each body from its own canonical state to where it is at ``first``.
         first: Knot at which the field's Gaussians are canonical.
         config: The run's configuration.
         draw: Source of the draws.
     """
-    made = FieldRepresentation(source.tracks, first, config)
+    made = FieldRepresentation(tracks, first, config)
     with torch.no_grad():
-        made.light.copy_(source.light)
-    bring_together(gaussians, source.tracks, first, source.light.detach())
-    gating.release(gaussians, source.tracks, config)
-    made.fit(gaussians, source.tracks, config.field.distill_steps, config.field.distill_steps, draw)
+        made.light.copy_(light)
+    bring_together(gaussians, tracks, first, light.detach())
+    gating.release(gaussians, tracks, config)
+    made.fit(gaussians, tracks, config.field.distill_steps, config.field.distill_steps, draw)
     return made
 
 

@@ -2,12 +2,11 @@
 
 The trainer knows only `Representation`: splats at a time, what to optimise, a penalty, upkeep, and named tensors for
 the checkpoint. `tracks` moves Gaussians by one SE(3) track per object, `field` by a deformation field, `still` not at
-all. A module is imported when a run or a checkpoint asks for it.
+all. `representation_registry` makes them by name.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Protocol
 
@@ -15,19 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import CheckpointError
 from ..model.gaussians import Gaussians
 from ..scene.cameras import Camera
-from . import initialization, posing
+from . import posing
 from .config import Config
 from .groups import ObservedMotion
 
 TRACKS, FIELD, STILL = "tracks", "field", "still"
-_CLASSES = {
-    TRACKS: ("tracks_representation", "TracksRepresentation"),
-    FIELD: ("field", "FieldRepresentation"),
-    STILL: ("stillness", "StillRepresentation"),
-}
 
 
 class Representation(Protocol):
@@ -106,60 +99,3 @@ class Representation(Protocol):
             config: The run's configuration.
         """
         ...
-
-
-def make(start: initialization.Start, config: Config, still: bool = False) -> Representation:
-    """The representation that training starts with: the one asked for, or the tracks that a field starts from.
-
-    Args:
-        start: What training starts from.
-        config: The run's configuration.
-        still: Whether nothing moves.
-    """
-    if still:
-        from .stillness import StillRepresentation
-
-        return StillRepresentation(start)
-    if config.train.representation == TRACKS or config.field.tracks_share > 0:
-        from .tracks_representation import TracksRepresentation
-
-        return TracksRepresentation(start, config)
-    from . import field
-    from .tracks_representation import first_tracks
-
-    tracks = first_tracks(start.tracks)
-    field.bring_together(start.gaussians, tracks, start.first_time)
-    return field.FieldRepresentation(tracks, start.first_time, config)
-
-
-def observed_motion(
-    name: str,
-    tensors: dict[str, Tensor],
-    object_ids: np.ndarray,
-    observed: np.ndarray,
-    labels: np.ndarray,
-    config: Config,
-) -> ObservedMotion:
-    """`Representation.observed_motion` of the representation ``name``.
-
-    Raises:
-        CheckpointError: This version has no such representation.
-    """
-    return _known(name).observed_motion(tensors, object_ids, observed, labels, config)
-
-
-def group_classes(name: str, tensors: dict[str, Tensor]) -> np.ndarray:
-    """`Representation.group_classes` of the representation ``name``. [G]
-
-    Raises:
-        CheckpointError: This version has no such representation.
-    """
-    return _known(name).group_classes(tensors)
-
-
-def _known(name: str) -> type[Representation]:
-    if name not in _CLASSES:
-        known = ", ".join(_CLASSES)
-        raise CheckpointError(f"the checkpoint was trained with representation '{name}'; this version knows {known}")
-    module, made = _CLASSES[name]
-    return getattr(importlib.import_module(f".{module}", __package__), made)

@@ -1,26 +1,13 @@
-"""Bodies that are not rigid, found by trying: residuals are given to all bodies for a while and kept where they help.
-
-Once every time takes part and the tracks have settled, the run goes on for some steps with a residual field on all
-bodies. Then each body's residuals are left out in turn: views that these steps did not use say by how much the error
-on the body grows. After that the run goes back to where it was, and bodies that lost more than a threshold keep
-their residuals. Those that did not are left without a trace: where none is flexible, the run goes on to the same bits
-as one that never tried.
-"""
+"""Residuals of flexible bodies: their tensors in a checkpoint, lighting, baking, and their row of the needs table."""
 
 from __future__ import annotations
 
-import dataclasses
-import logging
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
-from ..errors import TrainingError
-from ..model import residual_field
 from ..model.residual_field import Change, ResidualField
 from ..model.tracks import Tracks
 from ..motion import rotations
@@ -29,133 +16,8 @@ from . import shading as shading_vectors
 from .config import Config
 from .groups import PointMotion
 
-if TYPE_CHECKING:
-    from .trainer import Trainer
-
-log = logging.getLogger(__name__)
-
-MARGIN = 2  # pixels around a mask that count to its object: what bends crosses its edge
-HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
-MIN_PIXELS = 50  # on these together, below which nothing is said of a body
-TRIAL = "trial"  # name of its events
-SEED_STEP = 2  # the trial draws from a generator of its own
 PREFIX = "residual."
 GAINS = checkpoint_content.RESIDUAL_GAINS
-
-
-def decision_step(config: Config, all_entered: int) -> int | None:
-    """Step after which bodies are tried, None for never.
-
-    Args:
-        config: The run's configuration.
-        all_entered: Step at which the last observed time joins the training.
-    """
-    wanted = config.needs
-    if config.train.representation != "tracks" or wanted.residuals == "off" or wanted.tracks == "off":
-        return None
-    step = max(int(config.residual.start * config.train.iterations), all_entered, 1)
-    return step if step < config.train.iterations else None
-
-
-def decide(trainer: Trainer) -> None:
-    """Try residuals on all bodies, and go on from where the run was with those that help.
-
-    With one observed time nothing can bend, so that nothing is tried.
-    """
-    if len(trainer.times) < 2:
-        return
-    before = trainer.state()
-    field, gains = _try(trainer)
-    kept = flexible(gains, field, trainer.config)
-    added = {GAINS: torch.from_numpy(gains)}
-    if kept:
-        added |= tensors_of(field.only(kept))
-    trainer.restore(dataclasses.replace(before, tensors=before.tensors | added))
-    found = ", ".join(f"{i} {gain:+.2f} dB" for i, gain in zip(trainer.object_ids[1:], gains, strict=True))
-    log.info("residuals: gains by object %s; kept for %d", found or "none", len(kept))
-
-
-def flexible(gains: np.ndarray, field: ResidualField, config: Config) -> list[int]:
-    """Bodies that keep their residuals: those that gain more than the threshold, or all where you say so."""
-    if config.needs.residuals == "on":
-        return field.bodies
-    return [body for body in field.bodies if gains[body - 1] > config.residual.threshold]
-
-
-def trial_steps(config: Config) -> int:
-    """Length of the trial; shorter in runs that are too short for it, as the curriculum."""
-    return max(1, int(config.residual.trial_steps * min(1.0, config.train.iterations / 2000)))
-
-
-def _try(trainer: Trainer) -> tuple[ResidualField, np.ndarray]:
-    """The field after the trial, and what each body gains by it, dB, nan where that cannot be said. [B - 1]"""
-    config, g, ids = trainer.config, trainer.gaussians, trainer.object_ids[1:]
-    opacities = torch.sigmoid(g.params["opacity_logits"].detach())
-    bodies = list(range(1, len(ids) + 1))
-    field = residual_field.spread(
-        g.params["means"].detach(), g.motion_ids, opacities, bodies, config.residual.nodes, len(trainer.times)
-    )
-    unknown = np.full(len(ids), np.nan)
-    draws = torch.Generator().manual_seed(config.train.seed + SEED_STEP)
-    order = torch.randperm(len(trainer.views), generator=draws).tolist()
-    held, used = split([i for i in order if _shows(trainer.views[i].mask, ids)])
-    if not field.bodies or not held:
-        return field, unknown
-    state = trainer.state()
-    trainer.restore(dataclasses.replace(state, tensors=state.tensors | tensors_of(field)))
-    steps = trial_steps(config)
-    trainer.queue = [used[k % len(used)] for k in range(steps)]
-    try:
-        for step in range(1, steps + 1):
-            trainer.step()
-            if step % config.train.log_every == 0 or step == steps:
-                trainer.progress({"event": TRIAL, "done": step, "total": steps, "unit": "steps"})
-    except TrainingError as error:
-        log.warning("residuals cannot be tried, all bodies stay rigid: %s", error)
-        return field, unknown
-    learned = residual_of(trainer.state().tensors)
-    assert learned is not None
-    return learned, _gains(trainer, learned, held)
-
-
-def _shows(mask: np.ndarray | None, ids: np.ndarray) -> bool:
-    return mask is not None and bool(np.isin(mask, ids).any())
-
-
-def split(order: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Views for the comparison and views for the trial, out of shuffled ones; none held where there are too few."""
-    count = min(MAX_HELD, int(HELD_SHARE * len(order)))
-    return list(order[:count]), list(order[count:])
-
-
-@torch.no_grad()
-def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.ndarray:
-    """By how much the error on each body grows when it alone is without residuals, dB. [B - 1]"""
-    ids = trainer.object_ids[1:]
-    errors, pixels = np.zeros((2, len(ids))), np.zeros(len(ids))
-    for index in held:
-        view = trainer.views[index]
-        assert view.mask is not None
-        truth = torch.from_numpy(view.image).float() / 255
-        whole = _squares(trainer, field, index, truth)
-        for body in field.bodies:
-            region = view.mask == ids[body - 1]
-            if not region.any():
-                continue
-            region = np.asarray(ndimage.binary_dilation(region, iterations=MARGIN), bool)
-            others = field.only([b for b in field.bodies if b != body])
-            pixels[body - 1] += region.sum()
-            errors[0, body - 1] += whole[region].sum()
-            errors[1, body - 1] += _squares(trainer, others, index, truth)[region].sum()
-    gains = 10 * np.log10(np.maximum(errors[1], 1e-12) / np.maximum(errors[0], 1e-12))
-    return np.where(pixels >= MIN_PIXELS, gains, np.nan)
-
-
-def _squares(trainer: Trainer, field: ResidualField, index: int, truth: Tensor) -> np.ndarray:
-    """Squared error of each pixel with a field in place of the trial's. [H, W] float64"""
-    view = trainer.views[index]
-    trainer.motion.residuals = field  # type: ignore[reportAttributeAccessIssue]: `tracks` alone is tried
-    return ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)
 
 
 def tensors_of(field: ResidualField) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ import torch
 from .. import folder_lock
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
-from ..raster import warm_up
+from ..raster import warming
 from ..scene import files
 from ..time_left import Phase, Timed
 from . import (
@@ -31,6 +31,7 @@ from . import (
     needs,
     probing,
     representation,
+    representation_registry,
     stopping,
 )
 from .config import Config
@@ -139,10 +140,10 @@ def _train(
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
     with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
-        warm_up()
+        warming.warm_up()
         found = _found_masks(dataset, run.config, state, progress)
         progress({"event": "prepare", "text": "images, objects, background"})
-        trainer = Trainer(dataset, run.config, found, progress)
+        trainer = Trainer(dataset, run.config, found)
         probe = _probe(trainer)
     if replaces:
         run = checkpoint.create_run(folder, dataset, config)
@@ -182,13 +183,31 @@ def _plan(trainer: Trainer, progress: Timed) -> None:
     estimate.finish("discovery")  # `discovery.NAME`, without its networks
     estimate.add(Phase("step", config.train.iterations))
     estimate.at("step", trainer.iteration)
-    if trainer.motion.name == representation.TRACKS and len(trainer.times) > 1:
-        from . import residual  # scenes at rest do without it
+    decision = decision_step(trainer)
+    if decision is not None and decision > trainer.iteration:
+        from . import residual_trial
 
-        decision = residual.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
-        if decision is not None and decision > trainer.iteration:
-            estimate.add(Phase(residual.TRIAL, residual.trial_steps(config), TRIAL_COST))
+        estimate.add(Phase(residual_trial.TRIAL, residual_trial.trial_steps(config), TRIAL_COST))
     estimate.add(Phase("identity", _identity_steps(trainer)))
+
+
+def decision_step(trainer: Trainer) -> int | None:
+    """Step after which residuals are tried, or None for never: with one observed time nothing can bend."""
+    if trainer.motion.name != representation.TRACKS or len(trainer.times) < 2:
+        return None
+    from . import residual_trial  # which scenes at rest do not load
+
+    config = trainer.config
+    return residual_trial.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
+
+
+def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> None:
+    """Take a step, and try residuals after the step ``decision`` (see `decision_step`)."""
+    trainer.step()
+    if trainer.iteration == decision:
+        from . import residual_trial
+
+        residual_trial.decide(trainer, progress)
 
 
 def _probe(trainer: Trainer) -> probing.Probe | None:
@@ -211,9 +230,10 @@ def _optimise(
     """Take all steps that are left, with a line in the log and a checkpoint now and then."""
     section = trainer.config.train
     path = run.folder / checkpoint.LOG_FILE
+    decision = decision_step(trainer)
     with stopping.collected() as asked, _open_log(path) as stream:
         while not trainer.done:
-            trainer.step()
+            take_step(trainer, decision, progress)
             look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
             if trainer.iteration % section.log_every == 0 or trainer.done or look:
                 event = {
@@ -348,7 +368,7 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     given, ids = labels.numpy(), trainer.gaussians.motion_ids
     params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
     tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
-    motion = representation.observed_motion(
+    motion = representation_registry.observed_motion(
         trainer.motion.name,
         tensors | {"gaussians.motion_ids": ids},
         trainer.object_ids,

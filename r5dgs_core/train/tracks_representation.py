@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..model import spherical_harmonics
+from ..model import spherical_harmonics, track_state
 from ..model.gaussians import Gaussians
 from ..model.residual_field import ResidualField
 from ..model.tracks import Tracks
@@ -154,11 +153,7 @@ class TracksRepresentation:
 
     def tensors(self) -> dict[str, Tensor]:
         """Tracks by ``tracks.NAME`` and the light direction."""
-        tracks = self.tracks
-        named: dict[str, Any] = {f"tracks.{n}": p.detach() for n, p in tracks.params.items()}
-        named["tracks.times"] = torch.from_numpy(tracks.times)
-        for name in ("centers", "base_quats", "casters", "plane_normal"):
-            named[f"tracks.{name}"] = getattr(tracks, name)
+        named = track_state.tensors_of(self.tracks)
         named["tracks.entered"] = torch.tensor(self._entered)
         named["light"] = self.light.detach()
         if self._gains is not None:
@@ -167,7 +162,7 @@ class TracksRepresentation:
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `tensors`."""
-        self.tracks = tracks_of(tensors)
+        self.tracks = track_state.tracks_of(tensors)
         first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
         self._entered = (first, last)
         self.light = tensors["light"].clone().requires_grad_(True)
@@ -185,7 +180,7 @@ class TracksRepresentation:
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
         """See `Representation.observed_motion`: the pinned group, one body per object, then the shadows."""
-        tracks = tracks_of(tensors)
+        tracks = track_state.tracks_of(tensors)
         quats = tracks.knot_quats().detach().numpy().astype(np.float64)
         displacements = tracks.params["translations"].detach().numpy().astype(np.float64)
         centers = tracks.centers.numpy().astype(np.float64)
@@ -237,19 +232,4 @@ def first_tracks(first: initialization.FirstTracks) -> Tracks:
     )
     with torch.no_grad():
         tracks.params["slope"].copy_(torch.from_numpy(first.slope))
-    return tracks
-
-
-def tracks_of(tensors: dict[str, Tensor]) -> Tracks:
-    """The tracks in a checkpoint's named tensors."""
-    tracks = Tracks(
-        tensors["tracks.times"].numpy(),
-        tensors["tracks.centers"],
-        tensors["tracks.translations"].clone(),
-        tensors["tracks.base_quats"].clone(),
-        tensors["tracks.casters"],
-        tensors["tracks.plane_normal"],
-    )
-    for name in ("rotvecs", "slope"):
-        tracks.params[name] = tensors[f"tracks.{name}"].clone().requires_grad_(True)
     return tracks

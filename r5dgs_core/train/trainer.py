@@ -10,8 +10,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -34,6 +33,7 @@ from . import (
     normalization,
     posing,
     representation,
+    representation_registry,
     sky,
     stillness,
     strategies,
@@ -60,7 +60,6 @@ class Trainer:
         dataset: The data set.
         config: The run's configuration.
         found: Masks that were found for the training views where the data set has none; they serve the start alone.
-        progress: Called with an event while a step takes long, as the one that tries residuals.
 
     Raises:
         DatasetError: The training split is empty or cannot be read.
@@ -71,9 +70,7 @@ class Trainer:
         dataset: Dataset,
         config: Config,
         found: Sequence[np.ndarray] | None = None,
-        progress: Callable[[dict[str, Any]], None] = lambda event: None,
     ):
-        self.progress = progress
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
         self.config = config = needs.resolve(config)
@@ -101,7 +98,7 @@ class Trainer:
         if most:
             start = dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng))
         self.gaussians: Gaussians = start.gaussians
-        self.motion = representation.make(start, config, still)
+        self.motion = representation_registry.make(start, config, still)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
@@ -262,11 +259,9 @@ class Trainer:
         if self.config.train.representation != representation.FIELD or self.motion.name != representation.TRACKS:
             return
         if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
-            from . import field
-            from .tracks_representation import TracksRepresentation
-
-            assert isinstance(self.motion, TracksRepresentation)
-            self.motion = field.from_tracks(self.motion, self.gaussians, self.first_time, self.config, self.generator)
+            self.motion = representation_registry.leave_tracks(
+                self.motion, self.gaussians, self.first_time, self.config, self.generator
+            )
             self.optimizer = self._make_optimizer()
 
     def _target(self, index: int) -> Tensor:
@@ -354,11 +349,6 @@ class Trainer:
                 f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
                 "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
             )
-        if self.motion.name == representation.TRACKS:
-            from . import residual
-
-            if self.iteration == residual.decision_step(self.config, self._curriculum()[1]):
-                residual.decide(self)
 
     def _check_finite(self, value: float, view: str) -> None:
         """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
@@ -408,18 +398,7 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        asked = self.config.train.representation == representation.FIELD
-        if asked and state.representation == representation.FIELD and self.motion.name == representation.TRACKS:
-            from . import field
-            from .tracks_representation import TracksRepresentation
-
-            assert isinstance(self.motion, TracksRepresentation)
-            self.motion = field.FieldRepresentation(self.motion.tracks, self.first_time, self.config)
-        if state.representation != self.motion.name:
-            raise CheckpointError(
-                f"the checkpoint was trained with representation '{state.representation}', "
-                f"the configuration asks for '{self.motion.name}'"
-            )
+        self.motion = representation_registry.for_state(self.motion, state.representation, self.first_time, self.config)
         tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training changes them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])

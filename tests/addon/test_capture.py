@@ -29,7 +29,8 @@ STILL = {"frame_end": 1, "objects": "SELECTED"}  # a single time; the moving bal
 @pytest.fixture(scope="module")
 def service(extension):
     """The capture services of the add-on, as attributes of one object."""
-    names = ("capture", "capture_files", "capture_objects", "capture_overrides", "capture_render", "capture_views")
+    parts = ("files", "objects", "overrides", "render", "settings", "views")
+    names = ("capture", *(f"capture_{part}" for part in parts))
     modules = {name: importlib.import_module(f"r5dgs.r5dgs_addon.{name}") for name in names}
     return type("Service", (), modules)
 
@@ -86,7 +87,7 @@ def add_camera(bpy, name, azimuth_deg, distance=5.0, height=3.0):
 def settings_for(service, directory, **changes):
     """Small and fast settings: frames 1, 5, 9 are t = 0, 0.5, 1."""
     values = {**SMALL, "directory": directory, "frame_step": 4, "t_max": 0.5, "objects": "ANIMATED", **changes}
-    return service.capture.CaptureSettings(**values)
+    return service.capture_settings.CaptureSettings(**values)
 
 
 def capture(service, bpy, directory, **changes):
@@ -130,7 +131,7 @@ def test_the_splits_divide_time_at_t_max(extension, start, length, step, t_max, 
 
 
 def test_val_also_asks_for_times_between_the_observed_ones(service):
-    settings = service.capture.CaptureSettings(directory="x", frame_step=4, t_max=0.75, val_every=4)
+    settings = service.capture_settings.CaptureSettings(directory="x", frame_step=4, t_max=0.75, val_every=4)
     plan = service.capture.plan_times(settings, 1, 61)
     assert len(plan.observed) == 12
     assert plan.val == (5.0, 15.0, 21.0, 31.0, 37.0)
@@ -579,7 +580,7 @@ def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, 
 
 def test_the_operator_has_the_defaults_of_the_settings(service, blender):
     properties = blender.ops.r5dgs.capture_dataset.get_rna_type().properties
-    for field in dataclasses.fields(service.capture.CaptureSettings):
+    for field in dataclasses.fields(service.capture_settings.CaptureSettings):
         default = getattr(properties[field.name], "default", None)
         if field.name not in ("directory", "frame_start", "frame_end"):
             assert default == pytest.approx(field.default), field.name

@@ -8,11 +8,12 @@ import torch
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError
+from r5dgs_core.model import track_state
 from r5dgs_core.motion import rotations
 from r5dgs_core.raster import scene_render
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import playback, scene_file, validation
-from r5dgs_core.train import bake, checkpoint, normalization, run, tracks_representation
+from r5dgs_core.train import bake, checkpoint, normalization, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -78,7 +79,7 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
 def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
     scene = bake.bake(tiny_datasets.as_trained(trained))
     state = checkpoint.load(trained.folder)
-    tracks = tracks_representation.tracks_of(state.tensors)
+    tracks = track_state.tracks_of(state.tensors)
     norm = normalization.Normalization(np.array(state.origin), state.scale)
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates

@@ -44,6 +44,7 @@ def blocked(tmp_path: Path) -> Path:
 
 def run_toy(tmp_path, script=TOY, **environment):
     (tmp_path / "toy.py").write_text(script)
+    os.utime(tmp_path / "toy.py", (0, 0))
     kept = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "TMPDIR")}
     root = str(Path(__file__).resolve().parents[2])
     return subprocess.run(
@@ -165,20 +166,28 @@ def imported_from_the_core(path, tree):
                 yield inside if inside.exists() else folder.with_suffix(".py")
 
 
-def test_the_cache_is_apart_for_each_state_of_all_that_kernels_are_made_of():
-    sources = set(compilation.sources())
+def test_kernels_are_made_of_their_own_file_and_the_shared_sources_alone():
+    shared = set(compilation.shared_sources())
     found = dict(modules_with_kernels())
     assert len(found) > 8 and CORE / "train" / "losses.py" in found
-    assert set(found) <= sources
     for path, tree in found.items():
-        feeding = set(imported_from_the_core(path, tree))
-        assert feeding <= sources, f"{path.name} imports {feeding - sources}, which compile._SOURCES lacks"
-    assert CORE / "model" / "spherical_harmonics.py" in sources
+        strange = set(imported_from_the_core(path, tree)) - shared
+        assert not strange, f"{path.name} imports {strange}, which compile._SHARED lacks"
+    # The constants that `model.spherical_harmonics` hands on.
+    assert CORE / "scene" / "harmonics.py" in shared
+
+
+def test_a_kernel_is_compiled_again_for_another_state_of_its_own_file(tmp_path):
+    """Also if time and size of the file, at which numba looks, are the same."""
+    printed = []
+    for script in (TOY, TOY.replace("return 2 * x", "return 5 * x"), TOY):
+        printed.append(run_toy(tmp_path, script, NUMBA_CACHE_DIR=tmp_path / "cache").stdout.split())
+    assert printed == [["42", "0", "1"], ["105", "0", "1"], ["42", "1", "0"]]
 
 
 def test_another_state_of_a_source_has_another_folder(tmp_path, monkeypatch):
     source = tmp_path / "constants.py"
-    monkeypatch.setattr(compilation, "sources", lambda: [source])
+    monkeypatch.setattr(compilation, "shared_sources", lambda: [source])
     folders = []
     for text in ("C0 = 1", "C0 = 2", "C0 = 1"):
         source.write_text(text)

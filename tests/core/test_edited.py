@@ -8,7 +8,7 @@ import pytest
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import edited, playback, posing, scene_file, validation
 from r5dgs_core.scene.edited import Piece
-from r5dgs_core.scene.meanings import EncoderCard, Table, View
+from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from tests.scenes import make_scene
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))

@@ -9,8 +9,16 @@ import pytest
 from r5dgs_core import cli, commands_words, errors
 from r5dgs_core.exit_status import ExitStatus
 from r5dgs_core.scene import cameras, lookup, meanings, scene_file
-from r5dgs_core.scene.meanings import EncoderCard
-from r5dgs_core.semantics import best_views, calibration, common_nouns, encoders, lookup_table, query
+from r5dgs_core.scene.lookup_table import EncoderCard
+from r5dgs_core.semantics import (
+    best_views,
+    calibration,
+    common_nouns,
+    encoder_registry,
+    encoders,
+    lookup_table,
+    query,
+)
 from tests import encoder_folders
 from tests.scenes import make_scene
 
@@ -259,7 +267,7 @@ def test_tiny_encoders_go_all_the_way(kind, seen, tmp_path):
     commands_words.run_lookup(path, str(folder))
     stored = scene_file.read(path)
     assert stored.lookup.encoder.name == kind
-    encoder = encoders.open_encoder(folder)
+    encoder = encoder_registry.open_encoder(folder)
     assert [m.object_id for m in query.find(stored, "mug", encoder)] == [1]
     fresh = encoders.embed_phrases(encoder, ["teapot"])[0]
     row = lookup.vocabulary_row(stored.vocabulary, ["teapot"])
@@ -278,7 +286,7 @@ def test_another_encoder_is_refused_with_the_remedy(seen):
 
 
 def by_name(where):
-    """In place of `encoders.open_encoder`: a folder's name decides the digest."""
+    """In place of `encoder_registry.open_encoder`: a folder's name decides the digest."""
     return Plain(digest=str(where).ljust(64, "0"))
 
 
@@ -288,7 +296,7 @@ def content(tmp_path_factory):
     path = tmp_path_factory.mktemp("words") / "named.r5dgs"
     before = scene_file.read(scene_file.write(named("lemon", "apple", "donut", "hammer"), path, exact=True))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(encoders, "open_encoder", by_name)
+        patch.setattr(encoder_registry, "open_encoder", by_name)
         commands_words.run_lookup(path, "plain")
     after = scene_file.read(path)
     for field in ("means", "quats", "log_scales", "opacity_logits", "sh", "track_poses"):
@@ -299,7 +307,7 @@ def content(tmp_path_factory):
 @pytest.fixture
 def file(content, tmp_path, monkeypatch):
     """That file, and its encoder behind its name."""
-    monkeypatch.setattr(encoders, "open_encoder", by_name)
+    monkeypatch.setattr(encoder_registry, "open_encoder", by_name)
     path = tmp_path / "named.r5dgs"
     path.write_bytes(content)
     return path
@@ -397,7 +405,7 @@ def test_captions_come_from_a_file(file, tmp_path, capsys):
 
 @pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
 def test_a_real_sentence_model_finds_by_meaning_and_says_nothing_matches():
-    encoder = encoders.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
+    encoder = encoder_registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
     made = lookup_table.make(named("mug", "lemon", "apple", "donut", "cutting board", "bowl"), encoder).scene
     found = {text: {m.object_id for m in lookup.search(made, text)} for text in ("fruit", "pastry", "cup", "elephant")}
     assert found == {"fruit": {2, 3}, "pastry": {4}, "cup": {1}, "elephant": set()}

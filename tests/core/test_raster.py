@@ -23,7 +23,7 @@ from r5dgs_core.raster import (
     rasterize,
     rasterize_splats,
     splatting,
-    warm_up,
+    warming,
 )
 from r5dgs_core.raster import compile as compilation
 from r5dgs_core.scene import cameras
@@ -240,7 +240,7 @@ def test_two_python_threads_may_draw_at_once():
 
 
 def test_every_kernel_is_compiled_once_for_all_inputs():
-    warm_up()
+    warming.warm_up()
     for n_channels, background, labels in ((1, None, None), (3, torch.rand(3), torch.arange(50)), (19, None, None)):
         draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
     kernels = [

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from r5dgs_core import errors
-from r5dgs_core.raster import RasterSettings, RasterStats, SplatImage, cuda, rasterize_splats, splatting
+from r5dgs_core.raster import RasterSettings, RasterStats, SplatImage, backends, cuda, rasterize_splats
 from tests import gsplat_stand_in, splats
 from tests.gsplat_stand_in import OLD_STAND_IN, STAND_IN
 from tests.splats import camera, relative
@@ -316,7 +316,7 @@ ON_GPU = SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)
 
 def refusal(means=ON_GPU):
     with pytest.raises(errors.BackendError) as caught:
-        splatting.choose_backend("cuda", means)
+        backends.choose_backend("cuda", means)
     return str(caught.value)
 
 
@@ -362,7 +362,7 @@ def test_a_gsplat_that_does_not_load_is_told(cuda_machine, monkeypatch, tmp_path
 
 def test_gsplat_is_loaded_once_and_leaves_stdout_alone(cuda_machine, monkeypatch, tmp_path, capsys):
     install(tmp_path, monkeypatch, backend="print('building')\n_C = object()")
-    assert splatting.choose_backend("cuda", ON_GPU) == splatting.choose_backend("auto", ON_GPU) == "cuda"
+    assert backends.choose_backend("cuda", ON_GPU) == backends.choose_backend("auto", ON_GPU) == "cuda"
     assert capsys.readouterr() == ("", "building\n")
 
 
@@ -378,9 +378,9 @@ def test_thresholds_are_those_of_the_gsplat_that_is_there(cuda_machine, monkeypa
 
 def test_auto_takes_the_reference_on_a_gpu_without_gsplat_and_says_so_once(cuda_machine, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    splatting._warn_once.cache_clear()
+    backends._warn_once.cache_clear()
     with caplog.at_level(logging.WARNING):
-        assert [splatting.choose_backend("auto", ON_GPU) for _ in range(2)] == ["reference", "reference"]
+        assert [backends.choose_backend("auto", ON_GPU) for _ in range(2)] == ["reference", "reference"]
     assert caplog.text.count("pip install 'r5dgs[cuda]'") == 1
 
 

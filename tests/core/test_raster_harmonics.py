@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from r5dgs_core.model import spherical_harmonics
+from r5dgs_core.raster import backends, harmonics, rasterize, splatting
 from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster import harmonics, rasterize, splatting
 from r5dgs_core.scene.cameras import Camera
 from tests import scenes, splats
 
@@ -248,7 +248,7 @@ def test_the_sky_is_the_harmonics_along_each_ray(count, monkeypatch):
         assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.float32
         assert count == 1 or ((image == 0).any() and (image == 1).any())
         with monkeypatch.context() as without_numba:
-            without_numba.setattr(splatting, "numba_is_there", lambda: False)
+            without_numba.setattr(backends, "numba_is_there", lambda: False)
             np.testing.assert_allclose(image, harmonics.sky(sh, camera), atol=1e-6)
 
 
@@ -259,5 +259,5 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
     posed = scene_render.pose_frame(scene, playback.frame(scene, 1.1))
     fused = scene_render.colors(posed, camera)
-    monkeypatch.setattr(splatting, "numba_is_there", lambda: False)
+    monkeypatch.setattr(backends, "numba_is_there", lambda: False)
     np.testing.assert_allclose(scene_render.colors(posed, camera), fused, atol=2e-6)

@@ -13,7 +13,7 @@ from r5dgs_core.model import residual_field
 from r5dgs_core.motion import rotations
 from r5dgs_core.raster import scene_render
 from r5dgs_core.scene import playback
-from r5dgs_core.train import bake, checkpoint, config, residual, run
+from r5dgs_core.train import bake, checkpoint, config, residual, residual_trial, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -171,20 +171,23 @@ def test_bodies_that_gain_more_than_the_threshold_keep_residuals():
     means, _, weights, ids = random_state()
     field = field_on(means, ids, weights)
     settings = config.load(None, ["residual.threshold=0.5"])
-    assert residual.flexible(np.array([0.4, 0.6]), field, settings) == [2]
-    assert residual.flexible(np.array([np.nan, -1.0]), field, settings) == []
-    assert residual.flexible(np.array([np.nan, -1.0]), field, settings.replace(**{"needs.residuals": "on"})) == [1, 2]
+    assert residual_trial.flexible(np.array([0.4, 0.6]), field, settings) == [2]
+    assert residual_trial.flexible(np.array([np.nan, -1.0]), field, settings) == []
+    assert residual_trial.flexible(np.array([np.nan, -1.0]), field, settings.replace(**{"needs.residuals": "on"})) == [
+        1,
+        2,
+    ]
 
 
 @pytest.mark.parametrize("override", ["needs.residuals=off", "needs.tracks=off", "train.representation=field"])
 def test_nothing_is_tried_where_it_is_not_wanted(override):
-    assert residual.decision_step(config.load(None, [override]), 600) is None
+    assert residual_trial.decision_step(config.load(None, [override]), 600) is None
 
 
 def test_bodies_are_tried_once_all_times_take_part():
     settings = config.load(None, ["train.iterations=1000"])
-    assert residual.decision_step(settings, 300) == 400 and residual.decision_step(settings, 500) == 500
-    assert residual.decision_step(settings, 1000) is None
+    assert residual_trial.decision_step(settings, 300) == 400 and residual_trial.decision_step(settings, 500) == 500
+    assert residual_trial.decision_step(settings, 1000) is None
 
 
 def test_values_that_no_run_can_use_are_refused():
@@ -197,8 +200,9 @@ def make(data, *overrides):
 
 
 def advance(trainer, iteration):
+    decision = run.decision_step(trainer)
     while trainer.iteration < iteration:
-        trainer.step()
+        run.take_step(trainer, decision, lambda event: None)
     return trainer
 
 
@@ -226,7 +230,7 @@ def test_a_trial_that_fails_leaves_the_run_alone(tiny, monkeypatch):
         return step(self)
 
     monkeypatch.setattr(type(trainer), "step", failing)
-    step(trainer)
+    advance(trainer, 24)
     assert trainer.iteration == 24 and trainer.motion.residuals is None
     assert trainer.state().tensors["residual.gains"].isnan().all()
 

@@ -15,7 +15,7 @@ from r5dgs_core import errors, serve
 from r5dgs_core.raster import compile as compilation
 from r5dgs_core.raster import scene_render, stage, warming
 from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.semantics import encoders, lookup_table
+from r5dgs_core.semantics import encoder_registry, encoders, lookup_table
 from tests import encoder_folders, scenes
 from tests.core.test_scene_render import matrix
 
@@ -284,7 +284,7 @@ def test_words_find_objects(path):
 
 def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
     folder = encoder_folders.sentences(tmp_path / "tiny")
-    encoder = encoders.open_encoder(folder)
+    encoder = encoder_registry.open_encoder(folder)
     made = lookup_table.make(scenes.make_scene(n=120, objects=2), encoder).scene
     file = scene_file.write(made, tmp_path / "words.r5dgs")
     ask = {"encoder": str(folder)}

@@ -16,7 +16,10 @@ from r5dgs_core.scene import playback, scene_file
 from r5dgs_core.train import config, normalization, stillness, views
 from tests import datasets as tiny_datasets
 
-MOVING_PARTS = ("deformation", "trd", "encoding", "tracks", "tracks_representation", "residual", "residual_field")
+MOVING_PARTS = (
+    *("deformation", "trd", "encoding", "tracks", "track_state", "tracks_representation"),
+    *("residual", "residual_trial", "residual_field"),
+)
 RUN = """
 import json, sys
 from pathlib import Path

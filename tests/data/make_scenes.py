@@ -15,7 +15,7 @@ import numpy as np
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import scene_file
-from r5dgs_core.scene.meanings import EncoderCard, Table, View
+from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, TIMES, make_scene
 

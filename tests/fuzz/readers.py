@@ -22,7 +22,7 @@ from r5dgs_core.data import colmap, dataset, images, mask_notes, masks
 from r5dgs_core.importing import importer, weights
 from r5dgs_core.raster import rasterize, scene_render
 from r5dgs_core.scene import cameras, lookup, meanings, playback, ply, quality, scene_file, scene_info
-from r5dgs_core.scene.meanings import EncoderCard, Table, View
+from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.semantics import encoders
 from r5dgs_core.train import checkpoint, config
