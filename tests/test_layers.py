@@ -1,13 +1,14 @@
-"""The directions of the house: who may import whom, read from the sources and tried with packages blocked."""
+"""Directions and circles of imports, read from the sources and tried with packages blocked."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 import importlib.util
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,6 +82,35 @@ ALLOWED = {
         "exit_status",
     },
 }
+# Modules that may import modules of the project inside functions: the command line, which starts fast, and the worker,
+# which answers before torch is there and if it is missing.
+LATE_MODULES = {
+    *("cli", "commands", "commands_association", "commands_bench", "commands_info", "commands_masks"),
+    *("commands_objects", "commands_words", "check", "check.run", "demo", "stability_training"),
+    *("serve", "serve_requests"),
+}
+# Further modules of the core, and what each may import inside functions.
+LATE_IMPORTS = {
+    # numba is optional.
+    "raster.harmonics": {"raster.compile", "raster.cpu_harmonics", "raster.cpu_sky"},
+    "raster.segment_weights": {"raster.cpu"},
+    "raster.splatting": {"raster.cpu"},
+    "raster.stage": {"raster.backdrop"},
+    "raster.trial": {"raster.compile"},
+    # numba is optional, and scipy slow to import.
+    "raster.warming": {"raster.backdrop", "raster.segment_weights"},
+    # The stability table is listed without torch.
+    "report.stability.loading": {"raster", "raster.warming"},
+    # OpenImageIO is needed for images alone, not for words.
+    "semantics.clip_encoder": {"data.images"},
+    "semantics.open_clip_encoder": {"data.images"},
+    # A scene at rest loads neither tracks nor networks.
+    "train.bake": {"train.residual"},
+    "train.representation_registry": {"train.field", "train.tracks_representation"},
+    "train.run": {"train.discovery", "train.residual_trial"},
+}
+# The same of the add-on: OpenImageIO is optional there.
+LATE_ADDON_IMPORTS = {"capture_files": {"data.images"}}
 LIGHT = GROUND | {"motion", "scene", "user_settings"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
@@ -131,6 +161,47 @@ def room(module: str) -> str | None:
     """Room of the core that a module belongs to: r5dgs_core.scene.cameras -> scene."""
     parts = module.split(".")
     return parts[1] if parts[0] == "r5dgs_core" and len(parts) > 1 and parts[1] in ALLOWED else None
+
+
+def project_sources() -> dict[str, tuple[str, str]]:
+    """Source and package of each module of core, add-on and operators, by its name inside the extension."""
+    found = {}
+    for folder in ("r5dgs_core", "r5dgs_addon", "operators"):
+        for path, package in modules_in(folder):
+            name = f"r5dgs.{package}" if path.stem == "__init__" else f"r5dgs.{package}.{path.stem}"
+            found[name] = path.read_text(), f"r5dgs.{package}"
+    return found
+
+
+def project_imports(sources: Mapping[str, tuple[str, str]]) -> Iterator[tuple[str, str, Import]]:
+    """All imports between modules, those inside functions and for types included: importer, imported, import."""
+    for name, (source, package) in sources.items():
+        for item in imports_of(source, package):
+            for target in (item.target, item.target.rpartition(".")[0]):  # a module, or a name in a module
+                if target in sources and target != name:
+                    yield name, target, item
+                    break
+
+
+def circle(sources: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Modules of a circle of imports, in its order; empty if there is none."""
+    graph: dict[str, set[str]] = {name: set() for name in sources}
+    for name, target, _ in project_imports(sources):
+        graph[name].add(target)
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def late_imports(sources: Mapping[str, tuple[str, str]]) -> dict[str, set[str]]:
+    """Modules that each module imports inside functions."""
+    found: dict[str, set[str]] = {}
+    for name, target, item in project_imports(sources):
+        if item.late:
+            found.setdefault(name, set()).add(target)
+    return found
 
 
 def core_problems(source: str, package: str, own: str) -> list[str]:
@@ -191,6 +262,42 @@ def test_no_room_of_the_core_imports_upward(own):
         if room(module) == own:
             problems += [f"{path.relative_to(ROOT)}: {text}" for text in core_problems(path.read_text(), package, own)]
     assert not problems, "\n".join(problems)
+
+
+def test_no_module_imports_itself_on_a_detour():
+    assert circle(project_sources()) == []
+
+
+def test_modules_are_imported_inside_functions_only_for_the_listed_reasons():
+    allowed = {f"r5dgs.r5dgs_core.{name}": targets for name, targets in LATE_IMPORTS.items()}
+    allowed |= {f"r5dgs.r5dgs_addon.{name}": targets for name, targets in LATE_ADDON_IMPORTS.items()}
+    found = late_imports(project_sources())
+    for name in LATE_MODULES:
+        assert found.pop(f"r5dgs.r5dgs_core.{name}", None), f"{name} does not need its place in LATE_MODULES"
+    assert found == {name: {f"r5dgs.r5dgs_core.{target}" for target in targets} for name, targets in allowed.items()}, (
+        "imports inside functions differ from LATE_IMPORTS"
+    )
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "from . import a",
+        "from .a import f",
+        "def f():\n    from . import a",
+        "class C:\n    def f(self):\n        from .a import g",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .a import A",
+    ],
+)
+def test_the_scan_sees_a_circle(back):
+    sources = {"x.a": ("from . import b", "x"), "x.b": ("from .c import d", "x"), "x.c": ("import math", "x")}
+    assert circle(sources) == []
+    assert set(circle(sources | {"x.c": (back, "x")})) == {"x.a", "x.b", "x.c"}
+
+
+def test_the_scan_sees_imports_inside_functions():
+    sources = {"x.a": ("from . import b\ndef f():\n    from .c import d", "x"), "x.b": ("", "x"), "x.c": ("", "x")}
+    assert late_imports(sources) == {"x.a": {"x.c"}}
 
 
 @pytest.mark.parametrize("folder", ["r5dgs_addon", "operators"])

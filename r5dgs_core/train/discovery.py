@@ -19,7 +19,7 @@ from torch import Tensor
 from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
-from . import gating, motion_clusters, needs, representation
+from . import config_needs, gating, motion_clusters, representation
 from .config import Config
 from .field import FieldRepresentation
 from .posing import Splats
@@ -48,13 +48,13 @@ def find(
         progress: Called with an event when it begins, now and then, and when it ends.
 
     Returns:
-        Ids per pixel, 0 for what rests [H, W], for each training view; None where `needs.discovery`
+        Ids per pixel, 0 for what rests [H, W], for each training view; None where `config_needs.discovery`
         says no or nothing moves.
 
     Raises:
         DatasetError, TrainingError: As of a run.
     """
-    if not needs.discovery(dataset, config):
+    if not config_needs.discovery(dataset, config):
         return None
     progress = progress or (lambda event: None)
     progress({"event": "prepare", "text": "no masks: looking for what moves"})

@@ -1,7 +1,7 @@
 """What a scene does not need and therefore does not carry: the table of decisions, with the number behind each.
 
-``needs.NAME`` of the configuration is the user's word on a row: it wins over the number, in training (`resolve`) and in
-baking (`decide`, `simplify_motion`).
+``needs.NAME`` of the configuration is the user's word on a row: it wins over the number, in training
+(`config_needs.resolve`) and in baking (`decide`, `simplify_motion`).
 """
 
 from __future__ import annotations
@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..data.dataset import Dataset
 from ..motion import rotations
 from ..scene.scene import MotionGroup
-from .config import Config
 from .groups import Moves
 from .sections import NeedsSection
 
@@ -23,49 +21,6 @@ STILL = 0.0025  # displacement, as a share of the group's diameter, that counts 
 TURN = 0.002  # rotation in radians that counts as none if the images are missing
 SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
 SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
-
-
-def resolve(config: Config) -> Config:
-    """The configuration that training obeys: what the user says is not needed is not learned, and what is, is.
-
-    Args:
-        config: As the user gave it; its ``needs`` stay in the result.
-    """
-    wanted = config.needs
-    changes: dict[str, Any] = {}
-    if wanted.shading == "off":
-        changes["train.shading"] = False
-    if wanted.shadows == "off":
-        changes["train.shadows"] = False
-    if wanted.classifier == "off":
-        changes["identity.iterations"] = 0
-    if wanted.view_dependent_colour != "auto":
-        on = wanted.view_dependent_colour == "on"
-        changes["train.sh_degree"] = max(1, config.train.sh_degree) if on else 0
-    if wanted.tracks == "off":
-        changes |= {"rates.translations": 0.0, "rates.rotvecs": 0.0}
-    if wanted.rotation == "off":
-        changes["rates.rotvecs"] = 0.0
-    return config.replace(**changes)
-
-
-def discovery(dataset: Dataset, config: Config) -> bool:
-    """Whether a run looks for what moves: it starts with tracks, there is no mask, and there are several times."""
-    tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
-    return tracks and _looks_for_parts(dataset, config)
-
-
-def sorting(dataset: Dataset, config: Config) -> bool:
-    """Whether a finished run sorts its Gaussians into what moves as one: it is a field, and no mask says it."""
-    field = config.train.representation == "field" and config.field.tracks_share == 0
-    return field and _looks_for_parts(dataset, config)
-
-
-def _looks_for_parts(dataset: Dataset, config: Config) -> bool:
-    """Whether nobody says what the objects are, and what moves could: there is no mask, and there are several times."""
-    unmasked = all(view.mask_path is None for view in dataset.train)
-    several = len({view.t for view in dataset.train}) > 1
-    return unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
 
 
 def _travel(poses: np.ndarray, radius: float) -> float:

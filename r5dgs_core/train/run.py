@@ -24,11 +24,11 @@ from ..time_left import Phase, Timed
 from . import (
     checkpoint,
     checkpoint_content,
+    config_needs,
     curves,
     identity,
     label_hygiene,
     mask_stack,
-    needs,
     probing,
     representation,
     representation_registry,
@@ -166,7 +166,7 @@ def _found_masks(
 ) -> list[np.ndarray] | None:
     """Masks of what moves where the data set has none: those that the run began with, or found now."""
     if state is None:
-        if not needs.discovery(dataset, config):
+        if not config_needs.discovery(dataset, config):
             return None
         from . import discovery  # with the networks of its short run, which others do without
 
@@ -345,7 +345,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
         if trainer.config.identity.hygiene and len(classes) > 1:
             # After the encodings, which follow the masks' edges by themselves: the labels say what goes with what.
             extra |= _cleaned(trainer, votes, extra["labels"])
-    elif trainer.motion.name == representation.FIELD and needs.sorting(trainer.dataset, trainer.config):
+    elif trainer.motion.name == representation.FIELD and config_needs.sorting(trainer.dataset, trainer.config):
         from . import discovery
 
         progress({"event": "prepare", "text": "no masks: sorting what moves into parts"})

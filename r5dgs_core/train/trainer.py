@@ -24,12 +24,12 @@ from ..raster import RasterStats, rasterize_splats
 from ..scene.cameras import Camera
 from . import background as backgrounds
 from . import (
+    config_needs,
     densification,
     identity,
     initialization,
     losses,
     mask_stack,
-    needs,
     normalization,
     posing,
     representation,
@@ -73,7 +73,7 @@ class Trainer:
     ):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
-        self.config = config = needs.resolve(config)
+        self.config = config = config_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
         behind = views.behind(dataset, config)
         self.views = views.load(dataset, self.normalization, behind)

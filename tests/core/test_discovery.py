@@ -11,7 +11,7 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.report import evaluate
 from r5dgs_core.scene import validation
-from r5dgs_core.train import bake, checkpoint, discovery, mask_stack, needs, run
+from r5dgs_core.train import bake, checkpoint, config_needs, discovery, mask_stack, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -48,13 +48,13 @@ def test_what_moves_is_found_and_told_apart(unmasked, tiny):
 
 def test_a_run_looks_only_where_it_has_to(unmasked, tiny):
     config = tiny_datasets.settings()
-    assert needs.discovery(datasets.read(unmasked.root), config)
-    assert not needs.discovery(datasets.read(tiny.root), config)
+    assert config_needs.discovery(datasets.read(unmasked.root), config)
+    assert not config_needs.discovery(datasets.read(tiny.root), config)
     for off in ("discovery.iterations=0", "needs.tracks='off'", "train.representation='field'"):
-        assert not needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
+        assert not config_needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
         assert discovery.find(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
     field = tiny_datasets.settings("train.representation='field'", "field.tracks_share=0.2")
-    assert needs.discovery(datasets.read(unmasked.root), field)
+    assert config_needs.discovery(datasets.read(unmasked.root), field)
 
 
 def test_where_nothing_moves_no_masks_are_made(unmasked, monkeypatch):
@@ -153,11 +153,11 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
 def test_a_field_is_sorted_only_where_nothing_else_says_what_belongs_together(unmasked, tiny):
     data = datasets.read(unmasked.root)
     field = "train.representation='field'"
-    assert needs.sorting(data, tiny_datasets.settings(field))
-    assert not needs.sorting(data, tiny_datasets.settings())
-    assert not needs.sorting(datasets.read(tiny.root), tiny_datasets.settings(field))
+    assert config_needs.sorting(data, tiny_datasets.settings(field))
+    assert not config_needs.sorting(data, tiny_datasets.settings())
+    assert not config_needs.sorting(datasets.read(tiny.root), tiny_datasets.settings(field))
     for off in ("discovery.iterations=0", "needs.tracks='off'", "field.tracks_share=0.2"):
-        assert not needs.sorting(data, tiny_datasets.settings(field, off))
+        assert not config_needs.sorting(data, tiny_datasets.settings(field, off))
 
 
 @pytest.mark.slow

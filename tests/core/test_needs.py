@@ -10,7 +10,7 @@ from r5dgs_core.errors import ConfigError
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup
-from r5dgs_core.train import bake, checkpoint, config, groups, needs, run
+from r5dgs_core.train import bake, checkpoint, config, config_needs, groups, needs, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -179,7 +179,7 @@ def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
 def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_needed(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("needs.view_dependent_colour=on"))
     assert trainer.gaussians.params["sh_rest"].shape[1] == 3
-    kept = needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
+    kept = config_needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
     assert kept.train.sh_degree == 2
 
 
