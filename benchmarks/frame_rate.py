@@ -26,7 +26,7 @@ from r5dgs_core.motion import models, rotations
 from r5dgs_core.raster import RenderOutput, scene_render, stage
 from r5dgs_core.raster import compile as compilation
 from r5dgs_core.raster.scene_render import Instance
-from r5dgs_core.scene import playback
+from r5dgs_core.scene import playback, row_runs
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
 
@@ -124,7 +124,7 @@ def instances_at(scene: Scene, t: float) -> list[Instance]:
     quats, displacements = playback.group_poses(scene, t)
     turns = rotations.quats_to_rotmats(quats)
     found = []
-    for start, stop, g in playback.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         matrix, pivot = np.eye(4), scene.groups[g].pivot
         matrix[:3, :3], matrix[:3, 3] = turns[g], pivot + displacements[g] - turns[g] @ pivot
         found.append(Instance(start, stop - start, matrix))

@@ -14,7 +14,7 @@ import numpy as np
 from ..r5dgs_core.motion import keyframes as reduction
 from ..r5dgs_core.motion import rotations
 from ..r5dgs_core.motion.keyframes import Curves, Keys
-from ..r5dgs_core.scene import playback, posing
+from ..r5dgs_core.scene import playback, row_runs
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, timeline
 
@@ -109,7 +109,7 @@ def few(
 def reaches(scene: Scene) -> np.ndarray:
     """Largest distance of a member from the pivot of each motion group. [G] float64"""
     result = np.zeros(len(scene.groups))
-    for start, stop, g in posing.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         pivot = np.asarray(scene.groups[g].pivot, np.float64)
         squares = np.zeros(stop - start)
         for axis in range(3):  # a column at a time: numpy is slow at rows of three

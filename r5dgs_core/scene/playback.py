@@ -28,13 +28,13 @@ from ..motion.keyframes import slopes
 from . import group_dynamics, posing
 from .group_dynamics import knots
 from .modes import MODES, VARIANTS, every, split
-from .posing import move_points, rest_factors, runs, turn_quats
+from .posing import move_points, rest_factors, turn_quats
 from .residuals import Literal, OwnMotion, Residuals, unexplained
 from .scene import Scene
 
 __all__ = (
     "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
-    "modes", "move_points", "pose", "rest_factors", "runs", "sh_rotations", "slopes", "split", "turn_quats",
+    "modes", "move_points", "pose", "rest_factors", "sh_rotations", "slopes", "split", "turn_quats",
 )  # fmt: skip
 
 

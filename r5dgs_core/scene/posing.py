@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..motion import columns, rotations
+from .row_runs import runs
 from .scene import Scene
 
 
@@ -121,16 +122,6 @@ class Poser:
         if self._still is None or not np.array_equal(self._still[0], origin):
             self._still = origin.copy(), (self._scene.means.astype(np.float64) - origin).astype(np.float32)
         return self._still[1]
-
-
-def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
-    """Stretches of equal ids as (start, stop, id). [N]"""
-    if len(ids) == 0:
-        return []
-    cuts = np.flatnonzero(ids[1:] != ids[:-1]) + 1
-    starts = np.concatenate([[0], cuts])
-    stops = np.concatenate([cuts, [len(ids)]])
-    return [(int(a), int(b), int(ids[a])) for a, b in zip(starts, stops, strict=True)]
 
 
 def rest_factors(scene: Scene) -> np.ndarray:

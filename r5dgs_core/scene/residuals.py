@@ -11,7 +11,8 @@ import numpy as np
 
 from ..motion import columns, dynamics, keyframes, propagation, rotations, stepping
 from . import group_dynamics
-from .posing import Poser, runs
+from .posing import Poser
+from .row_runs import runs
 from .scene import Scene
 
 TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent

@@ -15,7 +15,7 @@ import numpy as np
 from .. import errors, findings
 from . import array_shapes, cameras
 from .lookup_table import Table
-from .playback import runs
+from .row_runs import runs
 from .scene import DTYPES, EMBEDDINGS, ROLES, MotionGroup, Scene
 
 _fail = array_shapes.fail

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.scene import edited, playback, posing, scene_file, validation
+from r5dgs_core.scene import edited, playback, row_runs, scene_file, validation
 from r5dgs_core.scene.edited import Piece
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from tests.scenes import make_scene
@@ -40,7 +40,7 @@ def pieces_of(scene, noise=0.0, before=None, after=None):
     """The clouds of a loaded scene: their maps are those of playback between ``after`` and ``before``, by object id."""
     random, pieces = np.random.default_rng(0), []
     pairs = scene.object_ids.astype(np.int64) * 1000 + scene.motion_ids
-    for start, stop, pair in posing.runs(pairs):
+    for start, stop, pair in row_runs.runs(pairs):
         object_id, motion_id = (pair + 1) // 1000 if pair < 0 else pair // 1000, pair % 1000
         object_id = int(scene.object_ids[start])
         maps = played(scene, motion_id, times_of(scene))

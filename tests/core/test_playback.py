@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import keyframes, models, rotations
-from r5dgs_core.scene import playback
+from r5dgs_core.scene import playback, row_runs
 from tests.scenes import T_MAX, make_scene
 
 AFTER = np.nextafter(T_MAX, 1.0)
@@ -90,7 +90,7 @@ def test_signs_in_the_file_do_not_matter(scene):
 @pytest.mark.parametrize("t", [0.0, 0.33, 0.9, 3.0])
 def test_every_group_moves_rigidly(scene, t):
     frame = playback.frame(scene, t)
-    for start, stop, g in playback.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
         np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-6)
@@ -154,7 +154,7 @@ def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
     moved = dataclasses.replace(scene, means=(scene.means + away).astype(np.float32), groups=groups)
     player = playback.Player(moved)
     _, displacements = player.group_poses(t)
-    for start, stop, g in playback.runs(moved.motion_ids):
+    for start, stop, g in row_runs.runs(moved.motion_ids):
         if moved.groups[g].role == "body":
             frame = player.frame(t, moved.groups[g].pivot + displacements[g])
             before, after = moved.means[start:stop].astype(float), frame.means[start:stop].astype(float)

@@ -9,7 +9,7 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations, se3
-from r5dgs_core.scene import group_dynamics, playback, residuals, scene_file, scene_info
+from r5dgs_core.scene import group_dynamics, playback, residuals, row_runs, scene_file, scene_info
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, TIMES, make_scene
 
@@ -79,7 +79,7 @@ def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
 def test_equal_twists_move_a_body_rigidly_in_mode_standard():
     scene = twisting(make_scene())
     frame = playback.frame(scene, 1.0, "standard")
-    for start, stop, g in playback.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
         np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-4)
@@ -134,7 +134,7 @@ def test_sources_move_every_group_rigidly_for_long(twisted, mode):
     scene = twisted
     player, t = playback.Player(scene, mode), T_MAX + 4.0
     _, displacements = player.group_poses(t)
-    for start, stop, g in playback.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         frame = player.frame(t, scene.groups[g].pivot + displacements[g])
         before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]

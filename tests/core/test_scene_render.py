@@ -9,7 +9,7 @@ import torch
 from r5dgs_core.motion import rotations
 from r5dgs_core.raster import RasterSettings, scene_render
 from r5dgs_core.raster.scene_render import Instance
-from r5dgs_core.scene import playback
+from r5dgs_core.scene import playback, row_runs
 from r5dgs_core.train import background
 from tests import scenes
 
@@ -41,7 +41,7 @@ def image(scene, pose, camera=CAMERA, **options):
 def group_instances(scene, t):
     quats, displacements = playback.group_poses(scene, t)
     result = []
-    for start, stop, g in playback.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.motion_ids):
         pivot = scene.groups[g].pivot
         transform = matrix(quats[g])
         transform[:3, 3] = pivot + displacements[g] - transform[:3, :3] @ pivot
