@@ -15,6 +15,7 @@ from r5dgs_core.model import spherical_harmonics
 from r5dgs_core.raster import (
     RasterSettings,
     RasterStats,
+    backends,
     cpu,
     cpu_blending,
     cpu_blending_backward,
@@ -565,7 +566,7 @@ def test_backends_that_cannot_draw_say_why():
 def test_without_numba_the_reference_draws_and_says_so(monkeypatch, caplog):
     scene = [t.float() for t in splats(10, 3)]
     expected = rasterize_splats(*scene, camera(), backend="reference").image
-    monkeypatch.setattr(splatting.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
     assert torch.equal(rasterize_splats(*scene, camera()).image, expected)
     assert "pip install numba" in caplog.text
     with pytest.raises(errors.BackendError, match="pip install numba"):
