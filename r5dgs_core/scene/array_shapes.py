@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from .. import errors, findings
-from .meanings import Table
+from .lookup_table import Table
 from .scene import EMBEDDINGS, IDENTITY_DIM, MotionGroup, SceneObject
 
 SH_BASES = (1, 4, 9, 16)
