@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree
 
@@ -33,6 +34,7 @@ INFINITE = 1e5
 PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
 SAME = 0.012  # colour difference that tells nothing
 GOOD = 0.12  # larger colour differences are no match
+CONFIRMATIONS = 2  # other cameras that must agree on a depth
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,9 @@ class Sweep:
             torch.from_numpy(ndimage.gaussian_filter(b.image, (0.7, 0.7, 0))).permute(2, 0, 1)[None] for b in scenes
         ]
         self._known = [torch.from_numpy(b.known.astype(np.float32))[None, None] for b in scenes]
-        z = np.append(1 / np.linspace(1 / NEAREST, 1 / FARTHEST, depths), INFINITE)
+        inverse = np.linspace(1 / NEAREST, 1 / FARTHEST, depths)
+        self._step = float(inverse[0] - inverse[-1]) / max(1, depths - 1)
+        z = np.append(1 / inverse, INFINITE)
         each = max(256, 5 * count // max(1, len(scenes)))
         self.rays = [r for i in range(len(scenes)) if (r := self._sweep(i, z, each)) is not None]
 
@@ -228,7 +232,8 @@ class Sweep:
 
         Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
         which it was found, and, where the sky is known, everywhere near that is not sky. Rays that show sky place
-        nothing, nor do those on which any depth will do. The others are placed at their best depth.
+        nothing, nor do those on which any depth will do. The others are placed at their best depth if other cameras
+        confirm it.
 
         Args:
             count: Number of points wanted.
@@ -259,14 +264,44 @@ class Sweep:
         is_sky = found[1] if found is not None else np.zeros(len(cost), bool)
         as_good = (plane_cost <= np.minimum(cost + 2 * SAME, GOOD)) & np.isfinite(cost)
         on_plane = as_good & (supported | ((plane_depth < PLANE_REACH) & (found is not None)))
-        usable = (clear | on_plane) & ~is_sky
-        points = (origin + direction * np.where(on_plane, plane_depth, depth)[:, None])[usable]
+        depth = np.where(on_plane, plane_depth, depth)
+        points = origin + direction * depth[:, None]
+        usable = (on_plane | (clear & self._confirmed(points, depth))) & ~is_sky
+        points = points[usable]
         coefficients = found[0] if found is not None else None
         if len(points) == 0:
             return Placed(np.zeros((0, 3)), np.zeros((0, 3)), coefficients)
         weights = 1 / (0.02 + cost[usable])
         chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
         return Placed(points[chosen], color[usable][chosen], coefficients)
+
+    def _confirmed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Mask of points at whose depth other cameras found a surface, too. [P] bool
+
+        A match between repeated or smooth patterns gives a depth that no other camera's best match agrees with. This
+        is the geometric consistency check of multi-view stereo: at least `CONFIRMATIONS` other cameras (one, if there
+        are only two cameras) have a depth within one step of the sweep beside the point's pixel.
+
+        Args:
+            points: Points on all rays, in the order of the rays. [P, 3]
+            depth: Depth of each in its own camera. [P]
+        """
+        owner = np.concatenate([np.full(r.depths.size, k) for k, r in enumerate(self.rays)])
+        maps = np.split(depth, np.cumsum([r.depths.size for r in self.rays])[:-1])
+        agreed = np.zeros(len(points), int)
+        for k, (rays, values) in enumerate(zip(self.rays, maps, strict=True)):
+            camera = self.scenes[rays.backdrop].camera
+            T, (height, width) = camera.T_cam_world, rays.depths.shape
+            x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column = (camera.intrinsics[0, 0] * x / z + camera.intrinsics[0, 2]) / camera.width * width
+                row = (camera.intrinsics[1, 1] * y / z + camera.intrinsics[1, 2]) / camera.height * height
+                visible = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height) & (owner != k)
+            row, column = row[visible].astype(int), column[visible].astype(int)
+            inverse = np.pad(1 / values.reshape(height, width), 1, mode="edge")
+            beside = sliding_window_view(inverse, (3, 3)).reshape(height, width, 9)[row, column]
+            agreed[visible] += (np.abs(beside - 1 / z[visible, None]) <= self._step).any(1)
+        return agreed >= min(CONFIRMATIONS, len(self.rays) - 1)
 
     def _up(self) -> np.ndarray:
         """Mean upward direction of the cameras, unit. [3]"""

@@ -83,6 +83,22 @@ def test_the_same_draws_give_the_same_points(floor):
     np.testing.assert_array_equal(a, b)
 
 
+def test_a_depth_that_no_other_camera_confirms_places_nothing(floor):
+    search = sweep.Sweep(sweep.backdrops(floor), 150, 288)
+    found = search.rays[0]
+    search.rays[0] = dataclasses.replace(found, depths=0.6 * found.depths, costs=np.zeros_like(found.costs))
+    heights = search.place(10**6, None, False, np.random.default_rng(0)).points[:, 2]
+    assert len(heights) > 200
+    assert heights.max() < 0.7  # the wrong depths lie 1.3 units above the floor
+
+
+def test_two_cameras_confirm_each_other(floor):
+    search = sweep.Sweep(sweep.backdrops(floor[:2]), 150, 96)
+    points = search.place(10**6, None, False, np.random.default_rng(0)).points
+    assert len(points) > 100
+    assert np.mean(np.abs(points[:, 2]) < 1.5 * depth_step(96)) > 0.8
+
+
 def test_a_constant_sky_places_nothing():
     search = sweep.Sweep(sweep.backdrops(constant_views()), 200, 48)
     for find_sky in (False, True):
