@@ -10,6 +10,10 @@ import sys
 import hypothesis
 import pytest
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # one process per core, so each gets one thread
+    for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
 BPY_PYTHON = (3, 11)
 STATUS = pytest.StashKey[int]()
 
