@@ -1,5 +1,8 @@
 """The loaded scenes of a .blend: their collections, which of them a Blender scene shows, members and origin."""
 
+import contextlib
+from collections.abc import Iterator
+
 import bpy
 import numpy as np
 
@@ -85,3 +88,16 @@ def origin(collection: bpy.types.Collection | None) -> np.ndarray:
 def origin_text(origin: np.ndarray) -> str:
     """An origin for messages and labels, such as "(5000002, -3500000, 1500002)"."""
     return f"({', '.join(f'{value:.15g}' for value in origin)})"
+
+
+@contextlib.contextmanager
+def nothing_left_after_error() -> Iterator[None]:
+    """Remove all data that the block made, if it raises."""
+    kinds = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
+    before = {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in kinds}
+    try:
+        yield
+    except BaseException:
+        made = [data for kind in kinds for data in getattr(bpy.data, kind) if data.session_uid not in before[kind]]
+        bpy.data.batch_remove(made)
+        raise

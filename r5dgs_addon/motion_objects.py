@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import bpy
 import numpy as np
 
-from . import compat, motion_confidence, motion_curves, motion_extrapolate, motion_physics, objects
+from . import compat, loaded_scenes, motion_confidence, motion_curves, motion_extrapolate, motion_physics
 
 
 def anchor_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
@@ -67,7 +67,7 @@ def duplicate(
         motion_curves.check_local(anchor)
     homes = {anchor: motion_extrapolate.scene_of(anchor) for anchor in everyone}
     copies: dict[bpy.types.Object, bpy.types.Object] = {}
-    with objects.nothing_left_after_error():
+    with loaded_scenes.nothing_left_after_error():
         for anchor in everyone:
             name = anchor.name.removesuffix(" anchor")
             collection = bpy.data.collections.new(name)

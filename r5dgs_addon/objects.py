@@ -5,9 +5,7 @@ and moves by the group's pose (R, d). A point x of the bind state is shown at W 
 cloud's parent inverse, so that the point cloud holds the file's own coordinates.
 """
 
-import contextlib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,7 +112,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         )
     times = timeline.Times.of(scene, options.frame_zero, options.t_end)
     timeline.check_end(path.name, times)
-    with nothing_left_after_error():
+    with loaded_scenes.nothing_left_after_error():
         collection = bpy.data.collections.new(table.fit(f"R5DGS {scene.name}"))
         context.scene.collection.children.link(collection)
         extent = scene.extent
@@ -150,19 +148,6 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
     root.select_set(True)
     context.view_layer.objects.active = root
     return collection
-
-
-@contextlib.contextmanager
-def nothing_left_after_error() -> Iterator[None]:
-    """Remove all data that the block made, if it raises."""
-    kinds = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
-    before = {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in kinds}
-    try:
-        yield
-    except BaseException:
-        made = [data for kind in kinds for data in getattr(bpy.data, kind) if data.session_uid not in before[kind]]
-        bpy.data.batch_remove(made)
-        raise
 
 
 def object_name(scene: Scene, object_id: int) -> str:

@@ -18,8 +18,8 @@ import numpy as np
 from .. import errors
 from . import english, prompts
 from . import meanings as stored
-from .meanings import Meanings
 from .scene import Scene
+from .stored_embeddings import Meanings
 
 THRESHOLD = stored.PASS
 EVERYTHING = "all"  # begins the reason of a match that no word of its own found

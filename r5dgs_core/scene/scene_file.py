@@ -17,9 +17,10 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from .. import errors, findings, strict_json
-from . import array_shapes, features, files, meanings, scene_json, validation
+from . import array_shapes, features, files, scene_json, validation
 from .archive import Archive, Header, most_content
 from .scene import DTYPES, EMBEDDINGS, Scene
+from .stored_embeddings import Meanings
 
 FORMAT = "r5dgs scene"
 JSON_MEMBER = "scene.json"
@@ -87,7 +88,7 @@ def is_exact(path: str | Path) -> bool:
     return any(header.dtype == "<f4" for header in headers.values())
 
 
-def read_meanings(path: str | Path) -> meanings.Meanings | None:
+def read_meanings(path: str | Path) -> Meanings | None:
     """Return only the stored embeddings of a scene; None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
@@ -102,9 +103,7 @@ def read_meanings(path: str | Path) -> meanings.Meanings | None:
     objects, words = arrays["embeddings"], arrays["vocabulary_embeddings"]
     if objects is None or words is None:
         return None
-    return meanings.Meanings(
-        ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"]
-    )
+    return Meanings(ids, objects, vocabulary, words, table, arrays["canonical_embeddings"], arrays["view_embeddings"])
 
 
 def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from r5dgs_core import errors
 from r5dgs_core.scene import lookup, meanings, scene_file, scene_info, scene_json
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
-from r5dgs_core.scene.meanings import Meanings
+from r5dgs_core.scene.stored_embeddings import Meanings
 from tests.scenes import make_scene
 
 CARD = EncoderCard("text", "tiny", "ab" * 32, 4, ("{}", "a photo of a {}"))
