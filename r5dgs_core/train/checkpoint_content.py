@@ -31,6 +31,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "gaussians.shading": ("N", 3),
     "gaussians.identities": ("N", "D"),
     "gaussians.motion_ids": ("N",),
+    "held": ("N",),
     "object_ids": ("B",),
     "background": ("Kb", 3),
     "generator": ("bytes",),

@@ -160,31 +160,56 @@ def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequen
                 state[key][slice(None) if rows is None else rows] = 0.0
 
 
-def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
-    """Background Gaussians close before a camera that no second camera sees: their depth is not determined.
+def single_view(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
+    """Mask of the background Gaussians that lie in the image of at most one camera, so that no parallax fixes their depth.
 
     Args:
-        gaussians: The Gaussians; those of group 0 are looked at.
-        eyes: The distinct training cameras; with fewer than three there is no second opinion.
-        distance: What is close, in normalised units.
+        gaussians: The Gaussians; those of group 0 are the background.
+        eyes: The distinct training cameras; with fewer than three, nothing is masked.
 
     Returns:
-        Which ones they are. [N] bool
+        Mask. [N] bool
     """
+    found = torch.zeros(len(gaussians), dtype=torch.bool)
+    if len(eyes) < 3:
+        return found
     means = gaussians.params["means"].detach()
-    pinned = gaussians.motion_ids == 0
-    if len(eyes) < 3 or distance <= 0:
-        return torch.zeros_like(pinned)
-    seen = torch.zeros(len(means))
-    near = torch.zeros_like(pinned)
+    rows = torch.nonzero(gaussians.motion_ids == 0)[:, 0]
+    count = torch.zeros(len(rows), dtype=torch.int64)
     for camera in eyes:
-        T = torch.from_numpy(camera.T_cam_world).float()
         k = camera.intrinsics
-        p_cam = means @ T[:3, :3].T + T[:3, 3]
+        p_cam = _in_camera(means[rows], camera)
         z = p_cam[:, 2].clamp(min=1e-6)
         u = k[0, 0] * p_cam[:, 0] / z + k[0, 2]
         v = k[1, 1] * p_cam[:, 1] / z + k[1, 2]
-        inside = (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-        seen += inside
-        near |= p_cam.norm(dim=1) < distance
-    return pinned & near & (seen < 2)
+        count += (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        rows, count = rows[count < 2], count[count < 2]
+    found[rows] = True
+    return found
+
+
+def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
+    """Mask of the `single_view` Gaussians that lie close before a camera.
+
+    Args:
+        gaussians: The Gaussians.
+        eyes: The distinct training cameras.
+        distance: Largest distance that counts as close, normalised units; nothing is masked if it is 0.
+
+    Returns:
+        Mask. [N] bool
+    """
+    found = single_view(gaussians, eyes) if distance > 0 else torch.zeros(len(gaussians), dtype=torch.bool)
+    rows = torch.nonzero(found)[:, 0]
+    means = gaussians.params["means"].detach()[rows]
+    near = torch.zeros(len(rows), dtype=torch.bool)
+    for camera in eyes:
+        near |= _in_camera(means, camera).norm(dim=1) < distance
+    found[rows] = near
+    return found
+
+
+def _in_camera(means: Tensor, camera: Camera) -> Tensor:
+    """Return points [N, 3] in the frame of a camera. [N, 3]"""
+    T = torch.from_numpy(camera.T_cam_world).float()
+    return means @ T[:3, :3].T + T[:3, 3]

@@ -47,7 +47,9 @@ from .config import Config
 log = logging.getLogger(__name__)
 
 TARGET_BYTES = 1 << 30
-FLOATER_CAMERAS = 256  # cameras that are asked whether they see what floats before another
+EYES = 256  # cameras that count for what a single camera sees
+HOLD_EVERY = 100  # steps after which it is decided anew which Gaussians are held
+HELD = "held"  # a tensor of the state
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope", "residual")
 NETWORKS = ("field", "trd")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
@@ -120,7 +122,8 @@ class Trainer:
         self._view_times = np.array([views.nearest_knot(self.times, v.t) for v in self.views])
         sizes = [v.camera.width * v.camera.height for v in self.views]
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
-        eyes = [group[0].camera for group in sweep.by_camera(self.views, FLOATER_CAMERAS)]
+        self.eyes = [group[0].camera for group in sweep.by_camera(self.views, EYES)]
+        self.held = torch.zeros(0, dtype=torch.bool)
         self.cap = most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes))))
         self.optimizer = self._make_optimizer()
         conditions = densification.Conditions(
@@ -128,8 +131,8 @@ class Trainer:
             iterations=config.train.iterations,
             pixel_size=normalization.TARGET_DISTANCE / focal,
             image_width=float(np.median([v.camera.width for v in self.views])),
-            extent=densification.extent_of(eyes),
-            eyes=eyes,
+            extent=densification.extent_of(self.eyes),
+            eyes=self.eyes,
             generator=self.generator,
             white=behind is not None and bool((behind == 1).all()),
         )
@@ -205,12 +208,21 @@ class Trainer:
         if not math.isfinite(value + float(torch.stack(sums).sum())):
             self._check_finite(value, view.name)
         self._hide_harmonics()
+        self._hold_places()
         self.optimizer.step()
         self.growth.observe(stats, view.camera)
         self.iteration += 1
         self.running_loss = value if math.isnan(self.running_loss) else 0.98 * self.running_loss + 0.02 * value
         self._maintain()
         return value
+
+    def _hold_places(self) -> None:
+        """Keep background Gaussians that a single camera sees where they are, as one view does not tell their depth."""
+        if self.iteration % HOLD_EVERY == 0 or len(self.held) != len(self.gaussians):
+            self.held = densification.single_view(self.gaussians, self.eyes)
+        gradient = self.gaussians.params["means"].grad
+        if gradient is not None:
+            gradient[self.held] = 0.0
 
     def _draw_all(self, view: views.TrainView, stats: RasterStats) -> tuple[Tensor, Tensor | None, posing.Splats]:
         """A training view's image, its blended encodings where they are drawn in the same pass, and the splats."""
@@ -378,6 +390,8 @@ class Trainer:
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
+        if len(self.held) == len(self.gaussians):
+            tensors[HELD] = self.held
         tensors |= self.growth.tensors()
         for group in self.optimizer.param_groups:
             moments = self.optimizer.state.get(group["params"][0], {})
@@ -416,6 +430,7 @@ class Trainer:
         if any(len(t) != len(self.gaussians) for n, t in tensors.items() if n.startswith("gradients.")):
             raise CheckpointError(f"the checkpoint's 'gradients.*': expected {len(self.gaussians)} rows each")
         self.growth.restore(tensors)
+        self.held = tensors.get(HELD, torch.zeros(0, dtype=torch.bool))
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:
             prefix = f"adam.{group['name']}."

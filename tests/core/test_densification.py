@@ -155,6 +155,8 @@ def test_background_close_before_a_camera_that_no_other_sees_goes():
         gaussians.means.copy_(torch.stack([before_first, before_first, middle, -50 * before_first]))
     gaussians.motion_ids = torch.tensor([0, 1, 0, 0])  # the second belongs to a body
     assert densification.floaters(gaussians, eyes, 1.0).tolist() == [True, False, False, False]
+    assert densification.single_view(gaussians, eyes).tolist() == [True, False, False, True]
+    assert not densification.floaters(gaussians, eyes, 0.0).any()
     assert not densification.floaters(gaussians, eyes[:2], 1.0).any()  # no second opinion
 
 

@@ -147,6 +147,20 @@ def test_times_enter_from_the_first_one_outwards_until_all_are_in(tiny):
     assert seen[-1] == (0, 5) and len(set(seen)) > 2
 
 
+def test_background_that_a_single_camera_sees_keeps_its_place(tiny):
+    trainer = make(tiny, "densify.start=1000")
+    means = trainer.gaussians.params["means"]
+    row = int(torch.nonzero(trainer.gaussians.motion_ids == 0)[0, 0])
+    eye = trainer.eyes[0]
+    with torch.no_grad():
+        means[row] = torch.from_numpy(eye.center + 0.3 * eye.forward).float()
+    before = means.detach().clone()
+    for _ in range(2 * len(trainer.views)):
+        trainer.step()
+    moved = (trainer.gaussians.params["means"].detach() != before).any(1)
+    assert not moved[row] and moved.sum() > 0.9 * len(moved)
+
+
 def test_without_masks_everything_is_one_pinned_group(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path, masks=False)
     trainer = make(data)
