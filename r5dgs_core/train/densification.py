@@ -161,7 +161,7 @@ def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequen
 
 
 def single_view(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
-    """Mask of the background Gaussians that lie in the image of at most one camera, so that no parallax fixes their depth.
+    """Mask of the background Gaussians in the image of at most one camera: no parallax determines their depth.
 
     Args:
         gaussians: The Gaussians; those of group 0 are the background.
