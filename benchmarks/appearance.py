@@ -38,15 +38,19 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
+from r5dgs_core.error_vs_time import image_task
+from r5dgs_core.evaluation import evaluate, metrics
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import rasterize, scene_render, warm_up
-from r5dgs_core.report import evaluate, image_rows, metrics
-from r5dgs_core.scene import cameras, playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import rasterize, warm_up
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import bake, checkpoint
+from r5dgs_core.train import checkpoint
 
 KINDS = ("borders", "unseen sides", "objects", "shadows", "background")
 NEAR = math.cos(math.radians(30))
@@ -54,7 +58,7 @@ VISIBLE = 0.2  # of what a Gaussian would show alone, from which on a view has s
 SHADOW_LEVEL = 3 / 255
 FEWEST_PIXELS = 30  # to which a change of colour is fitted
 
-Move = Callable[[float], playback.Frame]
+Move = Callable[[float], scene_player.Frame]
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Picture:
     truth: np.ndarray
     mask: np.ndarray
     drawn: np.ndarray
-    frame: playback.Frame
+    frame: scene_player.Frame
 
     @property
     def squares(self) -> np.ndarray:
@@ -93,15 +97,15 @@ def pictures(scene: Scene, views: Sequence[datasets.View], move: Move) -> list[P
     return found
 
 
-def draw(scene: Scene, frame: playback.Frame, camera: Camera) -> np.ndarray:
+def draw(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
     """Colour of a frame, rounded to 8 bits. [H, W, 3] float32"""
-    color = scene_render.to_numpy(scene_render.render_frame(scene, frame, camera).color, np.float32)
+    color = scene_renderer.to_numpy(scene_renderer.render_frame(scene, frame, camera).color, np.float32)
     return images.to_uint8(color).astype(np.float32) / np.float32(255)
 
 
 def oracle(scene: Scene, dataset: datasets.Dataset) -> Move:
     """The scene with its bodies in their true poses past t_max."""
-    move, reason = image_rows.true_move(scene, dataset, [v.t for v in dataset.test])
+    move, reason = image_task.true_move(scene, dataset, [v.t for v in dataset.test])
     if move is None:
         raise SystemExit(f"{dataset.root}: {reason}; the benchmark needs them at the times of split test")
     return move
@@ -113,12 +117,12 @@ def frozen(scene: Scene, shading: bool, shadows: bool) -> tuple[Scene, Move]:
     if shading and scene.shading is not None:
         still = dataclasses.replace(scene, shading=np.zeros_like(scene.shading))
 
-    def move(t: float) -> playback.Frame:
-        quats, displacements = (array.copy() for array in playback.group_poses(still, t))
+    def move(t: float) -> scene_player.Frame:
+        quats, displacements = (array.copy() for array in scene_player.group_poses(still, t))
         for group in still.groups:
             if shadows and group.role == "shadow":
                 quats[group.id], displacements[group.id] = rotations.identity(), 0.0
-        return playback.pose(still, quats, displacements, t)
+        return scene_player.pose(still, quats, displacements, t)
 
     return still, move
 
@@ -134,34 +138,34 @@ class Sight:
     def __init__(self, scene: Scene, views: Sequence[datasets.View]):
         self.scene = scene
         self.directions = np.zeros((len(views), len(scene.means), 3), np.float32)  # zero where a view has not
-        player = playback.Player(scene)
+        player = scene_player.Player(scene)
         for k, view in enumerate(views):
             frame = player.frame(view.t)
             seen = visibility(scene, frame, view.camera) > VISIBLE
             self.directions[k] = _towards(frame, view.camera) * seen[:, None]
 
-    def share(self, frame: playback.Frame, camera: Camera) -> np.ndarray:
+    def share(self, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
         """Share of each pixel's Gaussians that training has seen from near that direction. [H, W]"""
         now, nearest = _towards(frame, camera), np.full(len(frame.means), -1.0, np.float32)
         for directions in self.directions:
             np.maximum(nearest, (directions * now).sum(1), out=nearest)
         known = np.stack([nearest > NEAR, np.ones(len(nearest), bool)], axis=1)
-        output = scene_render.render_frame(self.scene, frame, camera, features=known.astype(np.float32))
-        blended = scene_render.to_numpy(output.features, np.float32)
+        output = scene_renderer.render_frame(self.scene, frame, camera, features=known.astype(np.float32))
+        blended = scene_renderer.to_numpy(output.features, np.float32)
         return blended[..., 0] / np.maximum(blended[..., 1], 1e-6)
 
 
-def _towards(frame: playback.Frame, camera: Camera) -> np.ndarray:
+def _towards(frame: scene_player.Frame, camera: Camera) -> np.ndarray:
     """Directions from the Gaussians to a camera, unit, bind frame. [N, 3]"""
     arm = camera.center - frame.origin - frame.means
     arm /= np.linalg.norm(arm, axis=1, keepdims=True)
     return rotations.rotate(rotations.conjugate(frame.group_quats[frame.motion_ids]), arm).astype(np.float32)
 
 
-def visibility(scene: Scene, frame: playback.Frame, camera: Camera) -> np.ndarray:
+def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.ndarray:
     """What a view shows of each Gaussian, as a share of what it would alone and whole. [N]"""
-    posed = scene_render.pose_frame(scene, frame)
-    gaussians = scene_render.PosedGaussians(posed)
+    posed = scene_renderer.pose_frame(scene, frame)
+    gaussians = scene_renderer.PosedGaussians(posed)
     ones = torch.ones(len(posed.means), 1, requires_grad=True)
     output = rasterize(gaussians, camera, ones, colors=torch.zeros(len(posed.means), 3))
     assert output.features is not None
@@ -283,7 +287,7 @@ def table(fitted: float, test: Sums, val: Sums) -> list[dict[str, Any]]:
 
 def measure(scene: Scene, dataset: datasets.Dataset) -> dict[str, Any]:
     """All rows of the benchmark in JSON types."""
-    sight, player = Sight(scene, dataset.train), playback.Player(scene)
+    sight, player = Sight(scene, dataset.train), scene_player.Player(scene)
     fitted = float(sum(p.squares.sum() for p in pictures(scene, dataset.test, player.frame)))
     test = add_up(scene, sight, pictures(scene, dataset.test, oracle(scene, dataset)))
     val = add_up(scene, sight, pictures(scene, dataset.val, player.frame))

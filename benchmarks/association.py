@@ -1,9 +1,9 @@
 """Spoils true masks and repairs them: `python benchmarks/association.py --seeds judging`.
 
 Synthetic scenes (`association_scenes.py`) are seen through Gaussians at wrong places; their masks are spoilt as
-trackers do (`association_masks.py`) and given to `semantics.association`. ``in``: the masks as they come;
+trackers do (`association_masks.py`) and given to `association.associate`. ``in``: the masks as they come;
 ``majority``: every Gaussian takes the id it shows most; ``sequential``: image by image with a fixed threshold
-(`association_sequential.py`); ``ours``: with the segments' new ids; ``mended``: with `semantics.mending`, too;
+(`association_sequential.py`); ``ours``: with the segments' new ids; ``mended``: with `association.mending`, too;
 ``oracle``: every segment named after the true object that most of it is. All are mIoU with one map of ids for all
 images (`association_masks.miou`). ``found`` is the number of objects, ``precision`` and ``recall`` are those of the
 switches in the list, ``usual`` is the median overlap of a segment with the other images' votes.
@@ -23,7 +23,7 @@ import association_scenes
 import association_sequential
 import numpy as np
 
-from r5dgs_core.semantics import association, bags, mending
+from r5dgs_core.association import associate, mending, segment_stack
 
 SEEDS = {"development": (1, 2, 3), "judging": (101, 102, 103, 104, 105)}
 ERRORS_PX = (0.0, 0.7, 1.5, 3.0)
@@ -45,10 +45,10 @@ def measure(plan: association_scenes.Plan, case: str, error_px: float, model: st
     count = len(scene.paths)
     start = time.process_time()
     given = [
-        bags.from_pixels(mask, image.indices, image.weights, count, view=image.view, time=image.time)
+        segment_stack.from_pixels(mask, image.indices, image.weights, count, view=image.view, time=image.time)
         for mask, image in zip(masks, images, strict=True)
     ]
-    found = association.associate(given)
+    found = associate.associate(given)
     seconds = time.process_time() - start
     ours = [mending.relabel(mask, bag.ids, ids) for mask, bag, ids in zip(masks, given, found.ids, strict=True)]
     mended = []
@@ -77,12 +77,12 @@ def measure(plan: association_scenes.Plan, case: str, error_px: float, model: st
 def sequential(masks: Sequence[np.ndarray], images: Sequence[association_scenes.Image], count: int) -> list[np.ndarray]:
     """Masks relabelled by `association_sequential` from the one Gaussian with most weight in each pixel."""
     given = [
-        bags.from_pixels(
+        segment_stack.from_pixels(
             mask, image.indices[:, :1], np.ones_like(image.weights[:, :1]), count, view=image.view, time=image.time
         )
         for mask, image in zip(masks, images, strict=True)
     ]
-    stack = bags.stack(given)
+    stack = segment_stack.stack(given)
     labels = np.maximum(association_sequential.associate(stack), 0)
     return [
         mending.relabel(mask, bag.ids, labels[stack.images == k])
@@ -100,13 +100,15 @@ def large(seed: int) -> dict[str, float]:
     tree_s = time.perf_counter() - start
     start = time.perf_counter()
     given = [
-        bags.from_pixels(mask, image.indices, image.weights, len(scene.paths), view=image.view, time=image.time)
+        segment_stack.from_pixels(
+            mask, image.indices, image.weights, len(scene.paths), view=image.view, time=image.time
+        )
         for mask, image in zip(masks, images, strict=True)
     ]
     bags_s = time.perf_counter() - start
     images_mb = sum(i.indices.nbytes + i.weights.nbytes + i.truth.nbytes for i in images) / 2**20
     start = time.perf_counter()
-    found = association.associate(given, neighbours, paths=scene.paths[:, ::5])
+    found = associate.associate(given, neighbours, paths=scene.paths[:, ::5])
     seconds = time.perf_counter() - start
     ours = [mending.relabel(mask, bag.ids, ids) for mask, bag, ids in zip(masks, given, found.ids, strict=True)]
     return {

@@ -12,8 +12,8 @@ import numpy as np
 from association_scenes import Image
 from scipy import ndimage, optimize
 
+from r5dgs_core.association.associate import Row
 from r5dgs_core.data.masks import UNKNOWN
-from r5dgs_core.semantics.association import Row
 
 
 @dataclass(frozen=True)

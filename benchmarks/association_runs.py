@@ -21,12 +21,14 @@ import association_masks
 import numpy as np
 from association_scenes import Image
 
-from r5dgs_core import commands_association
+from r5dgs_core.bake import bake
+from r5dgs_core.cli import associate
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
-from r5dgs_core.report import evaluate
-from r5dgs_core.semantics import videos
-from r5dgs_core.train import bake, config, run
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.masks import videos
+from r5dgs_core.train import run
 
 
 def spoil(dataset: datasets.Dataset, folder: Path, errors: association_masks.Errors, seed: int) -> None:
@@ -88,7 +90,7 @@ def main(arguments: list[str] | None = None) -> None:
         (plain / f"{view.name}.png").write_bytes((spoilt / f"{view.name}.png").read_bytes())
     options = {"iterations": args.iterations, "seed": args.seed}
     train(data, datasets.NO_MASKS, out / "without", **options)
-    commands_association.run_associate(out / "without", data, masks=spoilt, out=associated)
+    associate.run_associate(out / "without", data, masks=spoilt, out=associated)
     rows = {
         "true masks": {"masks": 1.0, **train(data, datasets.MASKS, out / "true", **options)},
         "spoilt, as they are": {

@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from r5dgs_core.semantics import bags, votes
+from r5dgs_core.association import leave_one_out, segment_stack
 
 THRESHOLD = 0.25
 FEWEST = 4
 PASSES = 3
 
 
-def associate(stack: bags.Stack, threshold: float = THRESHOLD, fewest: int = FEWEST) -> np.ndarray:
+def associate(stack: segment_stack.Stack, threshold: float = THRESHOLD, fewest: int = FEWEST) -> np.ndarray:
     """Object of each segment, 0 = background, -1 = none. [S]"""
     labels = np.where(stack.ids > 0, -1, 0)
     most = int((stack.ids > 0).sum())
@@ -51,7 +51,7 @@ def associate(stack: bags.Stack, threshold: float = THRESHOLD, fewest: int = FEW
         labels = np.where((labels > 0) & (shown[labels] < fewest), -1, labels)
         found = np.full_like(labels, -1)
         found[stack.ids == 0] = 0
-        for start, stop, overlap in zip(ends, ends[1:], votes.overlaps(stack, labels, count), strict=False):
+        for start, stop, overlap in zip(ends, ends[1:], leave_one_out.overlaps(stack, labels, count), strict=False):
             ious = overlap.ious * (stack.ids[start:stop] > 0)[:, None]
             ious[:, 0] = 0.0
             at, to = optimize.linear_sum_assignment(ious, maximize=True)

@@ -21,12 +21,13 @@ import association_masks
 import numpy as np
 from association_scenes import Image
 
+from r5dgs_core.association import mask_repair
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import masks as id_masks
-from r5dgs_core.raster import scene_render, warm_up
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import warm_up
+from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.semantics import mask_repair
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests import scenes  # noqa: E402  (the line before finds them)
@@ -40,7 +41,7 @@ def make_views(scene: Scene, images: int, pixels: int, folder: Path) -> tuple[li
     for k in range(CAMERAS):
         camera = scenes.orbit_camera(2 * np.pi * k / CAMERAS, pixels, pixels)
         for i, t in enumerate(np.linspace(0, scene.t_max, images // CAMERAS)):
-            ids = scene_render.render_frame(scene, playback.frame(scene, float(t)), camera, background=None).ids
+            ids = scene_renderer.render_frame(scene, scene_player.frame(scene, float(t)), camera, background=None).ids
             assert ids is not None
             truth.append(Image(k, i, np.maximum(ids.numpy(), 0).astype(np.int32).reshape(-1), nothing, nothing))
             path = folder / f"camera{k}_{i:03d}.png"

@@ -17,10 +17,10 @@ import torch
 import workloads
 from timing import Contender, take_turns
 
-from r5dgs_core.raster import compile as compilation
 from r5dgs_core.raster import rasterize_splats
-from r5dgs_core.raster.backdrop import Backdrop
-from r5dgs_core.raster.cpu_projection import TILE
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster.cpu.projection import TILE
+from r5dgs_core.render.static_layer import Backdrop
 
 COLUMNS = ("workload", "threads", "moving", "covered", "build_ms", "all_ms", "backdrop_ms", "ratio")
 

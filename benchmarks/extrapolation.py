@@ -19,23 +19,25 @@ from typing import Any
 
 import numpy as np
 
+from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data.dataset import Dataset
-from r5dgs_core.report import evaluate, image_rows, pose_rows
-from r5dgs_core.scene import playback
+from r5dgs_core.error_vs_time import image_task, pose_task
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.playback import scene_player
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import bake, checkpoint
+from r5dgs_core.train import checkpoint
 
 ORACLE = "true poses"
 
 
 def refitted(scene: Scene, name: str) -> Scene:
     """The scene with one motion model for all bodies: a swing where there is one, else the steady motion beside it."""
-    names = (name, pose_rows.STEADY[name]) if name in pose_rows.STEADY else (name,)
+    names = (name, pose_task.STEADY[name]) if name in pose_task.STEADY else (name,)
     groups = []
     for group in scene.groups:
         if group.role == "body" and np.any(scene.track_poses[group.id][:, 1:] != 0):
-            group = dataclasses.replace(group, model=pose_rows.fit_group(scene, group, names).model)
+            group = dataclasses.replace(group, model=pose_task.fit_group(scene, group, names).model)
         groups.append(group)
     return dataclasses.replace(scene, groups=tuple(groups))
 
@@ -45,14 +47,14 @@ def measure(folder: Path, split: str) -> dict[str, Any]:
     run = checkpoint.open_run(folder)
     dataset = datasets.read(run.data())
     scene = bake.bake(run, dataset)
-    ways: dict[str, Callable[[float], playback.Frame]]
+    ways: dict[str, Callable[[float], scene_player.Frame]]
     if scene.dynamics is not None:
-        ways = {mode: playback.Player(scene, mode).frame for mode in playback.modes(scene)}
+        ways = {mode: scene_player.Player(scene, mode).frame for mode in scene_player.modes(scene)}
     else:
-        ways = {name: playback.Player(refitted(scene, name)).frame for name in pose_rows.MODELS}
-        ways["chosen"] = playback.Player(scene).frame
+        ways = {name: scene_player.Player(refitted(scene, name)).frame for name in pose_task.MODELS}
+        ways["chosen"] = scene_player.Player(scene).frame
     views = dataset.views(split)
-    oracle, why = image_rows.true_move(scene, dataset, [view.t for view in views])
+    oracle, why = image_task.true_move(scene, dataset, [view.t for view in views])
     if oracle is None:
         print(f"{folder}: no oracle: {why}")
     else:
@@ -79,7 +81,7 @@ def _training(run: checkpoint.Run) -> str:
 
 def _objects(scene: Scene, dataset: Dataset) -> list[dict[str, Any]]:
     """Errors of poses at the last time, in diameters and degrees, and the share of errors outside the 2-sigma band."""
-    rows, _ = pose_rows.measure(scene, dataset.ground_truth, 1, "cpu")
+    rows, _ = pose_task.measure(scene, dataset.ground_truth, 1, "cpu")
     rows = [row for row in rows if row.error_kind in ("position", "rotation", "outside_band")]
     return [{"mode": row.mode, "method": row.method, "kind": row.error_kind, "error": row.error} for row in rows]
 

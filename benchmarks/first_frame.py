@@ -28,15 +28,16 @@ def first_frame(count: int, size: int, sh_degree: int, sky_degree: int) -> dict[
     start = time.perf_counter()
     import frame_rate
 
-    from r5dgs_core.raster import cpu, cpu_harmonics, cpu_sky, scene_render  # noqa: F401  (all that frames import)
-    from r5dgs_core.scene import playback
+    from r5dgs_core.playback import scene_player
+    from r5dgs_core.raster.cpu import cpu_backend, sh_kernels, sky  # noqa: F401  (all that frames import)
+    from r5dgs_core.render import scene_renderer  # noqa: F401  (all that frames import)
 
     imported = time.perf_counter()
     camera = frame_rate.make_camera(size)
     scene = frame_rate.make_scene(count, 6, sh_degree, sky_degree, camera)
     marks = [time.perf_counter()]
     for t in (0.1, 0.2):
-        scene_render.render_frame(scene, playback.frame(scene, t), camera)
+        scene_renderer.render_frame(scene, scene_player.frame(scene, t), camera)
         marks.append(time.perf_counter())
     return dict(zip(TIMES, (imported - start, marks[1] - marks[0], marks[2] - marks[1]), strict=True))
 

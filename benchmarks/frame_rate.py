@@ -23,10 +23,12 @@ import numpy as np
 import torch
 
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.raster import RenderOutput, scene_render, stage
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster.scene_render import Instance
-from r5dgs_core.scene import playback, row_runs
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import RenderOutput
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.render import incremental_renderer, scene_renderer
+from r5dgs_core.render.scene_renderer import Instance
+from r5dgs_core.scene import row_runs
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
 
@@ -121,7 +123,7 @@ def _room(random: np.random.Generator, cuts: list[int]) -> np.ndarray:
 
 def instances_at(scene: Scene, t: float) -> list[Instance]:
     """The groups at a time as the add-on sends them: ranges of Gaussians, each with a matrix."""
-    quats, displacements = playback.group_poses(scene, t)
+    quats, displacements = scene_player.group_poses(scene, t)
     turns = rotations.quats_to_rotmats(quats)
     found = []
     for start, stop, g in row_runs.runs(scene.motion_ids):
@@ -133,7 +135,7 @@ def instances_at(scene: Scene, t: float) -> list[Instance]:
 
 def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camera: Camera) -> None:
     """Raise AssertionError where the picture of a stage is not that of all Gaussians drawn anew."""
-    anew = scene_render.render_frame(scene, scene_render.pose_instances(scene, instances), camera)
+    anew = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, instances), camera)
     for name in ("color", "alpha"):
         difference = (getattr(staged, name) - getattr(anew, name)).abs().max().item()
         if not difference <= TOLERANCE:
@@ -143,16 +145,16 @@ def compare(staged: RenderOutput, scene: Scene, instances: list[Instance], camer
 def measure(scene: Scene, camera: Camera, frames: int) -> dict[str, float]:
     """Medians over frames spread over twice the observed time, in milliseconds, and frames per second."""
     parts: dict[str, list[float]] = {"ms_frame": [], "ms_motion": [], "ms_colors": [], "ms_stage": []}
-    theatre = stage.Stage(scene)
+    theatre = incremental_renderer.Stage(scene)
     for t in [0.1 * T_MAX, *np.linspace(0, 2 * T_MAX, frames)]:  # the first one warms up and is not counted
         start = time.perf_counter()
-        frame = playback.frame(scene, float(t))
+        frame = scene_player.frame(scene, float(t))
         moved = time.perf_counter()
-        scene_render.render_frame(scene, frame, camera)
+        scene_renderer.render_frame(scene, frame, camera)
         drawn = time.perf_counter()
-        posed = scene_render.pose_frame(scene, frame)
-        scene_render.colors(posed, camera)
-        scene_render.sky(scene, camera)
+        posed = scene_renderer.pose_frame(scene, frame)
+        scene_renderer.colors(posed, camera)
+        scene_renderer.sky(scene, camera)
         colored = time.perf_counter()
         instances = instances_at(scene, float(t))
         staged = theatre.render(instances, camera)

@@ -15,10 +15,9 @@ import numpy as np
 import torch
 from timing import Contender, take_turns
 
-from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster import harmonics
-from r5dgs_core.scene import cameras
+from r5dgs_core.raster import shade
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.scene import cameras, sh_color
 from r5dgs_core.scene.cameras import Camera
 
 COLUMNS = ("work", "degree", "way", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb", "ratio")
@@ -34,10 +33,10 @@ def colors(count: int, degree: int, fused: bool) -> dict[str, Callable]:
 
     def forward_backward():
         leaves = means.detach().requires_grad_(), sh.detach().requires_grad_()
-        harmonics.seen_colors(*leaves, eye, fused=fused).backward(upstream)
+        shade.seen_colors(*leaves, eye, fused=fused).backward(upstream)
 
     return {
-        "forward": lambda: harmonics.seen_colors(means, sh, eye, fused=fused),
+        "forward": lambda: shade.seen_colors(means, sh, eye, fused=fused),
         "forward_backward": forward_backward,
     }
 
@@ -47,8 +46,8 @@ def sky(size: int, degree: int, fused: bool) -> dict[str, Callable]:
     camera = Camera(size, size, np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]]), np.eye(4))
     sh = np.random.default_rng(degree).normal(size=((degree + 1) ** 2, 3))
     if fused:
-        return {"sky": lambda: harmonics.sky(sh, camera)}
-    return {"sky": lambda: np.clip(spherical_harmonics.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)}
+        return {"sky": lambda: shade.sky(sh, camera)}
+    return {"sky": lambda: np.clip(sh_color.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -24,11 +24,13 @@ from typing import Any
 
 import numpy as np
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.raster import warming
-from r5dgs_core.report import evaluate
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.render import warm_up
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.train import bake, config, run
+from r5dgs_core.train import run
 
 
 def held_out(times: Sequence[float], every: int, offset: int, sparse: bool = False) -> list[float]:
@@ -97,7 +99,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    warming.warm_up()
+    warm_up.warm_up()
     settings = config.load(None, args.set)
     dataset = datasets.read(args.data)
     removed = held_out([v.t for v in dataset.train], args.every, args.offset, args.sparse)

@@ -121,11 +121,13 @@ def measure(data: Path, folder: Path, gaussians: int, steps: int, overrides: lis
     """Train and bake; returns a row for each phase."""
     print(f"{'phase':<34} {'Gaussians':>9} {'peak MB':>8} {'CPU s':>8}")
     phases = Phases()
+    from r5dgs_core.bake import bake
+    from r5dgs_core.config import config
     from r5dgs_core.data import dataset as datasets
-    from r5dgs_core.raster import warming
-    from r5dgs_core.train import bake, checkpoint, config, run
+    from r5dgs_core.render import warm_up
+    from r5dgs_core.train import checkpoint, run
 
-    warming.warm_up()
+    warm_up.warm_up()
     phases.mark("imports and kernels")
     growth = 2 * int(np.ceil(np.log2(max(2.0, gaussians / 1000))))
     settings = config.load(

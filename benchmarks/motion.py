@@ -1,7 +1,7 @@
 """Times the motion stage of a frame beside what TRACE computes for one: `python benchmarks/motion.py [--json FILE]`.
 
 A generated scene of ``--gaussians`` Gaussians in ``--bodies`` bodies that turn and fly, all moving, with dynamics of
-their own, is played past t_max in every mode by a `playback.Player`. Rows:
+their own, is played past t_max in every mode by a `scene_player.Player`. Rows:
 
     networks   what TRACE evaluates for every frame: deformation field and TRD of its sizes for all Gaussians (with
                random weights), then TRACE's midpoint steps of all of them
@@ -29,8 +29,8 @@ import numpy as np
 import torch
 
 from r5dgs_core.model import deformation, trd
-from r5dgs_core.motion import dynamics, models, rotations, se3
-from r5dgs_core.scene import group_dynamics, playback
+from r5dgs_core.motion import models, point_dynamics, rotations, se3
+from r5dgs_core.playback import group_dynamics, scene_player
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
 
 T_MAX = 0.75
@@ -128,16 +128,16 @@ class Networks:
         """Field, TRD, and TRACE's midpoint steps of every Gaussian."""
         points, state = self.deform(), self.states()
         with torch.no_grad():
-            dynamics.rk2(
+            point_dynamics.rk2(
                 points, state.equiv_velocity, state.angular_velocity, state.equiv_acceleration,
-                state.angular_acceleration, t - T_MAX, dynamics.TRACE_STEP,
+                state.angular_acceleration, t - T_MAX, point_dynamics.TRACE_STEP,
             )  # fmt: skip
 
 
 def contenders(count: int, bodies: int, size: str, horizon: float) -> dict[tuple[str, str], Callable[[float], object]]:
     """What is timed, by stage and name: functions of a share of the horizon, in [0, 1]."""
     scene = make_scene(count, bodies)
-    networks, bent = Networks(scene, size), playback.Player(bending(scene))
+    networks, bent = Networks(scene, size), scene_player.Player(bending(scene))
     calls: dict[tuple[str, str], Callable[[float], object]] = {
         ("networks", "field"): lambda _: networks.deform(),
         ("networks", "TRD"): lambda _: networks.states(),
@@ -147,10 +147,10 @@ def contenders(count: int, bodies: int, size: str, horizon: float) -> dict[tuple
         motion = group_dynamics.GroupMotion(make_scene(bodies * 4, bodies, kind))
         calls["poses", kind] = lambda s, motion=motion: motion.poses(T_MAX + s * horizon)
     calls["poses", "observed"] = lambda s, motion=motion: motion.poses(s * T_MAX)
-    for mode in playback.modes(scene):
-        player = playback.Player(scene, mode)
+    for mode in scene_player.modes(scene):
+        player = scene_player.Player(scene, mode)
         calls["frame", mode] = lambda s, player=player: player.frame(T_MAX + s * horizon, ORIGIN)
-    player = playback.Player(scene)
+    player = scene_player.Player(scene)
     calls["frame", "observed"] = lambda s: player.frame(s * T_MAX, ORIGIN)
     calls["bending", "observed"] = lambda s: bent.frame(s * T_MAX, ORIGIN)
     return calls

@@ -101,10 +101,10 @@ class Remote(timing.Contender):
 
 def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Callable[[], Callable]) -> None:
     """Answer requests until the other end closes."""
-    from r5dgs_core.raster import compile as compilation
-    from r5dgs_core.raster import lanes
+    from r5dgs_core.raster.cpu import compilation
+    from r5dgs_core.raster.cpu.simd import float32x16
 
-    lanes._EXP2 = coefficients
+    float32x16._EXP2 = coefficients
     torch.set_num_threads(1)
     compilation.set_threads(1)
     run = make_run()

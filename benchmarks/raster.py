@@ -8,7 +8,7 @@ all alike. Times are of whole calls, checks included. Passes:
 
     forward           without gradients
     forward_backward  with gradients of every input
-    motion            scenes only: from the scene file's arrays to Gaussians at a time (`playback.frame`)
+    motion            scenes only: from the scene file's arrays to Gaussians at a time (`scene_player.frame`)
     frame             scenes only: motion, colours seen from the camera, forward, ids; what playback costs
 
 The threads are the rasterizer's. Beside the backend `cpu`, torch's own few operations run on one, or its waiting
@@ -42,8 +42,10 @@ import workloads
 from workloads import Workload
 
 from r5dgs_core import errors
-from r5dgs_core.raster import backends, rasterize_splats, scene_render
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import backends, rasterize_splats
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import scene_file
 
 COLUMNS = ("workload", "backend", "threads", "pass", "cpu_ms", "wall_ms_min", "wall_ms_median", "peak_mb")
 DEFAULT_WORKLOADS = ["W1", "W2", "W3", "W4"]
@@ -193,7 +195,7 @@ def _contenders(
         yield contender(backend, "forward", functools.partial(draw, placed, backend))
         yield contender(backend, "forward_backward", functools.partial(step, placed, backend, gradient))
         if workload.scene is not None:
-            yield contender(backend, "motion", functools.partial(playback.frame, workload.scene, workload.t))
+            yield contender(backend, "motion", functools.partial(scene_player.frame, workload.scene, workload.t))
             yield contender(backend, "frame", functools.partial(play, workload, backend))
     for peer in peers:
         if hasattr(peer, "supports") and not peer.supports(workload.name):
@@ -232,8 +234,8 @@ def step(workload: Workload, backend: str, upstream: torch.Tensor) -> None:
 def play(workload: Workload, backend: str) -> None:
     """One frame of a scene, from its file's arrays to pixels."""
     assert workload.scene is not None
-    frame = playback.frame(workload.scene, workload.t)
-    scene_render.render_frame(workload.scene, frame, workload.camera, backend=backend)
+    frame = scene_player.frame(workload.scene, workload.t)
+    scene_renderer.render_frame(workload.scene, frame, workload.camera, backend=backend)
 
 
 def _split(workload: Workload, threads: int, repeats: int) -> str:
@@ -267,7 +269,7 @@ def _compare_images(peer: ModuleType, workload: Workload) -> str:
 
 @contextmanager
 def _rasterizer_threads(count: int) -> Iterator[None]:
-    from r5dgs_core.raster import compile as compilation
+    from r5dgs_core.raster.cpu import compilation
 
     before = compilation.threads()
     compilation.set_threads(count)

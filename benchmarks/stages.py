@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster.cpu import compilation
 
-PACKAGE = "r5dgs_core.raster."
+PACKAGES = ("r5dgs_core.raster.", "r5dgs_core.render.")
 
 
 def measure(run: Callable[[], object], repeats: int) -> dict[str, float]:
@@ -35,7 +35,9 @@ def measure(run: Callable[[], object], repeats: int) -> dict[str, float]:
 
 @contextmanager
 def _watch() -> Iterator[dict[str, float]]:
-    """Milliseconds by kernel while the context lasts: kernels and `compile.run` are wrapped where Python finds them."""
+    """Milliseconds by kernel while the context lasts: kernels and `compilation.run` are wrapped where Python finds
+    them.
+    """
     spent: dict[str, float] = defaultdict(float)
     inside = [False]  # a kernel that `run` calls is not counted twice; only the calling thread looks at this
 
@@ -57,7 +59,7 @@ def _watch() -> Iterator[dict[str, float]]:
 
     runners = {compilation.run, compilation.run_parts}
     replaced = []
-    for module in [m for name, m in sys.modules.items() if name.startswith(PACKAGE)]:
+    for module in [m for name, m in sys.modules.items() if name.startswith(PACKAGES)]:
         for name, value in list(vars(module).items()):
             if isinstance(value, Callable) and value in runners:
                 wrapper = wrap(value, lambda arguments: arguments[0].py_func.__name__)

@@ -17,8 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import config, trainer, warming
+from r5dgs_core.train import trainer, warm_up
 
 VARIANTS = {
     "tracks": [],
@@ -64,7 +65,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    warming.warm_up()
+    warm_up.warm_up()
     dataset = datasets.read(args.data)
     rows = []
     print(f"{'':32} {'Gaussians':>9} {'median ms':>9} {'least ms':>9}")

@@ -15,10 +15,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.evaluation import evaluate
 from r5dgs_core.raster import warm_up
-from r5dgs_core.report import evaluate
-from r5dgs_core.train import bake, config, run
+from r5dgs_core.train import run
 
 
 def measure(data: Path, iterations: int, overrides: list[str]) -> dict[str, Any]:

@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from r5dgs_core.language import build_table, query
+from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
-from r5dgs_core.semantics import encoder_registry, encoders, lookup_table, query
 
 NAMES = {
     "kitchen": ("mug", "lemon", "apple", "donut", "cutting board", "bowl"),
@@ -84,14 +85,14 @@ ABSENT = (
 class Remembering:
     """An encoder that embeds each text once: the tables have most of theirs in common."""
 
-    def __init__(self, encoder: encoders.Encoder):
+    def __init__(self, encoder: encoder_base.Encoder):
         self.card = encoder.card
         self.embed_images = encoder.embed_images
         self._encoder = encoder
         self._known: dict[str, np.ndarray] = {}
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """As `encoders.Encoder`."""
+        """As `encoder_base.Encoder`."""
         fresh = [text for text in dict.fromkeys(texts) if text not in self._known]
         self._known |= dict(zip(fresh, self._encoder.embed_texts(fresh), strict=True))
         return np.stack([self._known[text] for text in texts])
@@ -126,9 +127,9 @@ def named(names: tuple[str, ...]) -> Scene:
     )
 
 
-def measure(name: str, encoder: encoders.Encoder) -> dict[str, Any]:
+def measure(name: str, encoder: encoder_base.Encoder) -> dict[str, Any]:
     """One row: counts, and what went wrong."""
-    scene = lookup_table.make(named(NAMES[name]), encoder).scene
+    scene = build_table.make(named(NAMES[name]), encoder).scene
     called = {item.id: item.name for item in scene.objects}
     row: dict[str, Any] = {"table": name, "present": 0, "top1": 0, "all": 0, "wrong": []}
     row |= dict.fromkeys(("hits", "right", "found", "absent", "nothing"), 0)
@@ -157,7 +158,7 @@ def main() -> None:
     parser.add_argument("--encoder", default="text", help="folder, or text")
     parser.add_argument("--json", type=Path, help="where the rows go")
     args = parser.parse_args()
-    encoder = Remembering(encoder_registry.open_encoder(args.encoder))
+    encoder = Remembering(registry.open_encoder(args.encoder))
     rows = [measure(name, encoder) for name in NAMES]
     total: dict[str, Any] = {key: sum(row[key] for row in rows) for key in rows[0] if isinstance(rows[0][key], int)}
     print(

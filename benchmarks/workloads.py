@@ -19,8 +19,9 @@ import tabletop
 import torch
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import RasterSettings, scene_render
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import RasterSettings
+from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene
 
@@ -78,13 +79,13 @@ def check(name: str, garden: Path | None = None) -> None:
 
 def pose_scene(name: str, scene: Scene, camera: Camera, t: float) -> Workload:
     """A scene at a time, drawn as playback poses it."""
-    posed = scene_render.pose_frame(scene, playback.frame(scene, t))
+    posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, t))
     inputs = _tensors(
         posed.means,
         posed.quats,
         np.exp(posed.log_scales.astype(np.float64)),
         1 / (1 + np.exp(-posed.opacity_logits.astype(np.float64))),
-        scene_render.colors(posed, camera),
+        scene_renderer.colors(posed, camera),
     )
     return Workload(name, inputs, camera, RasterSettings(near_plane=scene.near_plane), scene, t)
 

@@ -13,7 +13,7 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene.point_edits import PointEdit
+from ..r5dgs_core.editing.point_edits import PointEdit
 from . import amounts, clouds, displays
 
 PARTS = {

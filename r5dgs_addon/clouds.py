@@ -6,7 +6,7 @@ import hashlib
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import harmonics
+from ..r5dgs_core.scene import spherical_harmonics
 from ..r5dgs_core.scene.scene import Scene
 from . import compat
 
@@ -52,7 +52,7 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     log_scales = scene.log_scales[rows]
     opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
-    shown = srgb_to_linear(0.5 + harmonics.C0 * sh[:, 0].astype(np.float64))
+    shown = srgb_to_linear(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
     radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
     written = {
@@ -130,7 +130,7 @@ def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
     base = np.empty(4 * len(cloud.points), np.float32)
     stored.data.foreach_get("color", base)
     colors = base.reshape(-1, 4).astype(np.float64)
-    colors[:, :3] = srgb_to_linear(tint * (0.5 + harmonics.C0 * colors[:, :3]))
+    colors[:, :3] = srgb_to_linear(tint * (0.5 + spherical_harmonics.C0 * colors[:, :3]))
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", colors)
     cloud.update_tag()
 

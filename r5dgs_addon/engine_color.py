@@ -10,7 +10,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import view_inverse
+from ..r5dgs_core.color import view_inverse
 from . import compat, engine_settings, engine_view
 
 STANDARD = "Standard"

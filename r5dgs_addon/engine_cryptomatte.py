@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import cryptomatte
+from ..r5dgs_core.formats import cryptomatte
 from . import picture
 
 LAYER = "CryptoObject"

@@ -10,7 +10,7 @@ import functools
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import view_inverse
+from ..r5dgs_core.color import view_inverse
 from . import clouds, engine_color, engine_view, loaded_scenes, windows
 
 ENOUGH_DB = 40.0  # below it, the loss is worth a warning

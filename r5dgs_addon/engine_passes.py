@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import cameras, view_inverse
+from ..r5dgs_core.color import view_inverse
+from ..r5dgs_core.scene import cameras
 from . import compat, engine_color, engine_cryptomatte, picture, visible
 
 NOTHING = 1e10  # depth where there is nothing, as Blender's own engines write it

@@ -18,7 +18,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..r5dgs_core.scene import view_inverse
+from ..r5dgs_core.color import view_inverse
 from . import compat, windows
 
 DISPLAY = "sRGB"  # what pictures were trained for

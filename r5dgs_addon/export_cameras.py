@@ -7,8 +7,10 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import camera_files, cameras, carried
-from ..r5dgs_core.scene.camera_files import View
+from ..r5dgs_core.formats import camera_files
+from ..r5dgs_core.formats.camera_files import View
+from ..r5dgs_core.playback import affine_transform
+from ..r5dgs_core.scene import cameras
 from . import amounts, export_frames, export_gaussians, loaded_scenes, timeline, views, visible
 from .running import Outcome, Step, Steps
 
@@ -120,7 +122,7 @@ def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str,
     """
     own = views.of_camera(depsgraph, lambda: np.zeros((0, 3)), camera, border=False).camera
     turn = export_gaussians.world_to(axes, world)
-    if not carried.is_similarity(turn[:3, :3]) or np.linalg.det(turn[:3, :3]) < 0:
+    if not affine_transform.is_similarity(turn[:3, :3]) or np.linalg.det(turn[:3, :3]) < 0:
         raise errors.ConfigError("export: expected a root with one scale on all axes, found another; choose other axes")
     matrix = turn @ cameras.cam_world_to_opengl(own.T_cam_world)
     return cameras.Camera(own.width, own.height, own.intrinsics, cameras.opengl_to_cam_world(matrix), camera.name)

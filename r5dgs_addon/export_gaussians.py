@@ -7,8 +7,11 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras, carried, ply, point_edits, scene_file
-from ..r5dgs_core.scene.residuals import Residuals
+from ..r5dgs_core.editing import point_edits
+from ..r5dgs_core.formats import ply
+from ..r5dgs_core.playback import affine_transform
+from ..r5dgs_core.playback.residuals import Residuals
+from ..r5dgs_core.scene import cameras, scene_file
 from ..r5dgs_core.scene.scene import Scene
 from . import amounts, cloud_points, export_frames, loaded_scenes, look, picture, visible
 from .running import Outcome, Step, Steps
@@ -121,10 +124,10 @@ def splats_of(
             parts.append(_placed(scene, one, matrix, turn, sources))
         else:
             points = from_points(cloud_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)
-            parts.append(carried.carry(points, matrix, np.array(one.tint)))
-        if parts[-1].sh.shape[1] > 1 and not carried.is_similarity(matrix[:3, :3]):
+            parts.append(affine_transform.carry(points, matrix, np.array(one.tint)))
+        if parts[-1].sh.shape[1] > 1 and not affine_transform.is_similarity(matrix[:3, :3]):
             sources.note(f"{names[-1]}: scaled unevenly; how its colors change with the direction is a best fit")
-    return carried.join(parts), names
+    return affine_transform.join(parts), names
 
 
 def _placed(scene: Scene, one: visible.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources) -> ply.Splats:
@@ -137,9 +140,9 @@ def _placed(scene: Scene, one: visible.Instance, matrix: np.ndarray, turn: np.nd
         bending = None if scene is whole else Residuals(scene)
     bend = None
     if one.t is not None:
-        bend = carried.bend_of(bending or sources.bending(one.collection), one.t, start, count)
+        bend = affine_transform.bend_of(bending or sources.bending(one.collection), one.t, start, count)
     tint = None if one.tint == look.NONE else np.array(one.tint)
-    return carried.place(scene, start, count, matrix, world=turn @ one.world, tint=tint, bend=bend)
+    return affine_transform.place(scene, start, count, matrix, world=turn @ one.world, tint=tint, bend=bend)
 
 
 def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:

@@ -8,8 +8,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..r5dgs_core import errors
-from ..r5dgs_core.scene import files, image_files
+from ..r5dgs_core import atomic_files, errors
+from ..r5dgs_core.formats import image_files
 from . import amounts, engine_passes, export_cameras, export_frames, picture, table, views, worker
 from .running import Outcome, Step, Steps
 
@@ -56,7 +56,9 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
             names |= _names(seen)
             try:
                 _write(folder, export_cameras.image_name(frame), format, *planes(seen, arrays))
-                files.write(folder / "objects.json", (json.dumps(names, indent=1, ensure_ascii=False) + "\n").encode())
+                atomic_files.write(
+                    folder / "objects.json", (json.dumps(names, indent=1, ensure_ascii=False) + "\n").encode()
+                )
             except OSError as error:
                 raise errors.SceneFileError(f"{folder}: cannot be written: {error}") from error
     return Outcome(f"{folder}: {amounts.of(len(frames), 'frame')} of {amounts.of(len(names), 'object')}")

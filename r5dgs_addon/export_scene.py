@@ -7,7 +7,8 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras, edited, point_edits, scene_file
+from ..r5dgs_core.editing import edited_scene, point_edits
+from ..r5dgs_core.scene import cameras, scene_file
 from ..r5dgs_core.scene.scene import Scene, SceneObject
 from . import (
     amounts,
@@ -84,7 +85,7 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
     placed = {id(member): place for member, place in zip(changed, places, strict=True)}
     pieces = [piece for member in members for piece in _pieces(member, extended, placed.get(id(member)))]
-    result, notes = edited.edit(extended, pieces, when, _table(collection, source, members, names))
+    result, notes = edited_scene.edit(extended, pieces, when, _table(collection, source, members, names))
     notes += _lost_points(members, source, extended)
     yield Step(
         len(when) + 1, len(when) + 2, f"packing {amounts.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
@@ -212,7 +213,7 @@ def _matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray
     return np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
 
 
-def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> list[edited.Piece]:
+def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> list[edited_scene.Piece]:
     """A cloud as what the core writes; nothing if nothing is left of it.
 
     Args:
@@ -231,7 +232,7 @@ def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> 
     keys = motion_physics.key_error(anchor)[0] if remembers else 0.0
     model = motion_physics.model(anchor) if remembers else None
     return [
-        edited.Piece(
+        edited_scene.Piece(
             name=cloud.name,
             object_id=member.object_id,
             motion_id=cloud.r5dgs.motion_id,

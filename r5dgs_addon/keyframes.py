@@ -11,10 +11,11 @@ import math
 import bpy
 import numpy as np
 
-from ..r5dgs_core.motion import keyframes as reduction
+from ..r5dgs_core.motion import key_reduction as reduction
 from ..r5dgs_core.motion import rotations
-from ..r5dgs_core.motion.keyframes import Curves, Keys
-from ..r5dgs_core.scene import playback, row_runs
+from ..r5dgs_core.motion.key_reduction import Curves, Keys
+from ..r5dgs_core.playback import scene_player
+from ..r5dgs_core.scene import row_runs
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, timeline
 
@@ -123,8 +124,8 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
     """One key per knot, which is playback itself, or fewer keys where they hold the tolerance."""
     times = np.asarray(scene.track_times, np.float64)
     own = slice(motion_id, motion_id + 1)
-    quats, displacements = (values[0] for values in playback.knots(scene, own))
-    quat_slopes, displacement_slopes = (values[0] for values in playback.knot_slopes(scene, own))
+    quats, displacements = (values[0] for values in scene_player.knots(scene, own))
+    quat_slopes, displacement_slopes = (values[0] for values in scene_player.knot_slopes(scene, own))
     exact = Curves(
         Keys(times, displacements, displacement_slopes, displacement_slopes),
         Keys(times, quats, quat_slopes, quat_slopes),
@@ -174,7 +175,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
 
 
 def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
-    """Motion past t_max: the group's own model, or what it follows as `playback.group_poses` does."""
+    """Motion past t_max: the group's own model, or what it follows as `scene_player.group_poses` does."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
         return reduction.model_sampler(group.model, scene.t_max, most)

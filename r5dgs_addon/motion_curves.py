@@ -15,7 +15,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.motion import bezier
-from ..r5dgs_core.motion.keyframes import Keys
+from ..r5dgs_core.motion.key_reduction import Keys
 from . import compat, keyframes, timeline
 
 AT = 1e-3  # frames: a key this near counts as one at the frame

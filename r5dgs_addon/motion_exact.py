@@ -15,9 +15,11 @@ from bpy.app.handlers import persistent
 from bpy.props import BoolProperty, PointerProperty, StringProperty
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.motion import columns
-from ..r5dgs_core.scene import point_edits, residuals, scene_file
-from ..r5dgs_core.scene.residuals import Residuals
+from ..r5dgs_core.editing import point_edits
+from ..r5dgs_core.motion import quaternion_columns
+from ..r5dgs_core.playback import residuals
+from ..r5dgs_core.playback.residuals import Residuals
+from ..r5dgs_core.scene import scene_file
 from . import clouds, loaded_scenes, picture, remembered, timeline
 
 BIND = clouds.BIND
@@ -177,7 +179,7 @@ def _bend(
     if back:
         offsets, turns, growths = -offsets, turns * [[1], [-1], [-1], [-1]], -growths
     values["position"][points] += offsets.T
-    values["rotation"][points] = columns.multiply(turns.astype(np.float32), values["rotation"][points].T).T
+    values["rotation"][points] = quaternion_columns.multiply(turns.astype(np.float32), values["rotation"][points].T).T
     values["scale"][points] *= np.exp(growths.T)
     return values
 

@@ -12,9 +12,9 @@ import bpy
 import numpy as np
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.motion import keyframes as reduction
+from ..r5dgs_core.motion import key_reduction as reduction
 from ..r5dgs_core.motion import models, rotations
-from ..r5dgs_core.motion.keyframes import Keys
+from ..r5dgs_core.motion.key_reduction import Keys
 from ..r5dgs_core.scene import scene_file
 from ..r5dgs_core.scene.scene import Scene
 from . import compat, keyframes, loaded_scenes, motion_confidence, motion_curves, motion_physics, timeline

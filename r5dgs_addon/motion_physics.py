@@ -17,7 +17,7 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.motion import confidence, models, rotations, top
+from ..r5dgs_core.motion import confidence, free_top, models, rotations
 from ..r5dgs_core.motion.models import MotionModel
 from ..r5dgs_core.scene.scene import Scene
 from . import amounts, motion_curves, timeline
@@ -337,7 +337,7 @@ def inertia(anchor: bpy.types.Object) -> np.ndarray:
     points = _points(anchor)
     if len(points) == 0:
         return np.eye(3) / 3
-    body = top.inertia(points)
+    body = free_top.inertia(points)
     return body + _LEAST_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
 
 

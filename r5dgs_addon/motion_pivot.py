@@ -13,7 +13,7 @@ from bpy.props import FloatVectorProperty, PointerProperty
 from mathutils import Vector
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.motion import centers
+from ..r5dgs_core.motion import rotation_centers
 from ..r5dgs_core.motion.models import MotionModel
 from . import motion_curves, motion_extrapolate, motion_physics
 
@@ -33,7 +33,7 @@ def point(anchor: bpy.types.Object) -> np.ndarray | None:
 def axis(anchor: bpy.types.Object) -> np.ndarray | None:
     """Unit vector about which an anchor turns, or None where it does not turn. [3]"""
     model = _model(anchor)
-    return None if model is None else centers.axis(model)
+    return None if model is None else rotation_centers.axis(model)
 
 
 def move(anchor: bpy.types.Object, to: np.ndarray) -> None:
@@ -52,7 +52,7 @@ def move(anchor: bpy.types.Object, to: np.ndarray) -> None:
     offset = np.asarray(to, np.float64) - _place(anchor)
     if not np.isfinite(offset).all():
         raise errors.ConfigError(f"{anchor.name}: pivot: expected three finite numbers, found {tuple(to)}")
-    _store(anchor, centers.with_center(model, offset, old))
+    _store(anchor, rotation_centers.with_center(model, offset, old))
     anchor.r5dgs_motion.stored_pivot = offset
 
 
@@ -66,10 +66,10 @@ def turn(anchor: bpy.types.Object, direction: np.ndarray) -> None:
     """
     model = _model(anchor)
     length = float(np.linalg.norm(direction))
-    if model is None or centers.axis(model) is None or not 0 < length < np.inf:
+    if model is None or rotation_centers.axis(model) is None or not 0 < length < np.inf:
         return
     through = _offset(anchor)
-    _store(anchor, centers.with_axis(model, np.asarray(direction, np.float64), through))
+    _store(anchor, rotation_centers.with_axis(model, np.asarray(direction, np.float64), through))
     if through is not None:
         anchor.r5dgs_motion.stored_pivot = through
 
@@ -111,10 +111,10 @@ def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
     that, else the one nearest to the anchor.
     """
     model = _model(anchor)
-    found = None if model is None else centers.center(model)
+    found = None if model is None else rotation_centers.center(model)
     if model is None or found is None or model.kind in ("ballistic_spin", "translation"):
         return found
-    along = centers.axis(model)
+    along = rotation_centers.axis(model)
     assert along is not None  # what has a center and is no spring turns
     chosen = np.array(anchor.r5dgs_motion.stored_pivot, np.float64)
     on_axis = found + along * (along @ chosen)

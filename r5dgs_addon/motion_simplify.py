@@ -5,7 +5,7 @@ import numpy as np
 
 from ..r5dgs_core import errors
 from ..r5dgs_core.motion import bezier, rotations
-from ..r5dgs_core.motion import keyframes as reduction
+from ..r5dgs_core.motion import key_reduction as reduction
 from . import compat, keyframes, motion_curves, motion_extrapolate, motion_physics, timeline
 
 _FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames

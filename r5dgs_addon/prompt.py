@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 import bpy
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import lookup, scene_file
+from ..r5dgs_core.scene import scene_file
+from ..r5dgs_core.search import object_search
 from . import loaded_scenes, phrases, picture, remembered, selection, table, windows
 
 HISTORY = 12  # prompts kept
 ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
 STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
-_meanings: remembered.Remembered[lookup.Meanings | None] = remembered.Remembered(scene_file.read_meanings)
+_meanings: remembered.Remembered[object_search.Meanings | None] = remembered.Remembered(scene_file.read_meanings)
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Answer:
         return [(match.scene, match.object_id) for match in self.matches]
 
 
-def search(loaded: list[bpy.types.Collection], text: str, threshold: float = lookup.THRESHOLD) -> Answer:
+def search(loaded: list[bpy.types.Collection], text: str, threshold: float = object_search.THRESHOLD) -> Answer:
     """Objects of loaded scenes that words name.
 
     Args:
@@ -87,23 +88,23 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         notes += [note] if note else []
         embed = None
         if meanings is not None and meanings.table is not None:
-            card, unknown = meanings.table.encoder, lookup.unknown(labels, text, meanings)
+            card, unknown = meanings.table.encoder, object_search.unknown(labels, text, meanings)
             missing += phrases.missing(unknown)
             lost += [] if phrases.is_there() else unknown
             other = phrases.stranger(unknown, card)
             notes += [STRANGER.format(collection.name, card.name, other)] if other else []
             embed = functools.partial(phrases.of, card=card)
-        left.append(lookup.unanswered(labels, text, threshold, meanings, embed))
-        kept.append(lookup.not_excluded(labels, text, threshold, meanings, embed))
-        for found in lookup.search_labels(labels, text, threshold, meanings, embed):
+        left.append(object_search.unanswered(labels, text, threshold, meanings, embed))
+        kept.append(object_search.not_excluded(labels, text, threshold, meanings, embed))
+        for found in object_search.search_labels(labels, text, threshold, meanings, embed):
             if found.object_id in there:
                 matches.append(Match(collection, found.object_id, names[found.object_id], found.score, found.why))
-            elif not found.why.startswith(lookup.EVERYTHING):
+            elif not found.why.startswith(object_search.EVERYTHING):
                 deleted.append(names[found.object_id])
     unfit = [phrase for phrase in kept[0] if all(phrase in each for each in kept)] if kept else []
     if unfit:  # until the encoder has been asked, nobody knows what is left out
         matches = []
-        lookup.check_exclusions(known, text, [phrase for phrase in unfit if phrase not in missing])
+        object_search.check_exclusions(known, text, [phrase for phrase in unfit if phrase not in missing])
     if lost and not matches:
         asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
         notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
@@ -114,8 +115,8 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
         notes.insert(0, f"Deleted: {', '.join(deleted)}")
     notes += _instances({match.scene for match in matches})
     matches.sort(key=lambda match: -round(match.score, 6))
-    meant = [] if matches or not text.strip() else list(dict.fromkeys(lookup.suggest(known, text)))
-    nothing = bool(loaded) and all(lookup.is_nothing(table.labels(each), text) for each in loaded)
+    meant = [] if matches or not text.strip() else list(dict.fromkeys(object_search.suggest(known, text)))
+    nothing = bool(loaded) and all(object_search.is_nothing(table.labels(each), text) for each in loaded)
     return Answer(matches, meant, notes, tuple(dict.fromkeys(missing)), nothing=nothing)
 
 
@@ -134,7 +135,7 @@ def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answe
     """A sentence for the user when nothing matched."""
     there = [(table.labels(each), table.present(each)) for each in loaded]
     labels = [label for own, ids in there for label in own if label.object_id in ids]
-    said = lookup.explain_nothing(labels, text)
+    said = object_search.explain_nothing(labels, text)
     return ". ".join([said[0].upper() + said[1:], *answer.notes])
 
 
@@ -204,7 +205,7 @@ def forget() -> None:
     _meanings.clear()
 
 
-def _stored_meanings(collection: bpy.types.Collection) -> tuple[lookup.Meanings | None, str]:
+def _stored_meanings(collection: bpy.types.Collection) -> tuple[object_search.Meanings | None, str]:
     """The embeddings of a scene's file, or none and why the user should know."""
     if not collection.r5dgs_named.meanings:
         return None, ""

@@ -11,7 +11,7 @@ import bpy
 from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import lookup
+from ..r5dgs_core.search import object_search
 
 NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
 NOBODY = -2  # no object of any table; -1 are the unassigned Gaussians
@@ -86,11 +86,11 @@ def name_of(entry: bpy.types.PropertyGroup) -> str:
     return names(collection).get(entry.object_id, entry.name)
 
 
-def labels(collection: bpy.types.Collection) -> list[lookup.Label]:
+def labels(collection: bpy.types.Collection) -> list[object_search.Label]:
     """What the objects of a loaded scene answer to; the unassigned Gaussians answer to nothing."""
     current = names(collection)
     return [
-        lookup.Label(entry.object_id, current[entry.object_id], tuple(alias.name for alias in entry.aliases))
+        object_search.Label(entry.object_id, current[entry.object_id], tuple(alias.name for alias in entry.aliases))
         for entry in collection.r5dgs.table
         if entry.object_id >= 0
     ]

@@ -15,7 +15,8 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from ..r5dgs_core import errors
-from ..r5dgs_core.scene import cameras, view_inverse
+from ..r5dgs_core.color import view_inverse
+from ..r5dgs_core.scene import cameras
 from . import amounts, engine_color, engine_passes, engine_settings, picture, views, windows, worker
 
 KEY = "viewport"  # what `worker.busy` knows their pictures by

@@ -10,7 +10,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..r5dgs_core.scene import lookup
+from ..r5dgs_core.search import object_search
 from . import phrases, prompt
 
 
@@ -64,7 +64,7 @@ class R5DGS_PG_words(bpy.types.PropertyGroup):
     threshold: FloatProperty(
         name="Threshold",
         description="Least score of a match",
-        default=lookup.THRESHOLD,
+        default=object_search.THRESHOLD,
         min=0.0,
         max=1.0,
         subtype="FACTOR",

@@ -1,8 +1,8 @@
 """The process that runs the worker, and what is said to it and by it.
 
-The protocol is that of `r5dgs_core.serve`: a JSON line each way, and after an answer's line the raw bytes that it
-announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that dies,
-hangs or talks nonsense is dropped with a clear error.
+The protocol is that of `r5dgs_core.worker.server`: a JSON line each way, and after an answer's line the raw bytes that
+it announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that
+dies, hangs or talks nonsense is dropped with a clear error.
 
 The Python may be a wrapper script whose child does the work and keeps the pipes open. So the whole process group is
 ended, and a pipe is closed only by the thread that uses it: closing it elsewhere would wait for that thread's lock.
@@ -66,7 +66,7 @@ class Worker:
         environment["PYTHONUNBUFFERED"] = "1"
         try:
             self._group = ProcessGroup(
-                [python, "-m", "r5dgs_core.serve"],
+                [python, "-m", "r5dgs_core.worker.server"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,

@@ -11,8 +11,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+from . import atomic_files
 from .errors import ConfigError, UsageError
-from .scene import files
 
 MEANINGS = {
     "encoder": "folder of the text and image encoder, or 'text' (lookup and query --encoder)",
@@ -81,7 +81,7 @@ def write(key: str, value: str) -> Path:
     lines = [f"{name} = {_quoted(settings[name])}\n" for name in MEANINGS if name in settings]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        files.write(place, "".join(lines).encode())
+        atomic_files.write(place, "".join(lines).encode())
     except UnicodeEncodeError as error:
         raise ConfigError(f"config --user set {key}: expected a path in UTF-8; rename the folder") from error
     except OSError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster.cpu import compilation
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 

@@ -1,14 +1,14 @@
 """Calls of the command line in tests."""
 
-from r5dgs_core import cli
-from r5dgs_core.exit_status import ExitStatus
+from r5dgs_core.cli import main
+from r5dgs_core.cli.exit_status import ExitStatus
 
 
 def complaint(capsys, *arguments, status=ExitStatus.ERROR):
     """Run a command that fails; returns the line that says why, after the usage if arguments are wrong."""
     capsys.readouterr()
     try:
-        found = cli.main([str(argument) for argument in arguments])
+        found = main.main([str(argument) for argument in arguments])
     except SystemExit as stop:  # of argparse
         found = stop.code
     assert found == status

@@ -12,13 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset, images, mask_notes
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.motion.models import MotionModel
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras
 from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
-from r5dgs_core.train import checkpoint, config
+from r5dgs_core.train import checkpoint
 from tests import scenes
 
 T_MAX = 0.75
@@ -66,12 +68,12 @@ class TinyData:
 
     def center(self, object_id: int, t: float) -> np.ndarray:
         """True centre of an object in the data set's world. [3]"""
-        _, displacement = playback.group_poses(self.truth, t)
+        _, displacement = scene_player.group_poses(self.truth, t)
         return self.scale * (CENTERS[object_id] + displacement[object_id]) + self.shift
 
     def turn(self, object_id: int, t: float) -> np.ndarray:
         """True rotation of an object since `T_MAX`, unit wxyz. [4]"""
-        return playback.group_poses(self.truth, t)[0][object_id]
+        return scene_player.group_poses(self.truth, t)[0][object_id]
 
 
 def make_dataset(
@@ -120,9 +122,9 @@ def make_dataset(
         for i, (k, t) in enumerate(wanted):
             camera = orbit_camera(2 * np.pi * k / views if k < views else 0.5, width, height)
             shown = truth if t >= ball_from else without(truth, BALL)
-            output = scene_render.render_frame(
+            output = scene_renderer.render_frame(
                 shown,
-                playback.frame(shown, T_MAX if still else float(t)),
+                scene_player.frame(shown, T_MAX if still else float(t)),
                 camera,
                 background=None if alpha else "scene",
             )

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from r5dgs_core.data import dataset, images
+from r5dgs_core.evaluation import evaluate
 from r5dgs_core.motion import rotations
-from r5dgs_core.report import evaluate
-from r5dgs_core.scene import cameras, playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import cameras
 from r5dgs_core.scene.scene import Scene
 from tests import scenes
 
@@ -47,7 +48,7 @@ def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
         offset[:3, 3] = [0.1 * group.id, -0.2, 5.0]
         matrices = []
         for t in times:
-            quats, displacements = playback.group_poses(scene, t)
+            quats, displacements = scene_player.group_poses(scene, t)
             motion = np.eye(4)
             motion[:3, :3] = rotations.quats_to_rotmats(quats[group.id])
             motion[:3, 3] = group.pivot + displacements[group.id] - motion[:3, :3] @ group.pivot

@@ -16,102 +16,110 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Which rooms of the core a room may import, itself and `GROUND` aside: motion <- scene <- (data, raster, model) <-
-# train; report stands on baked scenes, so it needs no trainer; the command line may use everything.
-GROUND = {"errors", "findings", "input_paths", "strict_json", "time_left"}  # may be imported by all
+# Which rooms of the core a room may import, itself and `GROUND` aside, lower rooms first.
+# All rooms may import `GROUND`.
+GROUND = {"atomic_files", "errors", "findings", "folder_lock", "input_paths", "strict_json", "time_left"}
 ALLOWED = {
+    "atomic_files": set(),
     "errors": set(),
-    "findings": set(),
-    "strict_json": set(),
+    "motion": set(),
     "terminal": set(),
     "time_left": set(),
+    "findings": set(),
     "input_paths": set(),
-    "exit_status": set(),
-    "user_settings": {"scene"},
-    "folder_lock": set(),
-    "motion": set(),
-    "scene": {"motion"},
-    "data": {"motion", "scene"},
-    "model": {"motion", "scene"},
-    "raster": {"motion", "scene", "model"},
-    "importing": {"motion", "scene", "data", "model"},
-    "semantics": {"motion", "scene", "data", "model", "raster"},
-    "train": {"motion", "scene", "data", "model", "raster", "folder_lock"},
-    "report": {"terminal", "motion", "scene", "data", "model", "raster", "semantics"},
-    "serve_requests": {"scene", "raster"},
-    "serve_points": {"scene", "raster", "serve_requests"},
-    "serve": {"motion", "scene", "model", "raster", "semantics", "serve_points", "serve_requests"},
+    "strict_json": set(),
+    "user_settings": set(),
+    "motion_fit": {"motion"},
     "progress": {"terminal"},
-    "demo": {
+    "folder_lock": set(),
+    "scene": {"motion"},
+    "color": {"scene"},
+    "data": {"motion", "scene"},
+    "formats": {"motion", "scene"},
+    "raster": {"scene"},
+    "search": {"scene"},
+    "config": {"data"},
+    "playback": {"motion", "scene", "color", "formats"},
+    "editing": {"motion", "scene", "color", "playback"},
+    "model": {"motion", "playback"},
+    "render": {"motion", "scene", "raster", "playback"},
+    "importing": {"motion", "scene", "data", "formats", "model"},
+    "evaluation": {"motion", "terminal", "scene", "data", "playback", "render"},
+    "language": {"scene", "data", "search", "playback", "render"},
+    "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "model", "render"},
+    "masks": {"data", "language"},
+    "worker": {"scene", "raster", "search", "playback", "editing", "render", "language"},
+    "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train"},
+    "check": {"motion", "terminal", "scene", "data", "formats", "config", "train"},
+    "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
+    "association": {"scene", "data", "raster", "playback", "render", "masks"},
+    "bench": {"terminal", "progress", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},
+    "error_vs_time": {
+        "motion",
         "terminal",
-        *("commands", "motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"),
-        "folder_lock",
+        "motion_fit",
+        "scene",
+        "data",
+        "raster",
+        "playback",
+        "render",
+        "evaluation",
+        "bench",
     },
-    "bench": {"terminal", "motion", "scene", "data", "model", "raster", "semantics", "train", "report", "progress"},
-    "commands": {
-        "terminal",
-        *("motion", "scene", "data", "model", "raster", "semantics", "train", "report", "serve", "progress"),
-        *("importing", "folder_lock", "stability_training"),
-    },
-    "commands_bench": {"scene", "train", "bench", "commands"},
-    "stability_training": {"data", "raster", "train", "report"},
-    "check": {"terminal", "motion", "scene", "data", "train"},
-    "commands_info": {"terminal", "scene", "report"},
-    "commands_check": {"terminal", "check"},
-    "commands_config": {"train", "user_settings"},
-    "commands_association": {"scene", "data", "semantics", "commands", "progress", "folder_lock"},
-    "commands_masks": {"scene", "data", "semantics", "progress", "user_settings"},
-    "commands_objects": {"terminal", "scene", "data", "semantics", "report", "commands", "commands_words"},
-    "commands_words": {"terminal", "scene", "semantics", "progress", "commands", "user_settings", "folder_lock"},
-    "command_options": {"scene"},
-    "command_line": {"command_options", "scene", "bench"},
     "cli": {
         "terminal",
-        "command_line",
-        "command_options",
-        "commands",
-        "commands_bench",
-        "commands_info",
-        "commands_check",
-        "commands_config",
-        "commands_association",
-        "commands_masks",
-        "commands_words",
-        "commands_objects",
-        "demo",
-        "exit_status",
+        "user_settings",
+        "progress",
+        "scene",
+        "data",
+        "raster",
+        "search",
+        "config",
+        "playback",
+        "render",
+        "importing",
+        "evaluation",
+        "language",
+        "train",
+        "masks",
+        "bake",
+        "check",
+        "stability",
+        "association",
+        "bench",
+        "error_vs_time",
     },
 }
 # Modules that may import modules of the project inside functions: the command line, which starts fast, and the worker,
 # which answers before torch is there and if it is missing.
 LATE_MODULES = {
-    *("cli", "commands", "commands_association", "commands_bench", "commands_info", "commands_masks"),
-    *("commands_objects", "commands_words", "check", "check.run", "demo", "stability_training"),
-    *("serve", "serve_requests"),
+    *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.info", "cli.masks"),
+    *("cli.objects", "cli.language", "check", "check.run", "cli.demo", "stability.training"),
+    *("worker.server", "worker.requests"),
 }
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
     # numba is optional.
-    "raster.harmonics": {"raster.compile", "raster.cpu_harmonics", "raster.cpu_sky"},
-    "raster.segment_weights": {"raster.cpu"},
-    "raster.splatting": {"raster.cpu"},
-    "raster.stage": {"raster.backdrop"},
-    "raster.trial": {"raster.compile"},
+    "raster.shade": {"raster.cpu.compilation", "raster.cpu.sh_kernels", "raster.cpu.sky"},
+    "render.segment_weights": {"raster.cpu.cpu_backend"},
+    "raster.rasterizer": {"raster.cpu.cpu_backend"},
+    "render.incremental_renderer": {"render.static_layer"},
+    "render.speed_test": {"raster.cpu.compilation"},
     # numba is optional, and scipy slow to import.
-    "raster.warming": {"raster.backdrop", "raster.segment_weights"},
+    "render.warm_up": {"render.static_layer", "render.segment_weights"},
     # The stability table is listed without torch.
-    "report.stability.loading": {"raster", "raster.warming"},
+    "stability.loading": {"raster", "render.warm_up"},
     # OpenImageIO is needed for images alone, not for words.
-    "semantics.clip_encoder": {"data.images"},
-    "semantics.open_clip_encoder": {"data.images"},
+    "language.encoders.clip_encoder": {"data.images"},
+    "language.encoders.open_clip_encoder": {"data.images"},
     # A scene at rest loads neither tracks nor networks.
-    "train.bake": {"train.residual"},
-    "train.representation_registry": {"train.field", "train.tracks_representation"},
-    "train.run": {"train.discovery", "train.residual_trial"},
+    "bake.bake": {"train.representations.residual"},
+    "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
+    "train.run": {"train.object_discovery", "train.residual_trial"},
 }
 # The same of the add-on: OpenImageIO is optional there.
 LATE_ADDON_IMPORTS = {"capture_files": {"data.images"}}
-LIGHT = GROUND | {"motion", "scene", "user_settings"}
+LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "user_settings"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
@@ -243,7 +251,7 @@ def test_every_room_of_the_core_has_its_place():
     found = {path.stem for path in (ROOT / "r5dgs_core").iterdir() if path.suffix == ".py" and path.stem != "__init__"}
     found |= {path.parent.name for path in (ROOT / "r5dgs_core").glob("*/__init__.py")}
     assert found - {"__main__"} <= set(ALLOWED)
-    assert {"motion", "scene", "data", "model", "raster", "train", "report"} <= found
+    assert {"motion", "scene", "data", "model", "raster", "train", "cli"} <= found
 
 
 def test_the_allowed_directions_have_no_circle():
@@ -321,13 +329,13 @@ def test_the_root_imports_nothing_before_it_registers():
     [
         ("import bpy", "r5dgs_core.train", "train"),
         ("def f():\n    from mathutils import Vector", "r5dgs_core.cli", "cli"),
-        ("from ..train import trainer", "r5dgs_core.report", "report"),
-        ("from .. import report", "r5dgs_core.train", "train"),
+        ("from ..train import trainer", "r5dgs_core.evaluation", "evaluation"),
+        ("from ..bake import bake", "r5dgs_core.train", "train"),
         ("from ..scene.scene import Scene", "r5dgs_core.motion", "motion"),
         ("from r5dgs_core.motion import models", "r5dgs_core.train", "train"),
         ("def f():\n    import torch", "r5dgs_core.motion", "motion"),
         ("from scipy.spatial import cKDTree", "r5dgs_core.scene", "scene"),
-        ("from . import cli", "r5dgs_core", "serve"),
+        ("from ..cli import main", "r5dgs_core.worker", "worker"),
     ],
 )
 def test_the_scan_of_the_core_sees_a_wrong_import(source, package, own):
@@ -340,7 +348,7 @@ def test_the_scan_of_the_core_sees_a_wrong_import(source, package, own):
         ("import torch", "r5dgs.r5dgs_addon"),
         ("def f():\n    import numba", "r5dgs.operators"),
         ("import OpenImageIO", "r5dgs.r5dgs_addon"),
-        ("from ..r5dgs_core.raster import scene_render", "r5dgs.r5dgs_addon"),
+        ("from ..r5dgs_core.raster import rasterize", "r5dgs.r5dgs_addon"),
         ("def f():\n    from ..r5dgs_core import train", "r5dgs.operators"),
         ("from r5dgs_core.scene import scene_file", "r5dgs.operators"),
         ("from ..operators import load_scene", "r5dgs.r5dgs_addon"),
@@ -380,7 +388,7 @@ IMPORT_LIGHT_TIER = """
 sys.path.insert(0, root)
 import r5dgs_core.errors, r5dgs_core.strict_json, r5dgs_core.user_settings
 seen = []
-for name in ("motion", "scene"):
+for name in ("motion", "scene", "color", "formats", "playback", "editing", "search"):
     package = importlib.import_module(f"r5dgs_core.{name}")
     for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(info.name)

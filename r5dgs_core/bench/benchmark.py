@@ -10,14 +10,16 @@ from typing import Any
 import torch
 
 from .. import terminal
+from ..bake import bake
 from ..data import dataset as datasets
 from ..errors import CheckpointError, R5dgsError, TrainingError
+from ..evaluation import evaluate
+from ..playback import scene_player
 from ..progress import make as make_progress
-from ..raster import machine as machines
-from ..report import bench_plot, bench_tables, evaluate
-from ..scene import playback, scene_file
-from ..train import bake, checkpoint, stopping, warming
-from . import cases, playing, process
+from ..render import machine as machines
+from ..scene import scene_file
+from ..train import checkpoint, interrupt, warm_up
+from . import cases, playback_speed, plot, process, tables
 from .cases import Case, Plan
 
 log = logging.getLogger(__name__)
@@ -49,9 +51,9 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
     records: list[dict[str, Any]] = []
     failures: list[dict[str, Any]] = []
     result: dict[str, Any] = {}
-    with make_progress(progress_kind) as progress, stopping.at_once("stopped; give the same command to go on"):
+    with make_progress(progress_kind) as progress, interrupt.at_once("stopped; give the same command to go on"):
         progress({"event": "prepare", "text": "kernels"})
-        warming.warm_up()
+        warm_up.warm_up()
         for index, case in enumerate(planned):
             progress({"event": "case", "text": f"{case.title} ({index + 1} of {len(planned)})"})
             try:
@@ -149,7 +151,7 @@ def _measure(
         raise CheckpointError(f"{case.run}: was trained on other data than {case.root} now holds; restore the data")
     scene = bake.bake(run, dataset)
     scene_file.write(scene, case.beside(".r5dgs"))
-    there = playback.modes(scene)
+    there = scene_player.modes(scene)
     modes = [mode for mode in lacking if mode in there]
     evaluation = evaluate.evaluate(
         scene,
@@ -158,7 +160,7 @@ def _measure(
         splits=SPLITS,
         progress=lambda done, total: progress({"event": "evaluate", "done": done, "total": total}),
     )
-    played = playing.measure(scene, dataset.test or dataset.val, modes)
+    played = playback_speed.measure(scene, dataset.test or dataset.val, modes)
     found = {
         mode: {
             "splits": {split: evaluation["splits"][split][mode] for split in SPLITS},
@@ -189,19 +191,19 @@ def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dic
         },
         "results": list(records),
         "failures": list(failures),
-        "rows": bench_tables.report_rows(records),
+        "rows": tables.report_rows(records),
     }
     cases.write(plan.out / RESULT_FILE, json.dumps(result, indent=2))
-    cases.write(plan.out / TABLES_FILE, bench_tables.markdown(result))
-    bench_plot.write(records, plan.out / PLOT_FILE)
+    cases.write(plan.out / TABLES_FILE, tables.markdown(result))
+    plot.write(records, plan.out / PLOT_FILE)
     return result
 
 
 def _show(plan: Plan, result: dict[str, Any]) -> None:
     """Print tables and places."""
 
-    for sheet in bench_tables.sheets(result):
-        table, console = bench_tables.to_rich(sheet), terminal.console()
+    for sheet in tables.sheets(result):
+        table, console = tables.to_rich(sheet), terminal.console()
         wide = console.measure(table, options=console.options.update(width=1000)).maximum
         terminal.console(width=max(wide, console.width)).print(table)  # rather too long than cut short
     print(f"tables: {plan.out / TABLES_FILE}\nresult: {plan.out / RESULT_FILE}\nplot:   {plan.out / PLOT_FILE}")

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import strict_json
+from .. import atomic_files, strict_json
+from ..config import config as configs
 from ..data import dataset as datasets
 from ..errors import CheckpointError, ConfigError
-from ..scene import files, playback
+from ..playback import scene_player
 from ..train import checkpoint
-from ..train import config as configs
 from . import variants as kinds
 
 # Looking at held-out views while training would be counted into its time. The user's settings win over these.
@@ -35,7 +35,7 @@ class Plan:
         out: Folder of the benchmark.
         variants: Of `variants.VARIANTS`.
         seeds: Of training.
-        modes: Of `playback.every`; a scene is played in those that it has data for.
+        modes: Of `scene_player.every`; a scene is played in those that it has data for.
         preset: Named settings of training.
         config_path: TOML configuration, wins over the preset.
         overrides: ``section.key=value``, win over both.
@@ -45,7 +45,7 @@ class Plan:
     out: Path
     variants: tuple[str, ...] = kinds.DEFAULT_VARIANTS
     seeds: tuple[int, ...] = (0,)
-    modes: tuple[str, ...] = playback.MODES
+    modes: tuple[str, ...] = scene_player.MODES
     preset: str | None = None
     config_path: Path | None = None
     overrides: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def make(plan: Plan) -> list[Case]:
         DatasetError: A data set cannot be read, or two have one name.
         CheckpointError: A run folder is damaged, or its run was trained on other data.
     """
-    every_mode = playback.every()
+    every_mode = scene_player.every()
     for name, given, known in (("--variants", plan.variants, kinds.VARIANTS), ("--modes", plan.modes, every_mode)):
         if not given:
             raise ConfigError(f"{name}: expected at least one of {', '.join(known)}")
@@ -190,7 +190,7 @@ def write(path: Path, text: str) -> None:
     """
     try:
         os.makedirs(path.parent, exist_ok=True)
-        files.write(path, text.encode())
+        atomic_files.write(path, text.encode())
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be written: {error}; make room and give the command again") from error
 

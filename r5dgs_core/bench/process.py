@@ -16,7 +16,7 @@ from typing import Any
 # The system's largest size of a process counts its parent's, too, which it was forked from; so it tells its own.
 _CHILD = """
 import sys
-from r5dgs_core import cli
+from r5dgs_core.cli import main as cli
 from r5dgs_core.bench import process
 try:
     status = cli.main(sys.argv[1:])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ..train import config as configs
-from ..train.presets import PRESETS
+from ..config import config as configs
+from ..config.presets import PRESETS
 
 # The method has its identities trained with the geometry (docs/field.md). All their losses at a twentieth: the
 # encodings, whose optimizer does not feel the scale, learn as at the paper's weights, and the geometry is not harmed.

@@ -49,14 +49,14 @@ def _check_file(path: Path) -> list[Finding]:
 
         return scene.check(path)
     if suffix == ".ply":
-        from ..scene import ply
+        from ..formats import ply
 
         collect = Collector(CODES, "P01")
         with collect():
             ply.read(path, collect)
         return collect.findings
     if suffix == ".toml":
-        from ..train import config
+        from ..config import config
 
         collect = Collector(CODES, "C01")
         with collect():

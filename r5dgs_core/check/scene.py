@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..findings import Collector, Finding
-from ..motion import keyframes, models
+from ..motion import key_reduction, models
 from ..scene import scene_file
 from ..scene.scene import Scene
 from ..terminal import printable
@@ -66,7 +66,8 @@ def _check_motion(scene: Scene, path: Path, collect: Collector) -> None:
             quats, moved, spins, _ = models.curve(group.model, taus, _MOST_STEPS)
         if not (np.isfinite(quats).all() and np.isfinite(moved).all()):
             collect.add("S13", f"{place}: not finite between t_max and {end:g}")
-        elif float(np.linalg.norm(spins, axis=-1).max()) / scene.frames_per_unit > keyframes.MAX_FRAME_TURN_RAD:
+        elif float(np.linalg.norm(spins, axis=-1).max()) / scene.frames_per_unit > key_reduction.MAX_FRAME_TURN_RAD:
             collect.add(
-                "S14", f"{place}: turns by more than {np.degrees(keyframes.MAX_FRAME_TURN_RAD):.0f} degrees per frame"
+                "S14",
+                f"{place}: turns by more than {np.degrees(key_reduction.MAX_FRAME_TURN_RAD):.0f} degrees per frame",
             )

@@ -1,0 +1,1 @@
+"""Data sets on disk: images, cameras, masks, object names and ground truth."""

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from .. import errors
-from ..scene import files
+from .. import atomic_files, errors
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
@@ -127,7 +126,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("png:compressionLevel", COMPRESSION_LEVEL)
     try:
-        with files.replacing_by_name(path) as temporary:
+        with atomic_files.replacing_by_name(path) as temporary:
             target = oiio.ImageOutput.create(str(temporary))
             if target is None:
                 raise errors.DatasetError(f"{path}: cannot write the image ({oiio.geterror().strip()})")

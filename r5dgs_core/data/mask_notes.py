@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import errors, strict_json
-from ..scene import files
+from .. import atomic_files, errors, strict_json
 from . import masks
 
 FILE = "masks.json"
@@ -113,7 +112,7 @@ def write(notes: MaskNotes, folder: Path) -> Path:
     path = Path(folder) / FILE
     content = {"format_version": FORMAT_VERSION, **dataclasses.asdict(notes)}
     try:
-        files.write(path, (json.dumps(content, indent=1) + "\n").encode())
+        atomic_files.write(path, (json.dumps(content, indent=1) + "\n").encode())
     except OSError as error:
         raise errors.DatasetError(f"{path}: cannot be written: {error}") from error
     return path

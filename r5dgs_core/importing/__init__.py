@@ -1,0 +1,1 @@
+"""Import runs of other projects as a `Scene`."""

@@ -14,7 +14,7 @@ import numpy as np
 from ..motion import models, rotations
 from ..scene import scene
 from ..scene.scene import MotionGroup, Scene, SceneObject
-from .foreign import Foreign, State
+from .foreign_run import Foreign, State
 
 CHUNK = 16384  # rows that are evaluated at all knots at once
 STILL = 1e-4  # of the scene's extent: motion of a Gaussian's ellipsoid that is left out

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ..formats import ply
 from ..motion import rotations
-from ..scene import ply
 from . import networks, weights
-from .foreign import SPLATTING_NEAR, Foreign, State
+from .foreign_run import SPLATTING_NEAR, Foreign, State
 from .run_folder import RunFolder
 
 _SMALLEST = 1e-12  # standard deviation that a Gaussian keeps where exp(s) + ds vanishes, world units

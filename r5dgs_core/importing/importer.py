@@ -15,11 +15,10 @@ from ..data import dataset as datasets
 from ..data import origin as origins
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
-from ..model import spherical_harmonics
-from ..scene import cameras, validation
+from ..scene import cameras, sh_color, validation
 from ..scene.scene import Scene
-from . import assembly, camera_file, deformable, freegave, run_folder, splatting, trace, weights
-from .foreign import Foreign
+from . import assembly, cameras_json, deformable, freegave, gaussian_splatting, run_folder, trace, weights
+from .foreign_run import Foreign
 from .run_folder import RunFolder
 
 MOST_KNOTS = 10_000  # without --knots
@@ -70,7 +69,7 @@ def read(run: RunFolder, t_max: float | None = None) -> Foreign:
         CheckpointError, SceneFileError: A file is missing, damaged, holds code, or is of an unknown layout.
     """
     if not run.deforms:
-        return splatting.read(run)
+        return gaussian_splatting.read(run)
     if "vel.pth" not in run.files:
         return dataclasses.replace(deformable.read(run), t_max=t_max)
     t_max = run.max_time() if t_max is None else t_max
@@ -104,8 +103,8 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
         name=run.folder.resolve().name,
         frames_per_unit=datasets.FRAMES_PER_UNIT if dataset is None else dataset.frames_per_unit,
         world_convention=_world(run, foreign, dataset, options),
-        cameras=camera_file.read(run.folder / "cameras.json") if dataset is None else dataset.cameras,
-        background_sh=spherical_harmonics.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
+        cameras=cameras_json.read(run.folder / "cameras.json") if dataset is None else dataset.cameras,
+        background_sh=sh_color.rgb_to_dc(np.full((1, 3), float(white))).astype(np.float32),
         provenance={
             "imported": {
                 "layout": run_folder.TITLES[foreign.kind],

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError
+from ..formats import ply
 from ..motion import rotations
-from ..scene import ply
 from . import networks, weights
-from .foreign import TRACE_NEAR, Foreign, State, twisted_state
+from .foreign_run import TRACE_NEAR, Foreign, State, twisted_state
 from .run_folder import RunFolder
 
 TWIST = 12  # v, w and their rates

@@ -1,0 +1,1 @@
+"""Trainable modules: Gaussians, deformation field, TRD, tracks and residual field."""

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from . import propagation, rotations, se3, top
+from . import free_top, rotations, se3, twist_propagation
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class MotionModel:
             d_f = v s1 + a s2 + u - R_f u, R_f = exp(w s1 + eps s2)), "constant_twist" (a screw:
             R_f = exp(w tau), d_f = V(w tau) v tau), "world_twist" (v(x) = v + w x (x - p) with v and w linear in
             time, x in the world; Magnus-4 steps) or "free_top" (d_f = v tau + a tau^2 / 2, R_f of a body that starts
-            with spin w and tumbles without torque, `top`).
+            with spin w and tumbles without torque, `free_top`).
         velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
         acceleration: a, rate of v.
         angular_velocity: w, rad per unit of time.
@@ -263,9 +263,11 @@ def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray,
     if kind == "world_twist":
         v, a, w, eps, _ = rates
         radii = np.array([model.radius for model in models])
-        return propagation.Propagator(np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii, _MOST_STEPS)
+        return twist_propagation.Propagator(
+            np.concatenate([v, w, a, eps], -1), _STEP_TOLERANCE * radii, radii, _MOST_STEPS
+        )
     if kind == "free_top":
-        return top.Tops(np.array([model.inertia for model in models]), rates[2]), frequencies
+        return free_top.Tops(np.array([model.inertia for model in models]), rates[2]), frequencies
     return frequencies
 
 
@@ -352,7 +354,7 @@ def curve(
         return quats, d, w + zero, rotations.rotate(quats, v + zero)
     if model.kind == "free_top":
         assert model.inertia is not None
-        quats, spins = top.turns(model.inertia, w, tau.reshape(-1))
+        quats, spins = free_top.turns(model.inertia, w, tau.reshape(-1))
         quats, spins = quats.reshape(*tau.shape, 4), spins.reshape(*tau.shape, 3)
         return quats, v * once + a * twice, spins, v * slope + a * once
     quats, d = _world_twist(model, tau, most_steps)

@@ -82,7 +82,7 @@ def rasterize_splats(
     settings: RasterSettings,
     stats: RasterStats | None,
 ) -> SplatImage:
-    """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
+    """Draw as `rasterizer.rasterize_splats` says; inputs are checked there."""
     kernels = find_kernels()
     if isinstance(kernels, str):
         raise errors.BackendError(f"rasterizer 'cuda': {kernels}")

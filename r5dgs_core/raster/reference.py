@@ -38,7 +38,7 @@ def rasterize_splats(
     settings: RasterSettings,
     stats: RasterStats | None,
 ) -> SplatImage:
-    """Draw as `splatting.rasterize_splats` says; inputs are checked there."""
+    """Draw as `rasterizer.rasterize_splats` says; inputs are checked there."""
     dtype, height, width = means.dtype, camera.height, camera.width
     means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
     means2d, axes, z = project(means, quats, scales, camera, settings)

@@ -1,6 +1,6 @@
 """Description of the embeddings that a scene stores: their encoder, their views, and the thresholds of a match.
 
-Notation: D numbers of an embedding, C canonical phrases, as in `meanings`.
+Notation: D numbers of an embedding, C canonical phrases, as in `embedding_search`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class EncoderCard:
         digest: SHA-256 of its weights, hexadecimal: queries have to come from the same ones.
         dimension: D.
         templates: Sentences with "{}" for the phrase; a phrase is the mean over them.
-        scale: s of the relevancy, see `meanings`.
+        scale: s of the relevancy, see `embedding_search`.
     """
 
     kind: str

@@ -16,8 +16,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .. import errors, findings, strict_json
-from . import array_shapes, features, files, scene_json, validation
+from .. import atomic_files, errors, findings, strict_json
+from . import array_shapes, format_features, scene_json, validation
 from .archive import Archive, Header, most_content
 from .scene import DTYPES, EMBEDDINGS, Scene
 from .stored_embeddings import Meanings
@@ -57,7 +57,7 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
     if not path.parent.is_dir():
         raise errors.SceneFileError(f"{path}: expected an existing folder, found none; make {path.parent} first")
     try:
-        with files.replacing(path) as stream:
+        with atomic_files.replacing(path) as stream:
             _write_zip(scene, stream, exact)
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
@@ -135,7 +135,12 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
     with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
         arrays = [name for name in DTYPES if getattr(scene, name) is not None and name not in still]
-        head = {"format": FORMAT, "format_version": features.version(scene), "arrays": arrays, **features.dump(scene)}
+        head = {
+            "format": FORMAT,
+            "format_version": format_features.version(scene),
+            "arrays": arrays,
+            **format_features.dump(scene),
+        }
         text = scene_json.dump(scene, head)
         _add(archive, JSON_MEMBER, text, compression)
         for name in arrays:
@@ -206,8 +211,8 @@ def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
     headers = _read_headers(archive, top, DTYPES, guard)
     fields = scene_json.fields(top)
     with guard():
-        fields |= features.fields(top)
-        if skipped := features.skipped(top.data):
+        fields |= format_features.fields(top)
+        if skipped := format_features.skipped(top.data):
             _log.warning("%s: skipped what this release cannot read: %s", top.place, ", ".join(skipped))
     shapes = _shapes(headers)
     still = not set(headers) & set(_TRACKS)
@@ -249,7 +254,7 @@ def _read_json(archive: Archive, guard: findings.Guard = findings.STRICT) -> sce
             raise errors.SceneFileError(
                 f'{where}: expected "format": "{FORMAT}", not found; this is another kind of file'
             )
-        features.check(data, where)
+        format_features.check(data, where)
     return scene_json.Row(data, where, guard)
 
 

@@ -1,0 +1,1 @@
+"""Training: the run, the trainer, losses and checkpoints."""

@@ -18,15 +18,14 @@ from typing import Any
 
 from torch import Tensor
 
-from .. import __version__, folder_lock, input_paths, strict_json
+from .. import __version__, atomic_files, folder_lock, input_paths, strict_json
+from ..config import config as configs
+from ..config.config import Config
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, ConfigError
-from ..raster import machine
-from ..scene import files
+from ..render import machine
 from . import checkpoint_content, checkpoint_file
-from . import config as configs
 from .checkpoint_content import FORMAT_VERSION
-from .config import Config
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +113,7 @@ def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
     folder = Path(folder)
     try:
         # All that a kill at the very start leaves.
-        half_written = [*files.leftovers(folder / RUN_FILE), folder / folder_lock.LOCK_FILE]
+        half_written = [*atomic_files.leftovers(folder / RUN_FILE), folder / folder_lock.LOCK_FILE]
         foreign = folder.exists() and (
             not folder.is_dir()
             or (not (folder / RUN_FILE).exists() and any(path not in half_written for path in folder.iterdir()))
@@ -147,7 +146,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
         # The newest checkpoint goes last of the two: a kill in between leaves the old run as it was.
         for name in (PREVIOUS_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
             (run.folder / name).unlink(missing_ok=True)
-        files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
+        atomic_files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
     except OSError as error:
         raise CheckpointError(f"{run.folder}: cannot be made or written: {error}; choose another --out") from error
     return run
@@ -160,7 +159,7 @@ def remove_leftovers(folder: Path) -> None:
         CheckpointError: A file cannot be removed.
     """
     for name in (RUN_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
-        for path in files.leftovers(Path(folder) / name):
+        for path in atomic_files.leftovers(Path(folder) / name):
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:

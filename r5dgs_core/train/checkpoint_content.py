@@ -14,7 +14,7 @@ from ..model.gaussians import PARAMETERS
 
 FORMAT_VERSION = 1
 RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: the gain of a body is not always known
-TRAIN_PSNR = "train_psnr"  # a tensor: `probing.training_psnr` of a finished run, dB
+TRAIN_PSNR = "train_psnr"  # a tensor: `probe.training_psnr` of a finished run, dB
 TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
 
 _WHOLE = (torch.int64, torch.int32)

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..scene import files
+from .. import atomic_files
 
 _MARK = b"sha256:"
 _COMMENT_SIZE = len(_MARK) + hashlib.sha256().digest_size * 2
@@ -40,7 +40,7 @@ def write(path: Path, content: dict[str, Any], previous: Path) -> None:
     torch.save(content, buffer)
     buffer.seek(-_LENGTH.size, io.SEEK_END)
     buffer.write(_LENGTH.pack(_COMMENT_SIZE))
-    with files.replacing(path, previous) as stream:
+    with atomic_files.replacing(path, previous) as stream:
         stream.write(buffer.getbuffer())
         stream.write(_MARK + hashlib.sha256(buffer.getbuffer()).hexdigest().encode())
 

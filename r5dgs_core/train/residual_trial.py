@@ -19,11 +19,11 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from ..config.config import Config
 from ..errors import TrainingError
 from ..model import residual_field
 from ..model.residual_field import ResidualField
-from . import residual
-from .config import Config
+from .representations import residual
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)

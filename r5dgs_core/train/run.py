@@ -15,29 +15,19 @@ from typing import Any, TextIO
 import numpy as np
 import torch
 
-from .. import folder_lock
+from .. import atomic_files, folder_lock
+from ..config import training_needs
+from ..config.config import Config
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
-from ..raster import warming
-from ..scene import files
+from ..render import warm_up
 from ..time_left import Phase, Timed
-from . import (
-    checkpoint,
-    checkpoint_content,
-    config_needs,
-    curves,
-    identity,
-    label_hygiene,
-    mask_stack,
-    probing,
-    representation,
-    representation_registry,
-    stopping,
-)
-from .config import Config
-from .posing import Splats
+from . import checkpoint, checkpoint_content, interrupt, learning_curves, probe
+from .identity import identity_training, label_cleanup, packed_masks
+from .representations import registry, representation
+from .representations.fused_posing import Splats
+from .train_views import TrainView
 from .trainer import Trainer
-from .views import TrainView
 
 log = logging.getLogger(__name__)
 
@@ -138,9 +128,9 @@ def _train(
         progress({"event": "trained", "gaussians": count, "text": "was finished already"})
         return run
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
-    with stopping.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
+    with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
         progress({"event": "prepare", "text": "kernels"})
-        warming.warm_up()
+        warm_up.warm_up()
         found = _found_masks(dataset, run.config, state, progress)
         progress({"event": "prepare", "text": "images, objects, background"})
         trainer = Trainer(dataset, run.config, found)
@@ -151,10 +141,10 @@ def _train(
         trainer.restore(state)
         began -= state.seconds
     _clean_up(folder, trainer.iteration)
-    pictures = curves.Curves(run.folder)
+    pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, go_on, progress, probe, pictures)
-    with stopping.at_once(f"stopped after the last step, with labels still to be made; go on with: {go_on}"):
+    with interrupt.at_once(f"stopped after the last step, with labels still to be made; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
@@ -166,21 +156,21 @@ def _found_masks(
 ) -> list[np.ndarray] | None:
     """Masks of what moves where the data set has none: those that the run began with, or found now."""
     if state is None:
-        if not config_needs.discovery(dataset, config):
+        if not training_needs.discovery(dataset, config):
             return None
-        from . import discovery  # with the networks of its short run, which others do without
+        from . import object_discovery  # with the networks of its short run, which others do without
 
-        progress.estimate.add(Phase(discovery.NAME, config.discovery.iterations, DISCOVERY_COST))
+        progress.estimate.add(Phase(object_discovery.NAME, config.discovery.iterations, DISCOVERY_COST))
         progress.estimate.add(Phase("step", config.train.iterations))
-        return discovery.find(dataset, config, progress)
+        return object_discovery.find(dataset, config, progress)
     sizes = [(view.camera.height, view.camera.width) for view in dataset.train]
-    return mask_stack.unpack(state.tensors[mask_stack.NAME], sizes) if mask_stack.NAME in state.tensors else None
+    return packed_masks.unpack(state.tensors[packed_masks.NAME], sizes) if packed_masks.NAME in state.tensors else None
 
 
 def _plan(trainer: Trainer, progress: Timed) -> None:
     """Add what training does from here on to the estimate of the time that is left."""
     config, estimate = trainer.config, progress.estimate
-    estimate.finish("discovery")  # `discovery.NAME`, without its networks
+    estimate.finish("discovery")  # `object_discovery.NAME`, without its networks
     estimate.add(Phase("step", config.train.iterations))
     estimate.at("step", trainer.iteration)
     decision = decision_step(trainer)
@@ -210,12 +200,12 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
         residual_trial.decide(trainer, progress)
 
 
-def _probe(trainer: Trainer) -> probing.Probe | None:
+def _probe(trainer: Trainer) -> probe.Probe | None:
     """Held-out views to look at while training runs; None where there are none or none are wanted."""
     section = trainer.config.train
     if section.probe_every == 0 or not trainer.dataset.val:
         return None
-    return probing.Probe(trainer, section.probe_views)
+    return probe.Probe(trainer, section.probe_views)
 
 
 def _optimise(
@@ -224,14 +214,14 @@ def _optimise(
     began: float,
     go_on: str,
     progress: Timed,
-    probe: probing.Probe | None,
-    pictures: curves.Curves,
+    probe: probe.Probe | None,
+    pictures: learning_curves.Curves,
 ) -> None:
     """Take all steps that are left, with a line in the log and a checkpoint now and then."""
     section = trainer.config.train
     path = run.folder / checkpoint.LOG_FILE
     decision = decision_step(trainer)
-    with stopping.collected() as asked, _open_log(path) as stream:
+    with interrupt.collected() as asked, _open_log(path) as stream:
         while not trainer.done:
             take_step(trainer, decision, progress)
             look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
@@ -291,7 +281,7 @@ def _clean_up(folder: Path, iteration: int) -> None:
             if event is None or event["iteration"] > iteration:
                 break
             kept.append(line + b"\n")
-        files.write(path, b"".join(kept))
+        atomic_files.write(path, b"".join(kept))
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be written: {error}") from error
 
@@ -318,8 +308,8 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
             return trainer.splats(view.camera, view.t)
 
         progress({"event": "prepare", "text": "labels, by a vote of the masks"})
-        votes = identity.votes(trainer.views, pose, classes, len(fallback))
-        extra["labels"] = identity.elect(votes, fallback)
+        votes = identity_training.votes(trainer.views, pose, classes, len(fallback))
+        extra["labels"] = identity_training.elect(votes, fallback)
         steps = _identity_steps(trainer)
         if trainer.identity is not None:
             extra |= trainer.identity.outcome(trainer.gaussians)
@@ -331,7 +321,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
 
             # A generator of its own: a run resumed here draws what an unbroken one draws.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
-            encodings, weight, bias = identity.train_encodings(
+            encodings, weight, bias = identity_training.train_encodings(
                 trainer.views,
                 pose,
                 classes,
@@ -345,16 +335,16 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
         if trainer.config.identity.hygiene and len(classes) > 1:
             # After the encodings, which follow the masks' edges by themselves: the labels say what goes with what.
             extra |= _cleaned(trainer, votes, extra["labels"])
-    elif trainer.motion.name == representation.FIELD and config_needs.sorting(trainer.dataset, trainer.config):
-        from . import discovery
+    elif trainer.motion.name == representation.FIELD and training_needs.sorting(trainer.dataset, trainer.config):
+        from . import object_discovery
 
         progress({"event": "prepare", "text": "no masks: sorting what moves into parts"})
-        labels = torch.from_numpy(discovery.sort(trainer) + 1)
+        labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
         count = int(labels.max())
         progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
-        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), mask_stack.LABELS: labels}
+        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), packed_masks.LABELS: labels}
     with torch.no_grad():
-        shown = probing.training_psnr(
+        shown = probe.training_psnr(
             trainer.dataset,
             trainer.behind,
             lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
@@ -368,7 +358,7 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     given, ids = labels.numpy(), trainer.gaussians.motion_ids
     params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
     tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
-    motion = representation_registry.observed_motion(
+    motion = registry.observed_motion(
         trainer.motion.name,
         tensors | {"gaussians.motion_ids": ids},
         trainer.object_ids,
@@ -378,13 +368,13 @@ def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dic
     )
     gaussians = {name: tensor.numpy() for name, tensor in params.items()} | (motion.gaussians or {})
     group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
-    points = label_hygiene.bound(motion.groups, group_ids, gaussians["means"])
-    going, moving = label_hygiene.companions(motion.groups, group_ids, points, trainer.object_ids)
+    points = label_cleanup.bound(motion.groups, group_ids, gaussians["means"])
+    going, moving = label_cleanup.companions(motion.groups, group_ids, points, trainer.object_ids)
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].astype(np.float64)))
-    found, changes = label_hygiene.clean(votes.numpy(), given, points, opacities, going, moving)
+    found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, going, moving)
     counts = dataclasses.astuple(changes)
     log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)
-    return {"labels": torch.from_numpy(found), label_hygiene.CHANGES: torch.tensor(counts)}
+    return {"labels": torch.from_numpy(found), label_cleanup.CHANGES: torch.tensor(counts)}
 
 
 def _save(
@@ -397,7 +387,7 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
-    if mask_stack.LABELS in tensors:  # objects that nobody placed are taken to be there all the time
+    if packed_masks.LABELS in tensors:  # objects that nobody placed are taken to be there all the time
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
     values = {

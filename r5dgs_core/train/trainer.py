@@ -16,33 +16,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..config import training_needs
+from ..config.config import Config
 from ..data.dataset import Dataset
 from ..errors import CheckpointError, DatasetError, TrainingError
-from ..model import spherical_harmonics
 from ..model.gaussians import Gaussians
 from ..raster import RasterStats, rasterize_splats
+from ..scene import sh_color
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import (
-    config_needs,
-    densification,
-    identity,
-    initialization,
-    losses,
-    mask_stack,
-    normalization,
-    posing,
-    representation,
-    representation_registry,
-    sky,
-    stillness,
-    strategies,
-    sweep,
-    thinning,
-    views,
-)
+from . import losses, normalization, train_views
 from .checkpoint import Checkpoint
-from .config import Config
+from .densification import densifier, gradient
+from .identity import identity_training, packed_masks
+from .initialization import initialize, plane_sweep, sky, thinning
+from .representations import fused_posing, registry, representation, static
 
 log = logging.getLogger(__name__)
 
@@ -75,17 +63,17 @@ class Trainer:
     ):
         torch.set_num_threads(config.train.threads)
         self.dataset = dataset
-        self.config = config = config_needs.resolve(config)
+        self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
-        behind = views.behind(dataset, config)
-        self.views = views.load(dataset, self.normalization, behind)
+        behind = train_views.behind(dataset, config)
+        self.views = train_views.load(dataset, self.normalization, behind)
         rng = np.random.default_rng(config.train.seed)
-        self.found = None if found is None else mask_stack.pack(found)
-        shown = self.views if found is None else views.with_masks(self.views, found)
-        still = stillness.applies(self.views, config)
+        self.found = None if found is None else packed_masks.pack(found)
+        shown = self.views if found is None else train_views.with_masks(self.views, found)
+        still = static.applies(self.views, config)
         if still:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
-        start = initialization.start(shown, config, behind is None, rng, self._cloud(), still)
+        start = initialize.start(shown, config, behind is None, rng, self._cloud(), still)
         if len(start.gaussians) == 0:
             raise DatasetError(
                 f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
@@ -100,7 +88,7 @@ class Trainer:
         if most:
             start = dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng))
         self.gaussians: Gaussians = start.gaussians
-        self.motion = representation_registry.make(start, config, still)
+        self.motion = registry.make(start, config, still)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
@@ -112,31 +100,31 @@ class Trainer:
             self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color(), degree)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
-        self.identity = identity.joint(self.views, classes, config)
+        self.identity = identity_training.joint(self.views, classes, config)
         if self.identity is not None:
             self.identity.begin(self.gaussians)
         self.iteration = 0
         self.entered = (self.first_time, self.first_time)
         self.queue: list[int] = []
         self.running_loss = math.nan
-        self._view_times = np.array([views.nearest_knot(self.times, v.t) for v in self.views])
+        self._view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
         sizes = [v.camera.width * v.camera.height for v in self.views]
         focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
-        self.eyes = [group[0].camera for group in sweep.by_camera(self.views, EYES)]
+        self.eyes = [group[0].camera for group in plane_sweep.by_camera(self.views, EYES)]
         self.held = torch.zeros(0, dtype=torch.bool)
         self.cap = most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes))))
         self.optimizer = self._make_optimizer()
-        conditions = densification.Conditions(
+        conditions = densifier.Conditions(
             cap=self.cap,
             iterations=config.train.iterations,
             pixel_size=normalization.TARGET_DISTANCE / focal,
             image_width=float(np.median([v.camera.width for v in self.views])),
-            extent=densification.extent_of(self.eyes),
+            extent=densifier.extent_of(self.eyes),
             eyes=self.eyes,
             generator=self.generator,
             white=behind is not None and bool((behind == 1).all()),
         )
-        self.growth = strategies.make(config, conditions, len(self.gaussians))
+        self.growth = gradient.make(config, conditions, len(self.gaussians))
         self._targets: dict[int, Tensor] = {}
 
     def _cloud(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -149,7 +137,7 @@ class Trainer:
     def _mean_color(self) -> np.ndarray:
         """Coefficients of one colour, the median of all pixels, where no sky was found. [1, 3]"""
         color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
-        return spherical_harmonics.rgb_to_dc(color)[None]
+        return sh_color.rgb_to_dc(color)[None]
 
     def _make_optimizer(self) -> torch.optim.Adam:
         classifier = {} if self.identity is None else self.identity.params
@@ -219,12 +207,14 @@ class Trainer:
     def _hold_places(self) -> None:
         """Keep background Gaussians that a single camera sees where they are, as one view does not tell their depth."""
         if self.iteration % HOLD_EVERY == 0 or len(self.held) != len(self.gaussians):
-            self.held = densification.single_view(self.gaussians, self.eyes)
+            self.held = densifier.single_view(self.gaussians, self.eyes)
         gradient = self.gaussians.params["means"].grad
         if gradient is not None:
             gradient[self.held] = 0.0
 
-    def _draw_all(self, view: views.TrainView, stats: RasterStats) -> tuple[Tensor, Tensor | None, posing.Splats]:
+    def _draw_all(
+        self, view: train_views.TrainView, stats: RasterStats
+    ) -> tuple[Tensor, Tensor | None, fused_posing.Splats]:
         """A training view's image, its blended encodings where they are drawn in the same pass, and the splats."""
         splats = self.splats(view.camera, view.t, self.generator)
         colors, background = splats.colors, self.background.image(view.camera)
@@ -256,7 +246,7 @@ class Trainer:
             self.background.image(camera),
         ).image
 
-    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> posing.Splats:
+    def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.Splats:
         """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
         return self.motion.splats(self.gaussians, camera, t, draw)
 
@@ -271,7 +261,7 @@ class Trainer:
         if self.config.train.representation != representation.FIELD or self.motion.name != representation.TRACKS:
             return
         if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
-            self.motion = representation_registry.leave_tracks(
+            self.motion = registry.leave_tracks(
                 self.motion, self.gaussians, self.first_time, self.config, self.generator
             )
             self.optimizer = self._make_optimizer()
@@ -386,7 +376,7 @@ class Trainer:
         if self.identity is not None:
             tensors |= self.identity.tensors(self.gaussians)
         if self.found is not None:
-            tensors[mask_stack.NAME] = self.found
+            tensors[packed_masks.NAME] = self.found
         tensors["background"] = self.background.params["background"].detach()
         tensors["object_ids"] = torch.from_numpy(np.asarray(self.object_ids, np.int64))
         tensors["generator"] = self.generator.get_state()
@@ -412,7 +402,7 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
-        self.motion = representation_registry.for_state(self.motion, state.representation, self.first_time, self.config)
+        self.motion = registry.for_state(self.motion, state.representation, self.first_time, self.config)
         tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training changes them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])

@@ -4,7 +4,8 @@ import importlib
 
 import numpy as np
 
-from r5dgs_core.scene import cameras, playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import cameras
 
 POSITION_TOLERANCE = 1e-5  # of the scene's size: float32 in Blender and the tolerance of reduced keys
 
@@ -66,7 +67,9 @@ def all_points(bpy, collection, n):
 def offsets(bpy, collection, scene, t):
     """How far from where playback has it each Gaussian is at a time, in sizes of the scene. [N]"""
     go_to(bpy, collection, t)
-    expected = playback.frame(scene, t).means.astype(np.float64) @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
+    expected = (
+        scene_player.frame(scene, t).means.astype(np.float64) @ cameras.WORLD_TO_BLENDER[scene.world_convention].T
+    )
     return np.linalg.norm(all_points(bpy, collection, len(expected)) - expected, axis=-1) / scene.extent
 
 

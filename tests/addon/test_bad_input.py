@@ -255,7 +255,7 @@ def without_torch(monkeypatch, tmp_path):
         "sys.path.insert(0, os.environ['PYTHONPATH'].split(os.pathsep)[0])\n"
         "find = importlib.util.find_spec\n"
         "importlib.util.find_spec = lambda name, *a: None if name == 'torch' else find(name, *a)\n"
-        "runpy.run_module('r5dgs_core.serve', run_name='__main__')\n"
+        "runpy.run_module('r5dgs_core.worker.server', run_name='__main__')\n"
     )
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import carried, ply, scene_file
+from r5dgs_core.formats import ply
+from r5dgs_core.playback import affine_transform
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -143,11 +145,11 @@ def export(bpy, folder, obj):
 def picture_of(splats, scene, view):
     """The core's picture of the Gaussians of a file. [H, W, 3]"""
     count = len(splats.means)
-    posed = scene_render.PosedScene(
+    posed = scene_renderer.PosedScene(
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(count, np.int32), np.eye(3)[None], np.zeros(count, np.int64), None,
     )  # fmt: skip
-    return scene_render.render_frame(scene, posed, view, background=None).color.numpy()
+    return scene_renderer.render_frame(scene, posed, view, background=None).color.numpy()
 
 
 def psnr(a, b):
@@ -210,7 +212,7 @@ def test_shapes_and_harmonics_turn_with_transform_geometry(blender, scene, mug, 
     turn = Matrix.LocRotScale((0.1, 0.2, 0.3), Euler((0.4, 0.5, 0.6)), (1.2, 1.2, 1.2))
     matrix = np.array(mug.matrix_world, np.float64) @ np.array(turn, np.float64)
     world = np.array(mug.parent.parent.matrix_world, np.float64)
-    expected = carried.place(scene, mug.r5dgs.start, mug.r5dgs.count, matrix, world=world)
+    expected = affine_transform.place(scene, mug.r5dgs.start, mug.r5dgs.count, matrix, world=world)
     splats = export(blender, tmp_path, mug)
     np.testing.assert_allclose(splats.log_scales, expected.log_scales, atol=1e-4)
     np.testing.assert_allclose(np.abs((splats.quats * expected.quats).sum(-1)), 1, atol=1e-4)

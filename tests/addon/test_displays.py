@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import scenes
 
 SIGMAS = 1.5
@@ -24,7 +25,7 @@ def instances(bpy):
 
 def expected(scene, t):
     """The same from playback: rotation times standard deviations."""
-    frame = playback.frame(scene, t)
+    frame = scene_player.frame(scene, t)
     turned = rotations.quats_to_rotmats(frame.quats.astype(np.float64)) * np.exp(frame.log_scales)[:, None, :]
     order = sorted(range(len(turned)), key=lambda row: tuple(frame.means[row].astype(float).round(4)))
     return turned[order], frame.means[order]

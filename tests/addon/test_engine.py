@@ -12,8 +12,9 @@ import OpenImageIO
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, scene_file
 from tests import layouts, scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -104,8 +105,8 @@ def metadata_of(path):
 
 def core(scene, t, background="scene", camera=None):
     """The core's own picture."""
-    pose = playback.frame(scene, t)
-    return scene_render.render_frame(scene, pose, camera or scene.cameras[0], background=background)
+    pose = scene_player.frame(scene, t)
+    return scene_renderer.render_frame(scene, pose, camera or scene.cameras[0], background=background)
 
 
 def to_linear(srgb):
@@ -152,7 +153,7 @@ def test_the_passes_are_linear_colour_depth_along_the_axis_and_the_object_in_fro
 
 
 def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene, tmp_path):
-    cryptomatte = importlib.import_module("r5dgs_core.scene.cryptomatte")
+    cryptomatte = importlib.import_module("r5dgs_core.formats.cryptomatte")
     layer = blender.context.view_layer
     layer.use_pass_cryptomatte_object, layer.pass_cryptomatte_depth = True, 4
     go_to(blender, 0.3)
@@ -160,9 +161,9 @@ def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene,
     assert {name for name in passes.names if name.startswith("Crypto")} == {"CryptoObject00", "CryptoObject01"}
     ranks = [(f"CryptoObject0{k}.{name}", f"CryptoObject0{k}.{part}") for k in (0, 1) for name, part in ("rg", "ba")]
     mug = sum(np.where(passes.found[i] == cryptomatte.value_of("mug"), passes.found[c], 0) for i, c in ranks)
-    pose = playback.frame(scene, 0.3)
+    pose = scene_player.frame(scene, 0.3)
     one_hot = ((scene.object_ids == 1) & (scene.motion_ids == 1)).astype(np.float32)[:, None]
-    expected = scene_render.render_frame(scene, pose, scene.cameras[0], features=one_hot).features.numpy()[..., 0]
+    expected = scene_renderer.render_frame(scene, pose, scene.cameras[0], features=one_hot).features.numpy()[..., 0]
     assert_almost_all_close(mug, expected, 1e-3)
     alpha = core(scene, 0.3).alpha.numpy()
     assert np.abs(sum(passes.found[c] for _, c in ranks) - alpha).mean() < 0.01  # what four levels leave out

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
 from tests.addon.test_engine import NOTHING, assert_almost_all_close, go_to, loaded, psnr, render_passes, scene
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -28,12 +28,12 @@ def cloud(collection, name):
 
 def shares(scene, rows):
     """Share of each pixel that some Gaussians cover, and the depth of the others at t_max. [H, W] each"""
-    pose, camera = playback.frame(scene, scene.t_max), scene.cameras[0]
+    pose, camera = scene_player.frame(scene, scene.t_max), scene.cameras[0]
     held = np.zeros(len(scene.means), np.float32)
     held[rows] = 1
     z = pose.means @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
     features = np.stack([held, (1 - held) * z], axis=-1)
-    found = scene_render.render_frame(scene, pose, camera, features=features)
+    found = scene_renderer.render_frame(scene, pose, camera, features=features)
     share, depth = found.features.numpy().transpose(2, 0, 1)
     kept = found.alpha.numpy() - share
     return share, depth / np.maximum(kept, 1e-6), kept

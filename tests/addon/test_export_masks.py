@@ -7,8 +7,9 @@ import OpenImageIO as oiio
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, scene_file
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -46,7 +47,9 @@ def channels(path):
 
 
 def truth(scene, frame):
-    return scene_render.render_frame(scene, playback.frame(scene, (frame - 1) / 60), scene.cameras[0], background=None)
+    return scene_renderer.render_frame(
+        scene, scene_player.frame(scene, (frame - 1) / 60), scene.cameras[0], background=None
+    )
 
 
 def test_masks_and_index_of_a_range_are_the_cores(blender, scene, loaded, tmp_path):

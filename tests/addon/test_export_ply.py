@@ -6,9 +6,10 @@ import importlib
 import numpy as np
 import pytest
 
-from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback, ply, scene_file
+from r5dgs_core.formats import ply
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, scene_file, sh_color
 from tests import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -64,12 +65,12 @@ def edit(bpy, collection):
 
 def render(splats, scene, camera, backend="reference"):
     """The core's picture of the Gaussians of a file, over the scene's sky."""
-    posed = scene_render.PosedScene(
+    posed = scene_renderer.PosedScene(
         splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.sh,
         np.zeros(len(splats.means), np.int32), np.eye(3)[None], np.zeros(len(splats.means), np.int64), None,
     )  # fmt: skip
-    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
-    picture = scene_render.render_frame(scene, posed, camera, background=background, backend=backend)
+    background = sh_color.dc_to_rgb(scene.background_sh[0])
+    picture = scene_renderer.render_frame(scene, posed, camera, background=background, backend=backend)
     return np.clip(picture.color.numpy(), 0, 1)
 
 
@@ -80,13 +81,13 @@ def psnr(a, b):
 def shown(scene, collection, camera):
     """The core's picture of what Blender shows, by maps of the bind state."""
     instances = [
-        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
+        scene_renderer.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_world, np.float64), world=WORLD_4)
         for o in collection.all_objects
         if o.r5dgs.role == "CLOUD" and o.visible_get()
     ]
-    background = spherical_harmonics.dc_to_rgb(scene.background_sh[0])
-    pose = scene_render.pose_instances(scene, instances)
-    return np.clip(scene_render.render_frame(scene, pose, camera, background=background).color.numpy(), 0, 1)
+    background = sh_color.dc_to_rgb(scene.background_sh[0])
+    pose = scene_renderer.pose_instances(scene, instances)
+    return np.clip(scene_renderer.render_frame(scene, pose, camera, background=background).color.numpy(), 0, 1)
 
 
 def in_blender(camera):
@@ -167,11 +168,11 @@ def test_what_third_parties_read_looks_as_in_the_preview(blender, scene, preview
 def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path):
     blender.context.scene.frame_set(13, subframe=0.5)
     splats = export(blender, tmp_path / "a.ply", axes="FILE")
-    frame = playback.frame(scene, 12.5 / 60)
+    frame = scene_player.frame(scene, 12.5 / 60)
     np.testing.assert_allclose(np.sort(splats.means, axis=0), np.sort(frame.means, axis=0), atol=1e-5 * scene.extent)
     wanted = np.clip(
-        scene_render.render_frame(
-            scene, frame, scene.cameras[0], background=spherical_harmonics.dc_to_rgb(scene.background_sh[0])
+        scene_renderer.render_frame(
+            scene, frame, scene.cameras[0], background=sh_color.dc_to_rgb(scene.background_sh[0])
         ).color.numpy(), 0, 1,
     )  # fmt: skip
     assert psnr(render(splats, scene, scene.cameras[0]), wanted) > 50
@@ -191,7 +192,7 @@ def test_what_bends_is_exported_bent_in_exact_mode(blender, scene, tmp_path):
     assert blender.ops.r5dgs.exact_mode() == {"FINISHED"}
     found = export(blender, tmp_path / "b.ply", axes="FILE")
     assert (np.abs(found.means - straight.means).max(-1) > 1e-3).sum() == 2
-    wanted = playback.frame(scene_file.read(tmp_path / "bent.r5dgs"), 12 / 60).means
+    wanted = scene_player.frame(scene_file.read(tmp_path / "bent.r5dgs"), 12 / 60).means
     np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 
 
@@ -201,7 +202,7 @@ def test_a_tint_is_baked_into_the_colours(blender, loaded, tmp_path):
     mug.r5dgs_look.tint = (0.5, 1.0, 0.25)
     after = export(blender, tmp_path / "b.ply")
     rows = after.object_ids == mug.r5dgs.object_id
-    colour = spherical_harmonics.dc_to_rgb
+    colour = sh_color.dc_to_rgb
     np.testing.assert_allclose(colour(after.sh[rows, 0]), colour(before.sh[rows, 0]) * (0.5, 1, 0.25), atol=1e-6)
     np.testing.assert_array_equal(after.sh[~rows], before.sh[~rows])
 
@@ -227,7 +228,7 @@ def test_a_range_is_a_numbered_file_for_each_frame_and_the_frame_stays(blender, 
     assert blender.ops.r5dgs.export_ply(filepath=str(tmp_path / "a.ply"), frames="RANGE", frame_step=2) == {"FINISHED"}
     assert sorted(p.name for p in tmp_path.glob("*.ply")) == ["a_0005.ply", "a_0007.ply", "a_0009.ply"]
     assert (view.frame_current, view.frame_subframe) == (30, 0.25)
-    wanted = playback.frame(scene, 6 / 60).means @ WORLD.T
+    wanted = scene_player.frame(scene, 6 / 60).means @ WORLD.T
     found = ply.read(tmp_path / "a_0007.ply").means
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(wanted, axis=0), atol=1e-5 * scene.extent)
 

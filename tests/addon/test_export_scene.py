@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import scenes
 from tests.addon import motions
 
@@ -167,7 +168,7 @@ def test_a_duplicate_becomes_an_object_of_its_own(blender, scene, loaded, tmp_pa
     copy = saved.objects[-1]
     assert copy.count == scene.object(1).count and copy.name not in {item.name for item in scene.objects}
     for t in TIMES:
-        means = playback.frame(saved, t).means
+        means = scene_player.frame(saved, t).means
         shift = means[saved.object_ids == copy.id] - means[saved.object_ids == 1]
         np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=5e-5)
 

@@ -17,8 +17,8 @@ def program():
 def test_positions_and_keys_fail_where_blender_plays_something_else(program, tmp_path, monkeypatch, blender):
     path = scene_file.write(scenes.make_scene(n=120, objects=2), tmp_path / "scene.r5dgs")
     modules = {
-        name: importlib.import_module(f"r5dgs.r5dgs_core.scene.{name}")
-        for name in ("cameras", "playback", "scene_file")
+        name: importlib.import_module(f"r5dgs.r5dgs_core.{room}.{name}")
+        for room, name in (("scene", "cameras"), ("playback", "scene_player"), ("scene", "scene_file"))
     }
     table = program.Table()
     program.measure_positions(table, path, modules)

@@ -9,7 +9,8 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import models, se3
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import scenes
 from tests.addon import motions
 
@@ -199,7 +200,7 @@ def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scen
         for t in TIMES:
             motions.go_to(blender, collection, t)
             points = motions.all_points(blender, collection, len(scene.means))
-            distance = np.linalg.norm(points - playback.frame(scene, t).means, axis=-1)
+            distance = np.linalg.norm(points - scene_player.frame(scene, t).means, axis=-1)
             assert distance.max() <= (tolerance + 2e-6) * scene.extent
     assert counts[1e-3] < 0.7 * counts[3e-6]
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import layouts, scenes
 from tests.addon import motions
 
@@ -456,7 +457,7 @@ def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
     collection = motions.load(blender, path)
     blender.ops.r5dgs.extrapolate_until(t_end=1.3)
     motions.assert_plays_like_the_core(blender, collection, scene_file.read(path), (*TIMES, 1.3))
-    assert playback.frame(far, 1.3).means.shape == (300, 3)
+    assert scene_player.frame(far, 1.3).means.shape == (300, 3)
 
 
 def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded):
@@ -469,7 +470,7 @@ def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded)
     assert fewer < 0.6 * count
     for t in np.linspace(0, 1, 23):
         motions.go_to(blender, loaded, t)
-        frame = playback.frame(scene, t)
+        frame = scene_player.frame(scene, t)
         for cloud in (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD"):
             rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
             worst = np.linalg.norm(motions.points(blender, cloud) - frame.means[rows], axis=-1).max()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import layouts, scenes
 from tests.addon import motions
 
@@ -201,7 +202,7 @@ def test_export_writes_the_moved_pivot(blender, scene_path, tmp_path):
     arms = np.broadcast_to(PIVOT - group.pivot, displacements.shape)
     np.testing.assert_allclose(rotations.rotate(quats, arms) + displacements, arms, atol=1e-5)
     motions.assert_plays_like_the_core(blender, collection, scene, TIMES)
-    assert np.abs(playback.frame(scene, 1.0).means - playback.frame(scene, T_MAX).means).max() > 0.1
+    assert np.abs(scene_player.frame(scene, 1.0).means - scene_player.frame(scene, T_MAX).means).max() > 0.1
 
 
 def test_what_has_no_pivot_shows_none_and_says_so(blender, loaded, mug):

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import colmap_model, transforms
+from r5dgs_core.formats import ply
 from r5dgs_core.motion import models
-from r5dgs_core.scene import playback, ply, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import layouts, scenes
 from tests.addon.test_preview import core_picture, go_to, place_camera, preview, psnr
 
@@ -78,7 +80,7 @@ def test_the_preview_of_a_far_scene_is_the_cores_picture(blender, loaded, view, 
     scene = scene_file.read(scene_path)
     for t in (0.2, 0.95):
         go_to(blender, t)
-        assert psnr(preview(blender), core_picture(scene, playback.frame(scene, t))) > 45
+        assert psnr(preview(blender), core_picture(scene, scene_player.frame(scene, t))) > 45
 
 
 def test_exported_cameras_of_the_file_are_those_of_the_data_sets_world(blender, view, scene_path, tmp_path):

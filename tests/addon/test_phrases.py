@@ -16,16 +16,17 @@ pytest.importorskip("transformers", reason="transformers is not installed in thi
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     """An encoder, a stranger, and a scene file with the first one's table; its object 2 means zorb."""
-    from r5dgs_core.semantics import encoder_registry, encoders, lookup_table
+    from r5dgs_core.language import build_table
+    from r5dgs_core.language.encoders import encoder_base, registry
 
     folder = tmp_path_factory.mktemp("phrases")
     own = encoder_folders.sentences(folder / "own")
     other = encoder_folders.sentences(folder / "other", seed=1)
     scene = scenes.make_scene(n=200, objects=3)
-    encoder = encoder_registry.open_encoder(own)
-    made = lookup_table.make(scene, encoder).scene
+    encoder = registry.open_encoder(own)
+    made = build_table.make(scene, encoder).scene
     row = [item.id for item in made.objects].index(2)
-    made.view_embeddings[row, 0] = encoders.embed_phrases(encoder, ["zorb"])[0]
+    made.view_embeddings[row, 0] = encoder_base.embed_phrases(encoder, ["zorb"])[0]
     return own, other, scene_file.write(made, folder / "words.r5dgs")
 
 

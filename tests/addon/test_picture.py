@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.raster import scene_render, stage
-from r5dgs_core.scene import cameras, playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import incremental_renderer, scene_renderer
+from r5dgs_core.scene import cameras, scene_file
 from tests import datasets, scenes
 from tests.addon import motions
 
@@ -65,11 +66,11 @@ def affine(linear, translation=(0, 0, 0)):
 
 def everything(scene, matrix, number=0):
     """All of a scene, its world and its bind state moved by a matrix: at t_max they are at the same place."""
-    return scene_render.Instance(0, len(scene.means), matrix, number, matrix)
+    return scene_renderer.Instance(0, len(scene.means), matrix, number, matrix)
 
 
 def core_color(several, instances, camera, sky=None):
-    return stage.Stage(several).render(instances, camera, sky=sky).color.numpy()
+    return incremental_renderer.Stage(several).render(instances, camera, sky=sky).color.numpy()
 
 
 def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, load, kitchen):
@@ -83,7 +84,7 @@ def test_two_scenes_that_are_loaded_are_both_in_the_picture(blender, picture, lo
         [scene, other],
         [everything(scene, affine(W)), everything(other, moved, 1)],
         seen.camera,
-        stage.Sky(0, affine(W)),
+        incremental_renderer.Sky(0, affine(W)),
     )
     assert seen.scenes == (first, second)
     assert psnr(arrays["color"], expected) > 45
@@ -100,7 +101,7 @@ def test_a_scene_that_is_loaded_twice_is_seen_twice(blender, picture, kitchen):
     seen, arrays = drawn(blender, picture)
     both = [everything(scene, affine(W)), everything(scene, affine(W, (0.4, 0.0, 0.1)))]
     assert seen.scenes == (first, second)
-    assert psnr(arrays["color"], core_color(scene, both, seen.camera, stage.Sky(0, affine(W)))) > 45
+    assert psnr(arrays["color"], core_color(scene, both, seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
 
 
 def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path):
@@ -111,7 +112,7 @@ def test_what_bends_is_seen_bent_in_exact_mode(blender, picture, load, tmp_path)
     place_camera(blender, collection, made.cameras[0], made.world_convention)
     scene, t = scene_file.read(path), 0.2
     blender.context.scene.frame_set(int(1 + scene.frames_per_unit * t))
-    expected = scene_render.render_frame(scene, playback.frame(scene, t), scene.cameras[0]).color.numpy()
+    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0]).color.numpy()
     stiff = drawn(blender, picture)[1]["color"]
     collection.r5dgs_exact.enabled = True
     exact = drawn(blender, picture)[1]["color"]
@@ -136,7 +137,7 @@ def test_a_scene_that_is_hidden_all_of_it_leaves_its_sky(blender, picture, kitch
         obj.hide_set(True)
     seen, arrays = drawn(blender, picture)
     assert seen.instances == () and seen.scenes == (collection,)
-    assert psnr(arrays["color"], core_color(scene, [], seen.camera, stage.Sky(0, affine(W)))) > 60
+    assert psnr(arrays["color"], core_color(scene, [], seen.camera, incremental_renderer.Sky(0, affine(W)))) > 60
 
 
 def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture, kitchen):
@@ -149,12 +150,12 @@ def test_an_instanced_collection_is_seen_where_it_is_instanced(blender, picture,
     copy = np.array(instancer.matrix_world) @ affine(W)
     seen, arrays = drawn(blender, picture)
     both = [everything(scene, affine(W)), everything(scene, copy)]
-    assert psnr(arrays["color"], core_color(scene, both, seen.camera, stage.Sky(0, affine(W)))) > 45
+    assert psnr(arrays["color"], core_color(scene, both, seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
     # Excluded from the view layer, the scene is seen through its instance alone.
     blender.context.view_layer.layer_collection.children[collection.name].exclude = True
     seen, arrays = drawn(blender, picture)
     assert {one.parent for one in seen.instances} == {instancer}
-    assert psnr(arrays["color"], core_color(scene, both[1:], seen.camera, stage.Sky(0, affine(W)))) > 45
+    assert psnr(arrays["color"], core_color(scene, both[1:], seen.camera, incremental_renderer.Sky(0, affine(W)))) > 45
 
 
 def test_what_a_collection_hides_is_not_seen(blender, picture, kitchen):
@@ -175,10 +176,12 @@ def test_a_copy_outside_its_scene_is_still_its_scenes(blender, picture, kitchen)
     blender.context.scene.collection.objects.link(copy)
     copy.matrix_basis = Matrix.Translation((0.0, 0.0, 0.4))
     seen, arrays = drawn(blender, picture)
-    extra = scene_render.Instance(
+    extra = scene_renderer.Instance(
         apple.r5dgs.start, apple.r5dgs.count, affine(W) @ affine(np.eye(3), (0, 0, 0.4)), 0, affine(W)
     )
-    expected = core_color(scene, [everything(scene, affine(W)), extra], seen.camera, stage.Sky(0, affine(W)))
+    expected = core_color(
+        scene, [everything(scene, affine(W)), extra], seen.camera, incremental_renderer.Sky(0, affine(W))
+    )
     assert psnr(arrays["color"], expected) > 45
 
 
@@ -189,7 +192,7 @@ def test_a_root_may_be_scaled_by_axis_and_mirrored(blender, picture, kitchen):
     blender.context.view_layer.update()
     seen, arrays = drawn(blender, picture)
     matrix = affine(np.array(root.matrix_world)[:3, :3])
-    expected = core_color(scene, [everything(scene, matrix)], seen.camera, stage.Sky(0, matrix))
+    expected = core_color(scene, [everything(scene, matrix)], seen.camera, incremental_renderer.Sky(0, matrix))
     assert psnr(arrays["color"], expected) > 45
 
 
@@ -208,7 +211,7 @@ def test_a_tint_recolours_a_cloud(blender, picture, kitchen):
     for obj in collection.all_objects:
         if obj.r5dgs.role == "CLOUD":
             tint = (0.2, 1.0, 0.5) if obj == mug else None
-            instances.append(scene_render.Instance(obj.r5dgs.start, obj.r5dgs.count, affine(W), 0, affine(W), tint))
+            instances.append(scene_renderer.Instance(obj.r5dgs.start, obj.r5dgs.count, affine(W), 0, affine(W), tint))
     assert psnr(arrays["color"], core_color(scene, instances, seen.camera)) > 45
 
 
@@ -222,7 +225,7 @@ def test_points_that_were_deleted_are_not_drawn(blender, picture, kitchen):
     seen, arrays = drawn(blender, picture, sky=False)
     rows = np.setdiff1d(np.arange(len(scene.means)), np.arange(start, start + count)[~keep])
     cuts = np.flatnonzero(np.diff(rows) != 1) + 1
-    parts = [scene_render.Instance(int(part[0]), len(part), affine(W), 0, affine(W)) for part in np.split(rows, cuts)]
+    parts = [scene_renderer.Instance(int(part[0]), len(part), affine(W), 0, affine(W)) for part in np.split(rows, cuts)]
     assert psnr(arrays["color"], core_color(scene, parts, seen.camera)) > 45
 
 

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback, quality, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, quality, scene_file
 from tests import layouts, scenes
 from tests.addon import patience
 
@@ -76,7 +77,7 @@ def pixels_of(image):
 
 
 def core_picture(scene, pose):
-    return np.clip(scene_render.render_frame(scene, pose, scene.cameras[0]).color.numpy(), 0, 1)
+    return np.clip(scene_renderer.render_frame(scene, pose, scene.cameras[0]).color.numpy(), 0, 1)
 
 
 def psnr(a, b):
@@ -87,7 +88,7 @@ def psnr(a, b):
 def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
     scene = scene_file.read(scene_path)
     go_to(blender, t)
-    assert psnr(preview(blender), core_picture(scene, playback.frame(scene, t))) > 45
+    assert psnr(preview(blender), core_picture(scene, scene_player.frame(scene, t))) > 45
 
 
 def test_the_error_is_told_beside_the_milliseconds(blender, loaded, scene_path):
@@ -121,7 +122,7 @@ def test_saved_bytes_are_the_pictures_bytes(blender, loaded, scene_path, tmp_pat
     assert image.colorspace_settings.name == "sRGB" and not image.is_float
     image.filepath_raw, image.file_format = str(tmp_path / "saved.png"), "PNG"
     image.save()
-    expected = np.round(255 * core_picture(scene, playback.frame(scene, 0.5)))
+    expected = np.round(255 * core_picture(scene, scene_player.frame(scene, 0.5)))
     saved = 255 * images.read(tmp_path / "saved.png")[..., :3].astype(np.float64)
     assert np.abs(saved - expected).max() <= 1.001
 
@@ -137,9 +138,9 @@ def test_hidden_objects_are_left_out_and_moved_ones_are_moved(blender, loaded, s
     for obj in by_name.values():
         if obj.r5dgs.role == "CLOUD" and obj.name not in ("mug", "background"):
             # At t_max anchor and parent inverse cancel: what is left is the cloud's own matrix.
-            instances.append(scene_render.Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
-    expected = core_picture(scene, scene_render.pose_instances(scene, instances))
-    everything = core_picture(scene, playback.frame(scene, scene.t_max))
+            instances.append(scene_renderer.Instance(obj.r5dgs.start, obj.r5dgs.count, np.array(obj.matrix_basis)))
+    expected = core_picture(scene, scene_renderer.pose_instances(scene, instances))
+    everything = core_picture(scene, scene_player.frame(scene, scene.t_max))
     shown = preview(blender)
     assert psnr(shown, expected) > 45 and psnr(everything, expected) < 30
 
@@ -153,11 +154,11 @@ def test_a_duplicate_is_seen_twice_and_a_deleted_cloud_not_at_all(blender, loade
     copy.matrix_basis = Matrix.Translation((0.0, 0.0, 0.6))
     blender.data.objects.remove(loaded.all_objects["mug"])
     instances = [
-        scene_render.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_basis))
+        scene_renderer.Instance(o.r5dgs.start, o.r5dgs.count, np.array(o.matrix_basis))
         for o in loaded.all_objects
         if o.r5dgs.role == "CLOUD"
     ]
-    assert psnr(preview(blender), core_picture(scene, scene_render.pose_instances(scene, instances))) > 45
+    assert psnr(preview(blender), core_picture(scene, scene_renderer.pose_instances(scene, instances))) > 45
 
 
 def test_moving_the_whole_scene_with_its_camera_changes_nothing(blender, loaded):
@@ -351,7 +352,7 @@ def test_a_python_without_torch_is_named_with_the_remedy(blender, loaded, monkey
         "sys.path.insert(0, os.environ['PYTHONPATH'].split(os.pathsep)[0])\n"
         "find = importlib.util.find_spec\n"
         "importlib.util.find_spec = lambda name, *a: None if name == 'torch' else find(name, *a)\n"
-        "runpy.run_module('r5dgs_core.serve', run_name='__main__')\n"
+        "runpy.run_module('r5dgs_core.worker.server', run_name='__main__')\n"
     )
     monkeypatch.setenv("R5DGS_PYTHON", fake_python(tmp_path / "python", script))
     with pytest.raises(RuntimeError, match="lacks torch.*pip install r5dgs"):

@@ -387,7 +387,7 @@ spec = importlib.util.spec_from_file_location("process_group", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
 pipe = subprocess.PIPE
-group = module.ProcessGroup([sys.argv[2], "-m", "r5dgs_core.serve"], stdin=pipe, stdout=pipe, cwd=sys.argv[3])
+group = module.ProcessGroup([sys.argv[2], "-m", "r5dgs_core.worker.server"], stdin=pipe, stdout=pipe, cwd=sys.argv[3])
 group.process.stdin.write(b'{"id": 1, "command": "hello"}\\n')
 group.process.stdin.flush()
 print(group.process.stdout.readline().decode(), flush=True)

@@ -29,11 +29,13 @@ PICTURE_PSNR_DB = 45.0
 REFERENCE = """
 import json, sys
 import numpy as np
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 path, times, out = sys.argv[1], json.loads(sys.argv[2]), sys.argv[3]
 scene = scene_file.read(path)
-images = [scene_render.render_frame(scene, playback.frame(scene, t), scene.cameras[0]).color.numpy() for t in times]
+frames = [scene_player.frame(scene, t) for t in times]
+images = [scene_renderer.render_frame(scene, frame, scene.cameras[0]).color.numpy() for frame in frames]
 np.save(out, np.stack(images))
 """
 
@@ -76,7 +78,7 @@ def position_error(collection, scene, modules, t: float) -> float:
     set_time(collection, t)
     # Anchors carry the rigid part of the motion; what bends beside it is not played in Blender yet.
     rigid = dataclasses.replace(scene, residual_rows=None)
-    expected = modules["playback"].frame(rigid, t).means.astype(np.float64)
+    expected = modules["scene_player"].frame(rigid, t).means.astype(np.float64)
     world = modules["cameras"].WORLD_TO_BLENDER[scene.world_convention]
     depsgraph = bpy.context.evaluated_depsgraph_get()
     worst, seen = 0.0, 0
@@ -175,8 +177,8 @@ def main(arguments: list[str]) -> int:
         os.environ["R5DGS_PYTHON"] = options.worker
     package = extension_package()
     modules = {
-        name: importlib.import_module(f"{package}.r5dgs_core.scene.{name}")
-        for name in ("cameras", "playback", "scene_file")
+        name: importlib.import_module(f"{package}.r5dgs_core.{room}.{name}")
+        for room, name in (("scene", "cameras"), ("playback", "scene_player"), ("scene", "scene_file"))
     }
     path = options.scene.resolve()
     scene = modules["scene_file"].read(path)

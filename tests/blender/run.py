@@ -149,8 +149,10 @@ def measure_playing(table: Table, path: Path) -> None:
 def figures(path: Path | None) -> Table:
     """Measure everything with the extension registered, and take it away again."""
     package = check_playback.extension_package()
-    names = ("cameras", "playback", "scene_file")
-    modules = {name: importlib.import_module(f"{package}.r5dgs_core.scene.{name}") for name in names}
+    modules = {
+        name: importlib.import_module(f"{package}.r5dgs_core.{room}.{name}")
+        for room, name in (("scene", "cameras"), ("playback", "scene_player"), ("scene", "scene_file"))
+    }
     table = Table()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -4,8 +4,9 @@ import shutil
 
 import pytest
 
+from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import bake, run
+from r5dgs_core.train import run
 from tests import datasets as tiny_datasets
 from tests import pictures, scenes
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from r5dgs_core.association import associate, segment_stack, supergaussians
 from r5dgs_core.data.masks import UNKNOWN
-from r5dgs_core.semantics import association, bags, patches
 
 PER_BODY, FLOOR = 40, 200
 
@@ -26,7 +26,7 @@ class Seen:
     def bags(self, masks: list[np.ndarray]) -> list[bags.ImageBags]:
         """The images with masks."""
         return [
-            bags.from_pixels(mask, self.indices[k], self.weights[k], self.count, view=view, time=t)
+            segment_stack.from_pixels(mask, self.indices[k], self.weights[k], self.count, view=view, time=t)
             for k, (mask, (view, t)) in enumerate(zip(masks, self.moments, strict=True))
         ]
 
@@ -54,7 +54,9 @@ def partition(ids: list[np.ndarray]) -> list[int]:
     return [names.setdefault(int(i), len(names)) for i in np.concatenate(ids)]
 
 
-def new_masks(masks: list[np.ndarray], given: list[bags.ImageBags], found: association.Association) -> list[np.ndarray]:
+def new_masks(
+    masks: list[np.ndarray], given: list[segment_stack.ImageBags], found: associate.Association
+) -> list[np.ndarray]:
     """The masks with their new ids."""
     return [ids[np.searchsorted(bag.ids, mask)] for mask, bag, ids in zip(masks, given, found.ids, strict=True)]
 
@@ -70,7 +72,7 @@ def renumbered(seen: Seen, seed: int) -> list[np.ndarray]:
 @pytest.mark.parametrize(("bodies", "views", "times"), [(1, 1, 1), (2, 4, 1), (2, 1, 4), (6, 3, 5)])
 def test_clean_masks_come_back_as_they_are(bodies, views, times):
     seen = look(bodies, views, times)
-    found = association.associate(seen.bags(seen.truths))
+    found = associate.associate(seen.bags(seen.truths))
     for ids, bag in zip(found.ids, seen.bags(seen.truths), strict=True):
         assert ids.tolist() == bag.ids.tolist()
     assert {row.done for row in found.rows} == {"kept"}
@@ -81,10 +83,10 @@ def test_views_that_number_for_themselves_get_one_numbering(bodies, views, times
     seen = look(bodies, views, times)
     masks = renumbered(seen, 3)
     given = seen.bags(masks)
-    for mask, truth in zip(new_masks(masks, given, association.associate(given)), seen.truths, strict=True):
+    for mask, truth in zip(new_masks(masks, given, associate.associate(given)), seen.truths, strict=True):
         pairs = np.unique(np.stack([mask, truth]), axis=1)
         assert len(np.unique(pairs[0])) == len(np.unique(pairs[1])) == pairs.shape[1]
-    together = np.concatenate(new_masks(masks, given, association.associate(given)))
+    together = np.concatenate(new_masks(masks, given, associate.associate(given)))
     pairs = np.unique(np.stack([together, np.concatenate(seen.truths)]), axis=1)
     assert pairs.shape[1] == bodies + 1
 
@@ -92,7 +94,7 @@ def test_views_that_number_for_themselves_get_one_numbering(bodies, views, times
 def test_names_of_a_view_change_nothing():
     seen = look(6, 3, 5)
     outcomes = [
-        partition(new_masks(m, b := seen.bags(m), association.associate(b)))
+        partition(new_masks(m, b := seen.bags(m), associate.associate(b)))
         for m in (renumbered(seen, 3), renumbered(seen, 4))
     ]
     assert outcomes[0] == outcomes[1]
@@ -103,7 +105,7 @@ def test_the_order_of_images_changes_nothing():
     masks = renumbered(seen, 3)
     given = seen.bags(masks)
     order = np.random.default_rng(1).permutation(len(given))
-    straight, mixed = association.associate(given), association.associate([given[k] for k in order])
+    straight, mixed = associate.associate(given), associate.associate([given[k] for k in order])
     back = [mixed.ids[k] for k in np.argsort(order)]
     assert partition(straight.ids) == partition(back)
 
@@ -115,7 +117,7 @@ def test_a_switch_is_found_and_listed():
     a, b = (masks[changed[0]][seen.truths[changed[0]] == body][0] for body in (2, 5))
     for k in changed:
         masks[k] = np.where(masks[k] == a, b, np.where(masks[k] == b, a, masks[k]))
-    found = association.associate(seen.bags(masks))
+    found = associate.associate(seen.bags(masks))
     listed = {(row.image, row.old_id) for row in found.rows if row.done == "relabelled"}
     assert listed == {(k, name) for k in changed for name in (a, b)}
     rows = {(row.image, row.old_id): row for row in found.rows}
@@ -131,7 +133,7 @@ def test_a_fragment_and_a_missing_object_do_not_part_it():
         if view == 0 and t > 3:
             masks[k][masks[k] == 2] = 77
     given = seen.bags(masks)
-    found = association.associate(given)
+    found = associate.associate(given)
     assert found.objects.tolist() == [1, 2, 3, 4, 5]
     for k, mask in enumerate(new_masks(masks, given, found)):
         shown = np.unique(mask[seen.truths[k] == 2])
@@ -146,7 +148,7 @@ def test_parts_vote_for_the_whole_where_it_is_seen_whole_elsewhere():
         part = (seen.truths[k] == 3) & (seen.indices[k][:, 0] % 2 == 0)
         masks[k] = np.where(part, 90 + k, masks[k])
     given = seen.bags(masks)
-    made = new_masks(masks, given, association.associate(given))
+    made = new_masks(masks, given, associate.associate(given))
     whole = np.unique(made[0][seen.truths[0] == 3])
     for k in split:
         assert np.unique(made[k][(seen.truths[k] == 3)]).tolist() == whole.tolist()
@@ -158,7 +160,7 @@ def test_objects_that_are_joined_now_and_then_stay_apart():
     for k in (4, 12):
         name = masks[k][seen.truths[k] == 2][0]
         masks[k] = np.where(seen.truths[k] == 3, name, masks[k])
-    found = association.associate(seen.bags(masks))
+    found = associate.associate(seen.bags(masks))
     assert len(found.objects) == 4
 
 
@@ -166,7 +168,7 @@ def test_ids_without_any_geometry_behind_them_stay():
     seen = look(5, 3, 4)
     rng = np.random.default_rng(0)
     masks = [rng.integers(0, 6, len(truth)) for truth in seen.truths]
-    found = association.associate(seen.bags(masks))
+    found = associate.associate(seen.bags(masks))
     assert found.fallback
     assert all(row.done == "kept" and row.new_id == row.old_id for row in found.rows)
 
@@ -178,27 +180,27 @@ def test_empty_masks_and_segments_without_gaussians_pass():
     masks[1][:] = UNKNOWN
     seen.indices[2][seen.truths[2] == 1] = -1
     given = seen.bags(masks)
-    found = association.associate(given)
+    found = associate.associate(given)
     assert found.ids[0].tolist() == [0] and found.ids[1].tolist() == []
     assert found.ids[3].tolist() == [0, 1, 2, 3]
     assert len(found.ids[2]) == len(given[2].ids) == 4
-    nothing = association.associate(seen.bags([np.zeros_like(truth) for truth in seen.truths]))
+    nothing = associate.associate(seen.bags([np.zeros_like(truth) for truth in seen.truths]))
     assert not len(nothing.objects) and nothing.rows == []
 
 
 @pytest.mark.parametrize("rows", [[[1, 2]], [[1, 2], [3, 4]]])
 def test_images_of_objects_alone_that_share_nothing_keep_their_ids(rows):
     given = [
-        bags.from_pixels(np.ones(2, int), np.array(own)[:, None], np.ones((2, 1)), 5, view=view, time=0)
+        segment_stack.from_pixels(np.ones(2, int), np.array(own)[:, None], np.ones((2, 1)), 5, view=view, time=0)
         for view, own in enumerate(rows)
     ]
-    found = association.associate(given)
+    found = associate.associate(given)
     assert [ids.tolist() for ids in found.ids] == [[1]] * len(rows)
 
 
 def test_images_without_any_segment_have_no_objects():
-    unknown = bags.from_pixels(np.full(2, UNKNOWN), np.zeros((2, 1), int), np.ones((2, 1)), 3, view=0, time=0)
-    found = association.associate([unknown])
+    unknown = segment_stack.from_pixels(np.full(2, UNKNOWN), np.zeros((2, 1), int), np.ones((2, 1)), 3, view=0, time=0)
+    found = associate.associate([unknown])
     assert found.rows == [] and not len(found.objects) and found.ids[0].tolist() == []
 
 
@@ -210,9 +212,9 @@ def test_many_gaussians_in_patches_part_the_segments_alike():
     rng = np.random.default_rng(0)
     neighbours = np.stack([rng.choice(np.flatnonzero(objects == body), 4) for body in objects])
     whole, patched, thinned = (
-        association.associate(given),
-        association.associate(given, neighbours, most=100),
-        association.associate(given, most=300),
+        associate.associate(given),
+        associate.associate(given, neighbours, most=100),
+        associate.associate(given, most=300),
     )
     assert partition(whole.ids) == partition(patched.ids) == partition(thinned.ids)
 
@@ -223,18 +225,18 @@ def test_patches_hold_neighbours_that_move_together():
     side = places[:, 0] > 0.5
     neighbours = np.argsort(np.linalg.norm(places[:, None] - places[None], axis=-1), axis=1)[:, 1:9]
     paths = np.stack([places, places + side[:, None] * [3.0, 0.0, 0.0]], axis=1)
-    groups = patches.group(300, neighbours, paths, 50)
+    groups = supergaussians.group(300, neighbours, paths, 50)
     assert groups.max() + 1 < 200
     for k in range(groups.max() + 1):
         assert len(np.unique(side[groups == k])) == 1
-    still = patches.group(300, neighbours, None, 50)
+    still = supergaussians.group(300, neighbours, None, 50)
     assert any(len(np.unique(side[still == k])) == 2 for k in range(still.max() + 1))
 
 
 def test_ids_beyond_what_masks_hold_are_numbered_anew():
     seen = look(3, 3, 4)
     masks = [np.where(truth > 0, truth + 70_000, 0) for truth in seen.truths]
-    assert association.associate(seen.bags(masks)).objects.tolist() == [1, 2, 3]
+    assert associate.associate(seen.bags(masks)).objects.tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("high", [60_000, 65_534])
@@ -244,7 +246,7 @@ def test_new_objects_get_ids_that_name_them_however_high_the_incoming_ones_are(h
     for truth, (view, _) in zip(seen.truths, seen.moments, strict=True):  # each view names two of the three objects
         names = np.array([0, *(int(k) for k in np.insert([1, high], view, UNKNOWN))])
         given_masks.append(names[truth])
-    found = association.associate(seen.bags(given_masks))
+    found = associate.associate(seen.bags(given_masks))
     assert len(found.objects) == 3 and all(0 < k < UNKNOWN for k in found.objects)
     assert not any(row.done == "unknown" for row in found.rows)
 
@@ -252,9 +254,11 @@ def test_new_objects_get_ids_that_name_them_however_high_the_incoming_ones_are(h
 def test_what_does_not_fit_is_refused():
     seen = look(2, 2, 2)
     with pytest.raises(ValueError, match="at least one image"):
-        association.associate([])
+        associate.associate([])
     with pytest.raises(ValueError, match="pixels, got indices"):
-        bags.from_pixels(seen.truths[0][1:], seen.indices[0], seen.weights[0], seen.count, view=0, time=0)
+        segment_stack.from_pixels(seen.truths[0][1:], seen.indices[0], seen.weights[0], seen.count, view=0, time=0)
     given = seen.bags(seen.truths)
     with pytest.raises(ValueError, match="image 1: expected ascending ids"):
-        bags.stack([given[0], bags.ImageBags(given[1].ids[::-1], given[1].pixels, given[1].weights, 0, 1)])
+        segment_stack.stack(
+            [given[0], segment_stack.ImageBags(given[1].ids[::-1], given[1].pixels, given[1].weights, 0, 1)]
+        )

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError
+from r5dgs_core.evaluation import evaluate
 from r5dgs_core.model import track_state
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import scene_render
-from r5dgs_core.report import evaluate
-from r5dgs_core.scene import playback, scene_file, validation
-from r5dgs_core.train import bake, checkpoint, normalization, run
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import scene_file, validation
+from r5dgs_core.train import checkpoint, normalization, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -39,7 +41,7 @@ def assert_shows_what_was_trained(run_made, scene, bar=45.0):
     for view, trained_view in list(zip(trainer.dataset.train, trainer.views, strict=True))[::7]:
         with torch.no_grad():
             expected = trainer.render(trained_view.camera, trained_view.t).numpy()
-        shown = scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy()
+        shown = scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.numpy()
         assert psnr(shown.clip(0, 1), expected.clip(0, 1)) > bar
 
 
@@ -84,7 +86,7 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
     draws = np.random.default_rng(0)
     points = draws.normal(size=(20, 3)) * 0.5  # canonical, training coordinates
     for t in tracks.times:
-        quats, displacements = playback.group_poses(scene, float(t))
+        quats, displacements = scene_player.group_poses(scene, float(t))
         with torch.no_grad():
             now, last = tracks.poses(float(t)), tracks.poses(float(tracks.times[-1]))
             centers = tracks.group_centers()
@@ -103,10 +105,10 @@ def test_poses_at_the_knots_are_the_trained_ones_in_the_world(trained):
 
 
 def test_at_t_max_nothing_is_moved(baked):
-    quats, displacements = playback.group_poses(baked, baked.t_max)
+    quats, displacements = scene_player.group_poses(baked, baked.t_max)
     np.testing.assert_array_equal(quats, rotations.identity(len(baked.groups)))
     np.testing.assert_array_equal(displacements, 0)
-    np.testing.assert_array_equal(playback.frame(baked, baked.t_max).means, baked.means)
+    np.testing.assert_array_equal(scene_player.frame(baked, baked.t_max).means, baked.means)
 
 
 def test_objects_move_as_they_did_and_on_past_t_max(baked, tiny):
@@ -115,7 +117,7 @@ def test_objects_move_as_they_did_and_on_past_t_max(baked, tiny):
         arm = tiny.center(k, tiny_datasets.T_MAX) - group.pivot
         travel = np.linalg.norm(tiny.center(k, 0.0) - tiny.center(k, tiny_datasets.T_MAX))
         for t, tolerance in ((0.0, 0.06), (0.3, 0.06), (0.85, 0.06), (1.0, 0.15)):
-            quats, displacements = playback.group_poses(baked, t)
+            quats, displacements = scene_player.group_poses(baked, t)
             found = group.pivot + rotations.rotate(quats[k], arm) + displacements[k]
             assert np.linalg.norm(found - tiny.center(k, t)) < tolerance * travel, (k, t)
 
@@ -142,9 +144,9 @@ def test_a_scaled_and_shifted_world_gives_the_scaled_and_shifted_scene(tiny, tmp
     np.testing.assert_allclose(b.track_poses[..., :4], a.track_poses[..., :4], atol=1e-3)
     np.testing.assert_allclose(b.track_poses[..., 4:] / scale, a.track_poses[..., 4:], atol=1e-3 * a.extent)
     view = datasets.read(far.root).train[10]
-    shown = scene_render.render_frame(b, playback.frame(b, view.t), view.camera).color.numpy()
+    shown = scene_renderer.render_frame(b, scene_player.frame(b, view.t), view.camera).color.numpy()
     near = datasets.read(tiny.root).train[10].camera
-    assert psnr(shown, scene_render.render_frame(a, playback.frame(a, view.t), near).color.numpy()) > 40
+    assert psnr(shown, scene_renderer.render_frame(a, scene_player.frame(a, view.t), near).color.numpy()) > 40
 
 
 def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_path):
@@ -170,7 +172,9 @@ def test_a_baked_scene_survives_its_file(baked, tmp_path):
     assert again.needs == baked.needs and again.objects == baked.objects
     view = baked.cameras[0]
     for t in (0.0, 0.5, 1.0):
-        one, other = (scene_render.render_frame(s, playback.frame(s, t), view).color.numpy() for s in (baked, again))
+        one, other = (
+            scene_renderer.render_frame(s, scene_player.frame(s, t), view).color.numpy() for s in (baked, again)
+        )
         assert psnr(one, other) > 45
 
 

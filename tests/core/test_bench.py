@@ -9,15 +9,18 @@ import signal
 import numpy as np
 import pytest
 
-from r5dgs_core import cli, exit_status
-from r5dgs_core.bench import benchmark, cases, playing, process, variants
+from r5dgs_core.bake import bake
+from r5dgs_core.bench import benchmark, cases, playback_speed, process, variants
+from r5dgs_core.cli import exit_status, main
+from r5dgs_core.config import config as configs
+from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
-from r5dgs_core.raster import machine
-from r5dgs_core.report import evaluate
-from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.train import bake, checkpoint, presets
-from r5dgs_core.train import config as configs
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import machine
+from r5dgs_core.scene import scene_file
+from r5dgs_core.train import checkpoint
 from tests import datasets as tiny_datasets
 
 OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
@@ -79,10 +82,10 @@ def test_a_record_holds_what_evaluate_and_playing_find(made, tiny):
     )
     assert set(found["splits"]["test"]) == set(evaluate.METRICS)
     assert found["splits"]["test"]["images"] == 4 and found["splits"]["val"]["images"] == 2
-    assert found["playback"]["frames"] >= playing.LEAST_FRAMES
+    assert found["playback"]["frames"] >= playback_speed.LEAST_FRAMES
     assert found["playback"]["fps"] == pytest.approx(1e3 / found["playback"]["ms_frame"])
     assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).means)
-    assert cli.main(["evaluate", str(case.run), "--progress", "none"]) == 0
+    assert main.main(["evaluate", str(case.run), "--progress", "none"]) == 0
     alone = json.loads((case.run / checkpoint.EVALUATION_FILE).read_text())
     assert alone["splits"]["test"]["rigid"]["psnr"] == pytest.approx(found["splits"]["test"]["psnr"], abs=1e-6)
     assert json.loads((plan.out / benchmark.RESULT_FILE).read_text()) == result
@@ -92,7 +95,7 @@ def test_what_is_finished_is_neither_trained_nor_measured_again(made, monkeypatc
     plan, case, _, result = made
     before = contents(case.run)
     monkeypatch.setattr(process, "train", None)
-    monkeypatch.setattr(playing, "measure", None)
+    monkeypatch.setattr(playback_speed, "measure", None)
     assert benchmark.run_bench(plan, progress_kind="none")["results"] == result["results"]
     assert contents(case.run) == before
 
@@ -100,7 +103,9 @@ def test_what_is_finished_is_neither_trained_nor_measured_again(made, monkeypatc
 def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
     plan, case, _, result = made
     monkeypatch.setattr(process, "train", None)
-    monkeypatch.setattr(playing, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}})
+    monkeypatch.setattr(
+        playback_speed, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}}
+    )
     again = benchmark.run_bench(plan, remeasure=True, progress_kind="none")
     assert again["results"][0]["playback"]["fps"] == 123.0
     (one,), (other,) = again["results"], result["results"]
@@ -121,7 +126,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
 
     monkeypatch.setattr(bake, "bake", with_dynamics)
     result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
-    assert [record["mode"] for record in result] == list(playback.MODES)
+    assert [record["mode"] for record in result] == list(scene_player.MODES)
     assert result[0] == before[0], "what was measured before stays"
     # Motion past t_max stops in the modes that read the dynamics, which are none; up to t_max all modes are the same.
     rigid, hybrid, standard, literal = (record["splits"] for record in result)
@@ -137,7 +142,7 @@ def test_a_case_that_fails_is_reported_and_the_others_go_on(made, tiny, capsys):
     arguments = ["bench", str(tiny.root), "--out", str(plan.out), "--variants", "tracks", "--seeds", "1", "0"]
     options = [text for override in OVERRIDES for text in ("--set", override)]
     try:
-        assert cli.main([*arguments, *options]) == 3
+        assert main.main([*arguments, *options]) == 3
         printed = capsys.readouterr()
         assert len(printed.err.splitlines()) == 1 and "1 of 2 runs failed" in printed.err
         result = json.loads((plan.out / benchmark.RESULT_FILE).read_text())
@@ -313,33 +318,33 @@ def test_the_end_of_a_process_is_put_into_words(status, complaint, words):
 
 
 def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch):
-    drawn, frame = [], playback.Player.frame
+    drawn, frame = [], scene_player.Player.frame
 
     def watch(player, t, origin=None):
         drawn.append(t)
         return frame(player, t, origin)
 
-    monkeypatch.setattr(playback.Player, "frame", watch)
+    monkeypatch.setattr(scene_player.Player, "frame", watch)
     views = datasets.read(tiny.root).test
-    found = playing.measure(baked, views[::-1], ["rigid"])["rigid"]
+    found = playback_speed.measure(baked, views[::-1], ["rigid"])["rigid"]
     round_ = drawn[: len(views)]
     assert sorted(round_) == sorted(view.t for view in views) and round_ == [*tiny_datasets.LATER] * 2
     assert drawn == round_ * (len(drawn) // len(round_)) and found["frames"] == len(drawn) - len(views)
     assert found["ms_frame_low"] <= found["ms_frame"] <= found["ms_frame_high"]
-    assert playing.measure(baked, [], ["rigid"]) == {"rigid": {**dict.fromkeys(found), "frames": 0}}
+    assert playback_speed.measure(baked, [], ["rigid"]) == {"rigid": {**dict.fromkeys(found), "frames": 0}}
 
 
 def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
     still = dataclasses.replace(baked, dynamics=np.zeros((len(baked.means), 12), np.float32))
-    drawn, frame = [], playback.frame
+    drawn, frame = [], scene_player.frame
 
     def watch(scene, t, mode="rigid"):
         drawn.append(mode)
         return frame(scene, t, mode)
 
-    monkeypatch.setattr(playback, "frame", watch)
+    monkeypatch.setattr(scene_player, "frame", watch)
     views = datasets.read(tiny.root).test
-    found = playing.measure(still, views, ["rigid", "standard"])
+    found = playback_speed.measure(still, views, ["rigid", "standard"])
     turn = ["rigid"] * len(views) + ["standard"] * len(views)
     assert drawn == turn * (len(drawn) // len(turn))
-    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playing.LEAST_FRAMES
+    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playback_speed.LEAST_FRAMES

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from r5dgs_core.bench import plot, tables
 from r5dgs_core.data import images
 from r5dgs_core.errors import ConfigError
-from r5dgs_core.report import bench_plot, bench_tables, evaluate
+from r5dgs_core.evaluation import evaluate
 
 MACHINE = {
     "system": "Some system",
@@ -56,7 +57,7 @@ def lines_of(sheet):
 
 
 def test_seeds_become_their_mean_and_half_their_range():
-    test, val, played = bench_tables.sheets(result([record(seed=0, psnr=30.0), record(seed=1, psnr=31.0)]))
+    test, val, played = tables.sheets(result([record(seed=0, psnr=30.0), record(seed=1, psnr=31.0)]))
     (line,) = lines_of(test)
     assert line["PSNR"] == "30.50 ± 0.50" and line["CPU s"] == "10 ± 0" and line["LPIPS"] == "-"
     assert lines_of(val)[0]["PSNR"] == "33.50 ± 0.50"
@@ -66,13 +67,13 @@ def test_seeds_become_their_mean_and_half_their_range():
 def test_the_tables_say_which_records_were_measured_on_what():
     records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
     found = result(records)
-    assert "alike" not in bench_tables.markdown(found)
-    caption = bench_tables.sheets(found)[2].caption
+    assert "alike" not in tables.markdown(found)
+    caption = tables.sheets(found)[2].caption
     assert "threads of the rasterizer 1" in caption and "Some CPU" in caption and "GPU" not in caption
     records[1]["machine"] = {**MACHINE, "raster_threads": 4}
-    caption = bench_tables.sheets(found)[2].caption
+    caption = tables.sheets(found)[2].caption
     assert "not all measured alike" in caption and "rasterizer 1 / 4" in caption and "Some CPU" not in caption
-    (line,) = [line for line in bench_tables.markdown(found).splitlines() if "rasterizer 4" in line and line[0] == "-"]
+    (line,) = [line for line in tables.markdown(found).splitlines() if "rasterizer 4" in line and line[0] == "-"]
     assert line.startswith("- measured:") and line.endswith("(room tracks rigid seed 1)")
 
 
@@ -80,7 +81,7 @@ def test_the_tables_say_which_runs_were_trained_elsewhere_or_nobody_knows_where(
     records = [record(seed=0), record(seed=1), record(variant="r5dgs", mode="standard")]
     records[0]["trained_on"] = {**MACHINE, "versions": {"r5dgs": "0.1"}}
     records[2]["trained_on"] = None
-    text = bench_tables.markdown(result(records))
+    text = tables.markdown(result(records))
     assert "Not all runs were trained alike" in text and "Not all runs were measured alike" not in text
     trained = [line for line in text.splitlines() if line.startswith("- trained:")]
     assert len(trained) == 3 and "r5dgs 0.1" in trained[0] and trained[0].endswith("(room tracks seed 0)")
@@ -88,7 +89,7 @@ def test_the_tables_say_which_runs_were_trained_elsewhere_or_nobody_knows_where(
 
 
 def test_a_single_seed_has_no_spread():
-    test, _, played = bench_tables.sheets(result([record()]))
+    test, _, played = tables.sheets(result([record()]))
     assert lines_of(test)[0]["PSNR"] == "30.00" and "seeds" not in test.caption
     assert lines_of(played)[0]["mIoU test"] == "0.800"
 
@@ -98,8 +99,7 @@ def test_the_papers_rows_come_first_and_ours_last():
     records += [record(variant=v, mode=m) for v in ("r5dgs_extra", "r5dgs") for m in ("rigid", "rigid_paper")]
     records += [record(variant="r5dgs", mode="standard")]
     found = [
-        (line["paper's row"], line["method"], line["mode"])
-        for line in lines_of(bench_tables.sheets(result(records))[0])
+        (line["paper's row"], line["method"], line["mode"]) for line in lines_of(tables.sheets(result(records))[0])
     ]
     assert found == [
         ("5DGS", "field/r5dgs", "standard"),
@@ -114,41 +114,41 @@ def test_the_papers_rows_come_first_and_ours_last():
 def test_modes_are_compared_with_standard_of_the_same_run():
     records = [record(variant="r5dgs", mode="standard", seed=s, psnr=30.0 + 5 * s, ms=10.0) for s in (0, 1)]
     records += [record(variant="r5dgs", mode="rigid", seed=s, psnr=31.0 + 4 * s, ms=5.0) for s in (0, 1)]
-    (line,) = lines_of(bench_tables.sheets(result([*records, record()]))[3])
+    (line,) = lines_of(tables.sheets(result([*records, record()]))[3])
     assert (line["mode"], line["PSNR dB"], line["FPS x"]) == ("rigid", "+0.50 ± 0.50", "2.00 ± 0.00")
     assert line["objects dB"] == "-"
-    assert len(bench_tables.sheets(result([record()]))) == 3
+    assert len(tables.sheets(result([record()]))) == 3
 
 
 def test_only_one_row_is_called_5dgs():
     both = ("5dgs", "r5dgs")
-    assert bench_tables.paper_row("5dgs", "standard", both) == "5DGS"
-    assert bench_tables.paper_row("r5dgs", "standard", both) == ""
-    assert bench_tables.paper_row("r5dgs", "standard", ("r5dgs",)) == "5DGS"
+    assert tables.paper_row("5dgs", "standard", both) == "5DGS"
+    assert tables.paper_row("r5dgs", "standard", both) == ""
+    assert tables.paper_row("r5dgs", "standard", ("r5dgs",)) == "5DGS"
 
 
 def test_the_mean_over_scenes_is_given_where_all_scenes_have_a_figure():
     records = [record("a", psnr=20.0), record("b", psnr=30.0), record("a", variant="r5dgs", mode="standard")]
-    last = [line for line in lines_of(bench_tables.sheets(result(records))[0]) if line["scene"] == "mean of 2"]
+    last = [line for line in lines_of(tables.sheets(result(records))[0]) if line["scene"] == "mean of 2"]
     assert [(line["method"], line["PSNR"]) for line in last] == [("tracks", "25.00")]
     records[0]["splits"]["test"]["flip"] = None
-    last = lines_of(bench_tables.sheets(result(records))[0])[-1]
+    last = lines_of(tables.sheets(result(records))[0])[-1]
     assert last["FLIP"] == "-" and last["PSNR"] == "25.00"
 
 
 def test_what_failed_is_in_the_tables_and_below_them():
     names = {"scene": "b", "representation": "field", "variant": "r5dgs", "seed": 0}
     found = result([record("a")], [{**names, "error": "loss: nan | at step 3"}])
-    (line,) = [line for line in lines_of(bench_tables.sheets(found)[0]) if line["scene"] == "b"]
+    (line,) = [line for line in lines_of(tables.sheets(found)[0]) if line["scene"] == "b"]
     assert (line["method"], line["PSNR"]) == ("field/r5dgs", "failed")
-    assert "b, r5dgs, seed 0: loss: nan" in bench_tables.markdown(found)
+    assert "b, r5dgs, seed 0: loss: nan" in tables.markdown(found)
 
 
 def test_markdown_has_a_line_of_equal_width_for_every_line_of_the_tables():
     found = result([record("a"), record("b|c")])
-    text = bench_tables.markdown(found)
+    text = tables.markdown(found)
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    sheets = bench_tables.sheets(found)
+    sheets = tables.sheets(found)
     assert len(rows) == sum(2 + len(lines_of(sheet)) for sheet in sheets)
     widths = [len(row.replace("\\|", "").split("|")) for row in rows]
     assert sorted(set(widths)) == sorted({len(sheet.head) + 2 for sheet in sheets})
@@ -156,9 +156,9 @@ def test_markdown_has_a_line_of_equal_width_for_every_line_of_the_tables():
 
 
 def test_the_terminal_shows_every_figure():
-    sheet = bench_tables.sheets(result([record(psnr=12.34)]))[0]
+    sheet = tables.sheets(result([record(psnr=12.34)]))[0]
     console = Console(file=io.StringIO(), width=200)
-    console.print(bench_tables.to_rich(sheet))
+    console.print(tables.to_rich(sheet))
     text = console.file.getvalue()
     assert all(cell in text for block in sheet.blocks for line in block for cell in line)
 
@@ -168,7 +168,7 @@ def test_rows_mark_what_nothing_faster_equals():
         record(variant="tracks", psnr=40.0, cpu=5.0, ms=4.0),
         record(variant="r5dgs", psnr=35.0, cpu=50.0, ms=3.0),
     ]
-    rows = bench_tables.report_rows(records)
+    rows = tables.report_rows(records)
     assert {tuple(row) for row in rows} == {
         ("task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto")
     }
@@ -182,16 +182,16 @@ def test_rows_take_wall_time_where_processor_time_is_unknown_and_leave_out_what_
     records = [record(cpu=None), record(seed=1)]
     for split in ("test", "val"):
         records[1]["splits"][split]["psnr"] = None
-    rows = [row for row in bench_tables.report_rows(records) if "training" in row["task"]]
+    rows = [row for row in tables.report_rows(records) if "training" in row["task"]]
     assert [(row["setting"], row["ms"]) for row in rows] == [("seed 0", 4e4)] * 2
 
 
 def test_the_plot_shows_the_points(tmp_path):
-    empty = images.read(bench_plot.write([], tmp_path / "empty.png"))
-    full = images.read(bench_plot.write([record(), record(variant="r5dgs", psnr=20.0, ms=9.0)], tmp_path / "full.png"))
+    empty = images.read(plot.write([], tmp_path / "empty.png"))
+    full = images.read(plot.write([record(), record(variant="r5dgs", psnr=20.0, ms=9.0)], tmp_path / "full.png"))
     blue, orange = np.array([0x1F, 0x77, 0xB4]) / 255, np.array([0xFF, 0x7F, 0x0E]) / 255
     for color in (blue, orange):
         near = [(np.abs(picture[..., :3] - color).max(-1) < 0.25).sum() for picture in (empty, full)]
         assert near[0] == 0 and near[1] > 100
     with pytest.raises(ConfigError, match="gone"):
-        bench_plot.write([], tmp_path / "gone" / "plot.png")
+        plot.write([], tmp_path / "gone" / "plot.png")

@@ -211,16 +211,16 @@ def test_pairs_are_the_pixels_where_a_gaussian_is_strong_enough_until_they_are_f
 
 
 def test_a_posed_scene_gives_what_the_scene_shows(load):
-    from r5dgs_core.raster import scene_render
-    from r5dgs_core.scene import playback
+    from r5dgs_core.playback import scene_player
+    from r5dgs_core.render import scene_renderer
 
     workloads = load("workloads")
     posed = workloads.make("tabletop-small")
     drawn = rasterize_splats(*posed.inputs, posed.camera, settings=posed.settings, backend="cpu").image
-    frame = playback.frame(posed.scene, posed.t)
-    shown = scene_render.render_frame(posed.scene, frame, posed.camera, background=None, backend="cpu").color
+    frame = scene_player.frame(posed.scene, posed.t)
+    shown = scene_renderer.render_frame(posed.scene, frame, posed.camera, background=None, backend="cpu").color
     torch.testing.assert_close(drawn, shown, atol=1e-5, rtol=0)  # exp and sigmoid in another precision
-    still = playback.frame(posed.scene, posed.scene.t_max)
+    still = scene_player.frame(posed.scene, posed.scene.t_max)
     assert np.abs(frame.means - still.means).max() > 0.1
 
 

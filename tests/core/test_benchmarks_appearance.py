@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
 from tests import benchmark_modules, scenes
 
 
@@ -43,7 +43,7 @@ def test_a_change_of_colour_that_is_affine_counts_as_shading_whole(appearance):
 def test_what_is_frozen_stays_as_at_t_max_and_all_else_goes_on(appearance):
     scene = scenes.make_scene(seed=2)
     t = scene.t_max + 0.2
-    bind, free = playback.frame(scene, scene.t_max), playback.frame(scene, t)
+    bind, free = scene_player.frame(scene, scene.t_max), scene_player.frame(scene, t)
     shadow = np.isin(scene.motion_ids, [g.id for g in scene.groups if g.role == "shadow"])
     for shading in (False, True):
         for shadows in (False, True):
@@ -59,7 +59,7 @@ def test_what_is_frozen_stays_as_at_t_max_and_all_else_goes_on(appearance):
 
 def test_a_gaussian_is_seen_from_where_nothing_hides_it(appearance):
     scene = scenes.make_scene(n=200, objects=1, seed=3)
-    frame, camera = playback.frame(scene, scene.t_max), scenes.orbit_camera(0.3)
+    frame, camera = scene_player.frame(scene, scene.t_max), scenes.orbit_camera(0.3)
     seen = appearance.visibility(scene, frame, camera)
     assert seen.min() >= 0 and seen.max() > 0.5 and np.isfinite(seen).all()
     sight = appearance.Sight.__new__(appearance.Sight)

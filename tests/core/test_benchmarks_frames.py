@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback, validation
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import validation
 from tests import benchmark_modules
 
 
@@ -24,11 +25,11 @@ def test_the_scene_that_is_played_is_valid_and_its_bodies_move(load):
     scene = frame_rate.make_scene(300, 6, 1, 2, camera)
     validation.check(scene, "benchmark")
     for t in (0.2, 1.2):
-        frame = playback.frame(scene, t)
+        frame = scene_player.frame(scene, t)
         moved = np.linalg.norm(frame.means - scene.means, axis=-1)
         assert (moved[:100] == 0).all() and (moved[100:] > 1e-3).all()
         assert len(np.unique(frame.motion_ids)) == 7
-        output = scene_render.render_frame(scene, frame, camera)
+        output = scene_renderer.render_frame(scene, frame, camera)
         assert float(output.alpha.mean()) > 0.1
 
 
@@ -44,7 +45,7 @@ def test_bodies_in_the_room_are_small_and_before_walls_that_stay(load):
         ball = scene.means[one.start : one.start + one.count]
         assert np.linalg.norm(ball - ball.mean(0), axis=-1).max() <= 2 * frame_rate.BALL
         assert ball[:, 2].max() < 0
-    moved = np.linalg.norm(playback.frame(scene, 0.2).means - scene.means, axis=-1)
+    moved = np.linalg.norm(scene_player.frame(scene, 0.2).means - scene.means, axis=-1)
     assert (moved[:400] == 0).all() and (moved[400:] > 1e-3).all()
 
 
@@ -53,8 +54,8 @@ def test_what_a_stage_is_sent_places_the_gaussians_as_playback_does(load, kind):
     frame_rate = load("frame_rate")
     scene = frame_rate.make_scene(300, 3, 0, 0, frame_rate.make_camera(32), kind=kind)
     for t in (0.3, 1.1):
-        posed = scene_render.pose_instances(scene, frame_rate.instances_at(scene, t))
-        np.testing.assert_allclose(posed.means, playback.frame(scene, t).means, atol=1e-6)
+        posed = scene_renderer.pose_instances(scene, frame_rate.instances_at(scene, t))
+        np.testing.assert_allclose(posed.means, scene_player.frame(scene, t).means, atol=1e-6)
 
 
 def test_a_picture_of_a_stage_that_differs_is_noticed(load):
@@ -62,7 +63,7 @@ def test_a_picture_of_a_stage_that_differs_is_noticed(load):
     camera = frame_rate.make_camera(32)
     scene = frame_rate.make_scene(100, 2, 0, 0, camera)
     instances = frame_rate.instances_at(scene, 0.4)
-    picture = scene_render.render_frame(scene, scene_render.pose_instances(scene, instances), camera)
+    picture = scene_renderer.render_frame(scene, scene_renderer.pose_instances(scene, instances), camera)
     frame_rate.compare(picture, scene, instances, camera)
     with pytest.raises(AssertionError, match="alpha"):
         frame_rate.compare(dataclasses.replace(picture, alpha=picture.alpha * 0.999), scene, instances, camera)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import colmap_model, transforms
-from r5dgs_core.scene import camera_files, cameras
-from r5dgs_core.scene.camera_files import View
+from r5dgs_core.formats import camera_files
+from r5dgs_core.formats.camera_files import View
+from r5dgs_core.scene import cameras
 from tests.scenes import orbit_camera
 
 

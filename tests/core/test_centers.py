@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.motion import centers, models, rotations
+from r5dgs_core.motion import models, rotation_centers, rotations
 from r5dgs_core.motion.models import MotionModel
 
 TAU = np.linspace(0.0, 1.5, 7)
@@ -42,7 +42,7 @@ def spins(**more):
 @pytest.mark.parametrize("name", spins())
 @given(point=vectors)
 def test_the_point_that_a_motion_is_moved_to_stays(name, point):
-    moved = centers.with_center(spins()[name], point, old=POINT)
+    moved = rotation_centers.with_center(spins()[name], point, old=POINT)
     np.testing.assert_allclose(places(moved, point[None])[:, 0], np.broadcast_to(point, (len(TAU), 3)), atol=1e-7)
     assert np.ptp(places(moved, point + POINTS), axis=0).max() > 0.05
 
@@ -51,7 +51,7 @@ def test_the_point_that_a_motion_is_moved_to_stays(name, point):
 @given(point=vectors)
 def test_every_other_point_moves_as_it_did_about_the_old_one(name, point):
     model = spins()[name]
-    moved = centers.with_center(model, point, old=POINT)
+    moved = rotation_centers.with_center(model, point, old=POINT)
     about = places(moved, point + POINTS) - point
     np.testing.assert_allclose(about, places(model, POINT + POINTS) - POINT, atol=1e-7)
 
@@ -62,10 +62,10 @@ def test_what_lies_on_the_new_axis_stays_and_the_speed_is_the_old_one(name, dire
     model = spins()[name]
     if name == "hinge":  # one that turns about one axis throughout
         model = dataclasses.replace(model, angular_acceleration=0.3 * W)
-    at = centers.center(model)
-    turned = centers.with_axis(model, direction)
-    np.testing.assert_allclose(centers.axis(turned), direction / np.linalg.norm(direction), atol=1e-12)
-    line = at + np.array([[-1.0], [0.0], [2.0]]) * centers.axis(turned)
+    at = rotation_centers.center(model)
+    turned = rotation_centers.with_axis(model, direction)
+    np.testing.assert_allclose(rotation_centers.axis(turned), direction / np.linalg.norm(direction), atol=1e-12)
+    line = at + np.array([[-1.0], [0.0], [2.0]]) * rotation_centers.axis(turned)
     np.testing.assert_allclose(places(turned, line), np.broadcast_to(line, (len(TAU), 3, 3)), atol=1e-9)
     for new, old in ((turned.angular_velocity, model.angular_velocity),
                      (turned.angular_acceleration, model.angular_acceleration)):  # fmt: skip
@@ -76,8 +76,8 @@ def test_what_lies_on_the_new_axis_stays_and_the_speed_is_the_old_one(name, dire
 def test_a_screw_keeps_its_rise_and_an_orbit_its_drift(direction, point):
     for kind in ("constant_twist", "world_twist"):
         screw = MotionModel(kind, angular_velocity=[0, 0, 2.0], velocity=[0.4, 0.1, 0.3])
-        turned = centers.with_axis(centers.with_center(screw, point), direction, through=point)
-        along = centers.axis(turned)
+        turned = rotation_centers.with_axis(rotation_centers.with_center(screw, point), direction, through=point)
+        along = rotation_centers.axis(turned)
         np.testing.assert_allclose(turned.velocity @ along, 0.3, atol=1e-9)
         moved = places(turned, point[None])[:, 0] - point
         np.testing.assert_allclose(moved, 0.3 * TAU[:, None] * along, atol=1e-6)
@@ -86,16 +86,16 @@ def test_a_screw_keeps_its_rise_and_an_orbit_its_drift(direction, point):
 @given(point=vectors)
 def test_a_spring_swings_about_its_rest(point):
     spring = MotionModel("translation", velocity=[0.3, 0, -1.0], acceleration=[1.0, 2.0, 3.0], frequency=4.0)
-    moved = centers.with_center(spring, point)
+    moved = rotation_centers.with_center(spring, point)
     here, there = places(moved, np.zeros((1, 3))), places(moved, np.zeros((1, 3)), TAU + np.pi / 4.0)
     np.testing.assert_allclose(0.5 * (here + there)[:, 0], np.broadcast_to(point, (len(TAU), 3)), atol=1e-9)
-    np.testing.assert_allclose(centers.center(moved), point, atol=1e-12)
+    np.testing.assert_allclose(rotation_centers.center(moved), point, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", spins())
 def test_the_center_is_on_the_axis_and_of_a_twist_the_nearest_to_the_pivot(name):
     model = spins()[name]
-    center, axis = centers.center(model), centers.axis(model)
+    center, axis = rotation_centers.center(model), rotation_centers.axis(model)
     np.testing.assert_allclose(np.cross(center - POINT, axis), 0, atol=1e-12)
     np.testing.assert_allclose(center @ axis if name in ("turn", "orbit") else center - POINT, 0, atol=1e-12)
 
@@ -103,7 +103,10 @@ def test_the_center_is_on_the_axis_and_of_a_twist_the_nearest_to_the_pivot(name)
 @pytest.mark.parametrize("name", spins())
 def test_moving_and_turning_to_where_it_is_changes_nothing(name):
     model = spins()[name]
-    for same in (centers.with_center(model, centers.center(model)), centers.with_axis(model, centers.axis(model))):
+    for same in (
+        rotation_centers.with_center(model, rotation_centers.center(model)),
+        rotation_centers.with_axis(model, rotation_centers.axis(model)),
+    ):
         for field in ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset"):
             np.testing.assert_allclose(getattr(same, field), getattr(model, field), atol=1e-12)
 
@@ -111,7 +114,7 @@ def test_moving_and_turning_to_where_it_is_changes_nothing(name):
 def test_the_opposite_axis_is_reached_too():
     for along in (*np.eye(3), W):
         model = MotionModel("constant_twist", angular_velocity=along)
-        np.testing.assert_allclose(centers.with_axis(model, -along).angular_velocity, -along, atol=1e-12)
+        np.testing.assert_allclose(rotation_centers.with_axis(model, -along).angular_velocity, -along, atol=1e-12)
 
 
 def test_what_has_no_center_or_axis_says_so():
@@ -123,12 +126,12 @@ def test_what_has_no_center_or_axis_says_so():
         MotionModel("free_top", angular_velocity=W, inertia=np.eye(3)),
     )
     for model in without:
-        assert centers.center(model) is None
+        assert rotation_centers.center(model) is None
         with pytest.raises(ValueError, match=model.kind):
-            centers.with_center(model, POINT)
+            rotation_centers.with_center(model, POINT)
         if model.kind != "free_top":
-            assert centers.axis(model) is None
+            assert rotation_centers.axis(model) is None
             with pytest.raises(ValueError, match=model.kind):
-                centers.with_axis(model, POINT)
+                rotation_centers.with_axis(model, POINT)
     with pytest.raises(ValueError, match="direction"):
-        centers.with_axis(spins()["turn"], np.zeros(3))
+        rotation_centers.with_axis(spins()["turn"], np.zeros(3))

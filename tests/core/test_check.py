@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r5dgs_core import check, cli, errors, findings
+from r5dgs_core import check, errors, findings
 from r5dgs_core.check import codes, data
+from r5dgs_core.cli import main
 from r5dgs_core.data import images
 from r5dgs_core.motion import models
 from r5dgs_core.scene import scene_file
@@ -527,23 +528,23 @@ def test_the_data_of_a_run_are_checked_as_the_run_reads_them(tmp_path, small_run
 def test_statuses_and_the_last_line(tmp_path, capsys):
     (tmp_path / "bad").mkdir()
     (tmp_path / "warned").mkdir()
-    assert cli.main(["check", str(CASES["D05"](tmp_path / "bad"))]) == 1
+    assert main.main(["check", str(CASES["D05"](tmp_path / "bad"))]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("D05 error ") and re.fullmatch(r"1 error, \d+ warnings?", lines[-1])
-    assert cli.main(["check", str(CASES["D52"](tmp_path / "warned"))]) == 0
+    assert main.main(["check", str(CASES["D52"](tmp_path / "warned"))]) == 0
     out = capsys.readouterr().out
     assert "\x1b" not in out and "0 errors, " in out.splitlines()[-1]
-    assert cli.main(["check", str(tmp_path / "nowhere")]) == 3
+    assert main.main(["check", str(tmp_path / "nowhere")]) == 3
     (tmp_path / "notes.txt").write_text("x")
-    assert cli.main(["check", str(tmp_path / "notes.txt")]) == 3
+    assert main.main(["check", str(tmp_path / "notes.txt")]) == 3
     with pytest.raises(SystemExit) as stop:
-        cli.main(["check"])
+        main.main(["check"])
     assert stop.value.code == 2
 
 
 def test_json_has_the_same_findings(tmp_path, capsys):
     root = CASES["D05"](tmp_path)
-    assert cli.main(["check", str(root), "--json"]) == 1
+    assert main.main(["check", str(root), "--json"]) == 1
     content = json.loads(capsys.readouterr().out)
     assert content["errors"] == 1 and content["errors"] + content["warnings"] == len(content["findings"])
     assert [findings.Finding(**row) for row in content["findings"]] == check.check(root)
@@ -554,7 +555,7 @@ def test_data_sets_and_scenes_are_checked_without_torch(tmp_path):
     scene = scene_changed(tmp_path)
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from r5dgs_core import cli\n"
+        "from r5dgs_core.cli import main as cli\n"
         f"sys.exit(max(cli.main(['check', path]) for path in {[str(tmp_path), str(scene)]!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from r5dgs_core.config import config
 from r5dgs_core.errors import CheckpointError
-from r5dgs_core.train import checkpoint, config
+from r5dgs_core.train import checkpoint
 
 ROWS = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": (), "sh": (1, 3), "sh_rest": (8, 3)}
 STATE = checkpoint.Checkpoint(

@@ -19,9 +19,10 @@ import zipfile
 import pytest
 import torch
 
-from r5dgs_core import cli
+from r5dgs_core.bake import bake
+from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError
-from r5dgs_core.train import bake, checkpoint, checkpoint_content, run
+from r5dgs_core.train import checkpoint, checkpoint_content, run
 from tests import datasets as tiny_datasets
 
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=5", "train.probe_every=0")
@@ -125,7 +126,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     assert checkpoint.load(newest.parent).iteration < stopped
     assert len(bake.bake(checkpoint.open_run(newest.parent)).means) > 0
     caplog.clear()
-    assert cli.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
+    assert main.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
     told = [record.getMessage() for record in caplog.records if "checkpoint before it" in record.getMessage()]
     assert len(told) == 1 and str(newest) in told[0] and previous.name in told[0] and "\n" not in told[0]
     assert_same(checkpoint.load(newest.parent), checkpoint.load(reference))

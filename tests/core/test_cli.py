@@ -15,15 +15,18 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core import __version__, cli, command_line, commands, demo, errors, progress
+from r5dgs_core import __version__, atomic_files, errors, progress
 from r5dgs_core.bench import variants
+from r5dgs_core.cli import demo, main, parser, runs
+from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.exit_status import ExitStatus
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.report import evaluate, motion_words
-from r5dgs_core.scene import files, modes, scene_file
+from r5dgs_core.evaluation import evaluate, scene_summary
+from r5dgs_core.playback import modes
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import Timed
-from r5dgs_core.train import checkpoint, presets
+from r5dgs_core.train import checkpoint
 from tests import datasets as tiny_datasets
 from tests.command_line import complaint
 
@@ -36,7 +39,7 @@ OPTIONS = [
 
 def sub_parsers():
     """The parser of each sub-command, by name."""
-    (found,) = [a.choices for a in command_line.parser()._actions if isinstance(a, argparse._SubParsersAction)]
+    (found,) = [a.choices for a in parser.parser()._actions if isinstance(a, argparse._SubParsersAction)]
     return found
 
 
@@ -45,8 +48,8 @@ def made(tiny, tmp_path_factory):
     """A folder with a run and a scene, made by the commands, and what they printed."""
     folder = tmp_path_factory.mktemp("made")
     run, scene = folder / "run", folder / "tiny.r5dgs"
-    assert cli.main(["train", str(tiny.root), "--out", str(run), "--progress", "none", *OPTIONS]) == 0
-    assert cli.main(["bake", str(run), "--out", str(scene)]) == 0
+    assert main.main(["train", str(tiny.root), "--out", str(run), "--progress", "none", *OPTIONS]) == 0
+    assert main.main(["bake", str(run), "--out", str(scene)]) == 0
     return run, scene
 
 
@@ -64,7 +67,7 @@ def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
         arguments, path = [str(run)], run / "evaluation.json"
     else:
         arguments, path = [str(scene), "--data", str(tiny.root)], scene.with_suffix(".evaluation.json")
-    assert cli.main(["evaluate", *arguments]) == 0
+    assert main.main(["evaluate", *arguments]) == 0
     result = json.loads(path.read_text())
     assert result["splits"]["val"]["rigid"]["images"] == 2 and result["splits"]["test"]["rigid"]["images"] == 4
     assert 5 < result["splits"]["val"]["rigid"]["psnr"] < 60
@@ -75,15 +78,15 @@ def test_evaluate_measures_a_run_and_a_scene(made, tiny, capsys, target):
 
 
 def test_evaluate_writes_where_it_is_told(made, tmp_path, capsys):
-    assert cli.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]) == 0
+    assert main.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json")]) == 0
     assert set(json.loads((tmp_path / "e.json").read_text())) == {"scene", "splits", "objects", "train"}
 
 
 def test_info_tells_the_same_to_people_and_programs(made, capsys):
-    assert cli.main(["info", str(made[1]), "--json"]) == 0
+    assert main.main(["info", str(made[1]), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [o["name"] for o in found["objects"]] == ["background", "brick", "ball"]
-    assert cli.main(["info", str(made[1])]) == 0
+    assert main.main(["info", str(made[1])]) == 0
     text = capsys.readouterr().out
     assert f"{found['gaussians']} Gaussians, 2 objects" in text
     start, end = found["times"]
@@ -91,13 +94,13 @@ def test_info_tells_the_same_to_people_and_programs(made, capsys):
     assert f"duration   {frames} frames: scene time {start:g} to {end:g}" in text
     assert f"{found['frames_per_unit']:g} per unit" in text and f"{found['extent']:.3g} world units" in text
     assert "quality" in text and "regrouping" not in text
-    assert cli.main(["info", str(made[1]), "--needs"]) == 0
+    assert main.main(["info", str(made[1]), "--needs"]) == 0
     assert capsys.readouterr().out.startswith(text) and all(need["name"] for need in found["needs"])
 
 
 def test_a_summary_names_what_moves_and_how(scene):
-    text = motion_words.summary(scene)
-    resting = {item.name for item in scene.objects if motion_words.observed_motion(scene, item.id) is None}
+    text = scene_summary.summary(scene)
+    resting = {item.name for item in scene.objects if scene_summary.observed_motion(scene, item.id) is None}
     assert "background" in resting and len(resting) < len(scene.objects)
     for item in scene.objects:
         assert (f"\n  {item.name}: " in text) == (item.name not in resting)
@@ -108,13 +111,13 @@ def test_a_summary_names_what_moves_and_how(scene):
 @pytest.mark.parametrize("odd", ["x", {}, {"checkpoint_psnr": 1.0, "baked_psnr": "x"}])
 def test_a_summary_leaves_out_what_provenance_does_not_have(scene, odd):
     odd_scene = dataclasses.replace(scene, provenance={"training_views": odd})
-    assert motion_words.summary(odd_scene) == motion_words.summary(scene)
+    assert scene_summary.summary(odd_scene) == scene_summary.summary(scene)
 
 
 def test_bake_prints_the_summary_and_the_needs_on_demand(made, tmp_path, capsys):
     scene = tmp_path / "again.r5dgs"
     for extra, shown in (([], False), (["--needs"], True)):
-        assert cli.main(["bake", str(made[0]), "--out", str(scene), "--progress", "none", *extra]) == 0
+        assert main.main(["bake", str(made[0]), "--out", str(scene), "--progress", "none", *extra]) == 0
         text = capsys.readouterr().out
         assert text.startswith(f"written: {scene}\nscene ") and ("what the scene needs" in text) == shown
         assert re.search(r"^baking +checkpoint \d+\.\d\d dB, scene \d+\.\d\d dB on the training views$", text, re.M)
@@ -153,12 +156,12 @@ def test_a_wrong_override_is_named_before_anything_is_made(tmp_path, tiny, capsy
 def test_a_resumed_run_keeps_its_own_configuration(made, tiny, capsys):
     line = complaint(capsys, "train", tiny.root, "--out", made[0], "--resume", "--seed", "1", status=ExitStatus.USAGE)
     assert "--resume" in line
-    assert cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
+    assert main.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--progress", "none"]) == 0
 
 
 def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
     run, given = tmp_path / "run", ["train", str(tiny.root), "--progress", "none", *OPTIONS]
-    assert cli.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
+    assert main.main([*given, "--out", str(run), "--max-gaussians", "120", "--preset", "fast"]) == 0
     kept = checkpoint.load(run)
     assert len(kept.tensors["gaussians.means"]) <= 120 and kept.iteration == 20  # --set wins over the preset
     assert checkpoint.open_run(run).config.densify.max_gaussians == 120
@@ -170,7 +173,7 @@ def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
 
 def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
     bare = tmp_path / "bare.r5dgs"
-    assert cli.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
+    assert main.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
     assert scene_file.read(bare).identities is None and scene_file.read(made[1]).identities is not None
     wrong = ("bake", made[0], "--out", bare, "--set", "train.seed=1")
     assert "bake takes needs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
@@ -188,22 +191,22 @@ def test_a_target_folder_that_does_not_exist_is_an_error_for_bake(made, tmp_path
 def test_wrong_usage_is_status_2(capsys):
     for arguments in ([], ["fly"], ["train"]):
         with pytest.raises(SystemExit) as stop:
-            cli.main(arguments)
+            main.main(arguments)
         assert stop.value.code == 2
     assert "usage: r5dgs" in capsys.readouterr().err
 
 
 def test_help_of_bench_names_every_variant(capsys):
     with pytest.raises(SystemExit):
-        cli.main(["bench", "--help"])
+        main.main(["bench", "--help"])
     shown = capsys.readouterr().out.replace("\n", " ")
     assert all(f"{name}," in shown or f"{name} " in shown for name in variants.VARIANTS)
     assert f"(default: {' '.join(variants.DEFAULT_VARIANTS)})" in " ".join(shown.split())
 
 
 def test_the_module_of_the_command_line_names_every_command():
-    named = " ".join(cli.__doc__.split("\n\n")[0].split()).partition(": ")[2].rstrip(".").split(", ")
-    assert sorted(named) == sorted(sub_parsers()) == sorted(cli._RUN)
+    named = " ".join(main.__doc__.split("\n\n")[0].split()).partition(": ")[2].rstrip(".").split(", ")
+    assert sorted(named) == sorted(sub_parsers()) == sorted(main._RUN)
 
 
 def test_the_bundled_data_is_found_and_small():
@@ -228,7 +231,7 @@ def test_a_second_run_is_not_begun_over_the_first(made, tiny, capsys):
 
 def test_resume_and_overwrite_exclude_each_other(made, tiny, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--overwrite"])
+        main.main(["train", str(tiny.root), "--out", str(made[0]), "--resume", "--overwrite"])
     assert stop.value.code == 2 and "not allowed with" in capsys.readouterr().err
 
 
@@ -254,8 +257,8 @@ def test_the_table_is_shown_even_where_the_file_cannot_be_written(made, tmp_path
     def full_disk(*args):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files, "write", full_disk)
-    assert cli.main(["evaluate", str(made[0])]) == ExitStatus.ERROR
+    monkeypatch.setattr(atomic_files, "write", full_disk)
+    assert main.main(["evaluate", str(made[0])]) == ExitStatus.ERROR
     shown = capsys.readouterr()
     assert "PSNR" in shown.out and "No space left" in shown.err and str(made[0] / "evaluation.json") in shown.err
 
@@ -267,14 +270,14 @@ def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, t
     assert not (tmp_path / "x.r5dgs").exists()
     for target in made:
         caplog.clear()
-        assert cli.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
-        assert [r.getMessage() for r in caplog.records if r.name == commands.__name__] == [
+        assert main.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
+        assert [r.getMessage() for r in caplog.records if r.name == runs.__name__] == [
             f"{other.root}: {target} was trained on other data than this; it is used all the same"
         ]
 
 
 def test_evaluate_counts_its_images(made, tmp_path, capsys):
-    assert cli.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json"), "--progress", "json"]) == 0
+    assert main.main(["evaluate", str(made[0]), "--json", str(tmp_path / "e.json"), "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     first, *counted = events
     assert first == {"event": "prepare", "text": "the scene"}
@@ -293,7 +296,7 @@ def small_demo(tiny, monkeypatch):
 def test_the_demo_may_be_run_twice_and_leaves_other_runs_alone(small_demo, made, tmp_path, capsys, monkeypatch):
     out = tmp_path / "my demo"
     for _ in range(2):
-        assert cli.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
+        assert main.main([*small_demo, "--out", str(out), "--set", "train.seed=3"]) == 0
         events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
         kinds = list(dict.fromkeys(event["event"] for event in events))
         assert kinds == [
@@ -321,10 +324,10 @@ def test_a_stopped_demo_names_the_command_that_goes_on(small_demo, tmp_path, cap
 
     with monkeypatch.context() as patch:
         patch.setattr(progress, "make", stopping)
-        assert cli.main([*small_demo, "--out", str(out)]) == 130
+        assert main.main([*small_demo, "--out", str(out)]) == 130
     command = shlex.split(capsys.readouterr().err.split("go on with: ")[1])
     assert command == ["r5dgs", "demo", "--out", str(out), "--resume"]
-    assert cli.main([*command[1:], "--progress", "none"]) == 0
+    assert main.main([*command[1:], "--progress", "none"]) == 0
     assert (out / "contact_sheet.png").exists()
 
 
@@ -344,13 +347,13 @@ def test_a_data_set_that_has_moved_is_asked_for(made, tmp_path, capsys):
 
 def test_a_reader_that_goes_away_is_no_traceback(made):
     command = f"{shlex.quote(sys.executable)} -m r5dgs_core.cli info {shlex.quote(str(made[1]))} | true"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(cli.__file__).parents[1])
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(main.__file__).parents[2])
     assert "Traceback" not in done.stderr
 
 
 def test_the_help_of_train_names_every_preset(capsys):
     with pytest.raises(SystemExit):
-        command_line.parser().parse_args(["train", "--help"])
+        parser.parser().parse_args(["train", "--help"])
     text = capsys.readouterr().out
     assert all(f"{name} " in text or f"{name}\n" in text for name in presets.PRESETS)
 
@@ -371,12 +374,12 @@ def test_a_report_refuses_what_it_would_not_heed(given, said, capsys):
 @pytest.mark.parametrize("name", sub_parsers())
 def test_every_help_has_a_description_an_example_and_a_page_that_exists(name, capsys):
     with pytest.raises(SystemExit) as stop:
-        cli.main([name, "--help"])
+        main.main([name, "--help"])
     shown = capsys.readouterr().out
     assert stop.value.code == 0 and len(sub_parsers()[name].description) > 30
     assert f"example:\n  r5dgs {name}" in shown
     page = shown.rpartition("read more: ")[2].strip()
-    assert (Path(cli.__file__).parents[1] / page).is_file()
+    assert (Path(main.__file__).parents[2] / page).is_file()
     if re.search(r"--modes? MODE", shown):
         flat = "".join(shown.split())
         assert all(mode in flat for mode in modes.every())
@@ -387,7 +390,7 @@ def test_the_example_of_every_help_can_be_parsed(name):
     lines = sub_parsers()[name].epilog.partition("example:\n")[2].partition("\n\n")[0].splitlines()
     for line in lines:
         program, *arguments = shlex.split(line)
-        assert program == "r5dgs" and command_line.parser().parse_args(arguments).command == name
+        assert program == "r5dgs" and parser.parser().parse_args(arguments).command == name
 
 
 NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, for every command that can be given some
@@ -439,7 +442,7 @@ NOWHERE = [  # a path that does not exist, or arguments that cannot be meant, fo
 def test_wrong_arguments_and_paths_are_reported_before_any_large_import(tmp_path):
     code = """
 import json, os, sys
-from r5dgs_core import cli
+from r5dgs_core.cli import main as cli
 for arguments in json.loads(sys.argv[1]):
     try:
         status = cli.main(arguments)
@@ -448,7 +451,7 @@ for arguments in json.loads(sys.argv[1]):
     heavy = sorted({"torch", "numba", "scipy", "matplotlib", "numpy", "rich"} & set(sys.modules))
     print(json.dumps([arguments, status, heavy, os.listdir()]), file=sys.__stdout__)
 """
-    settings = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    settings = {**os.environ, "PYTHONPATH": str(Path(main.__file__).parents[2])}
     done = subprocess.run(
         [sys.executable, "-c", code, json.dumps(NOWHERE)], capture_output=True, text=True, cwd=tmp_path, env=settings
     )
@@ -479,16 +482,16 @@ def test_every_kind_of_error_has_its_status(monkeypatch, capsys, error, status):
     def fail(args):
         raise error
 
-    monkeypatch.setitem(cli._RUN, "info", fail)
-    assert cli.main(["info", "x.r5dgs"]) == status
+    monkeypatch.setitem(main._RUN, "info", fail)
+    assert main.main(["info", "x.r5dgs"]) == status
     shown = capsys.readouterr().err
     assert ("Traceback" in shown) == (status == 70) and ("usage: r5dgs info" in shown) == (status == 2)
 
 
 def test_a_query_that_finds_nothing_is_status_1(made, capsys):
-    assert cli.main(["query", str(made[1]), "brick"]) == 0
-    assert cli.main(["query", str(made[1]), "elephant"]) == 1
-    assert cli.main(["query", str(made[1]), "elephant", "--json"]) == 1
+    assert main.main(["query", str(made[1]), "brick"]) == 0
+    assert main.main(["query", str(made[1]), "elephant"]) == 1
+    assert main.main(["query", str(made[1]), "elephant", "--json"]) == 1
     assert "nothing" in capsys.readouterr().out
 
 
@@ -498,7 +501,7 @@ def test_steps_and_seed_reach_the_run_and_threads_leave_its_bits(tiny, tmp_path)
         for threads in (1, 2):
             folder = tmp_path / str(threads)
             given = ["--iterations", "4", "--seed", "7", "--threads", str(threads), "--progress", "none"]
-            assert cli.main(["train", str(tiny.root), "--out", str(folder), *OPTIONS, *given]) == 0
+            assert main.main(["train", str(tiny.root), "--out", str(folder), *OPTIONS, *given]) == 0
             assert compilation.threads() == threads
             states.append(checkpoint.load(folder))
     finally:

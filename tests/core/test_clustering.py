@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from r5dgs_core.semantics import clustering
+from r5dgs_core.association import clustering
 
 
 def evidence(objects: list[int], views: list[int], overlap: float, ids: list[int] | None = None, noise: float = 0.0):

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster.cpu import compilation
 
 CORE = Path(__file__).resolve().parents[2] / "r5dgs_core"
 TOY = """
-from r5dgs_core.raster.compile import kernel
+from r5dgs_core.raster.cpu.compilation import kernel
 
 @kernel
 def double(x):
@@ -81,8 +81,8 @@ def test_the_first_compilation_of_a_machine_is_told_once_and_loading_never(tmp_p
 
 TOLD = """
 import gc, threading, numba
-from r5dgs_core.raster import compile
-from r5dgs_core.raster.compile import helper, kernel
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster.cpu.compilation import helper, kernel
 
 told = []
 gc_inside = []
@@ -103,19 +103,19 @@ def tell(text):
     told.append(text)
     gc_inside.append(gc.isenabled())
 
-with compile.telling(tell):
+with compilation.telling(tell):
     other(1)
-    assert not told and compile.compiled() == 0
+    assert not told and compilation.compiled() == 0
     threads = [threading.Thread(target=outer, args=(x,)) for x in (1, 1, 1.0)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-assert told == [compile.NOTICE] and compile.compiled() == 2  # two kinds of argument
+assert told == [compilation.NOTICE] and compilation.compiled() == 2  # two kinds of argument
 assert gc_inside == [False] and gc.isenabled()
 gc.disable()
 outer(1j)
-assert not gc.isenabled() and compile.compiled() == 3 and len(told) == 1
+assert not gc.isenabled() and compilation.compiled() == 3 and len(told) == 1
 """
 
 
@@ -125,7 +125,9 @@ def test_only_kernels_are_told_of_and_the_collector_is_left_as_it_was(tmp_path):
 
 def test_without_a_place_the_notice_says_so_in_every_process(tmp_path):
     script = TOY.replace(
-        "from r5dgs_core", "import r5dgs_core.raster.compile as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core", 1
+        "from r5dgs_core",
+        "import r5dgs_core.raster.cpu.compilation as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
+        1,
     )
     complaints = [run_toy(tmp_path, script).stderr.splitlines() for _ in range(2)]
     assert complaints[0] == complaints[1] and complaints[0][1:] == [compilation.NOTICE_UNKEPT]
@@ -172,9 +174,9 @@ def test_kernels_are_made_of_their_own_file_and_the_shared_sources_alone():
     assert len(found) > 8 and CORE / "train" / "losses.py" in found
     for path, tree in found.items():
         strange = set(imported_from_the_core(path, tree)) - shared
-        assert not strange, f"{path.name} imports {strange}, which compile._SHARED lacks"
-    # The constants that `model.spherical_harmonics` hands on.
-    assert CORE / "scene" / "harmonics.py" in shared
+        assert not strange, f"{path.name} imports {strange}, which compilation._SHARED lacks"
+    # The constants that `scene.sh_color` hands on.
+    assert CORE / "scene" / "spherical_harmonics.py" in shared
 
 
 def test_a_kernel_is_compiled_again_for_another_state_of_its_own_file(tmp_path):
@@ -270,7 +272,7 @@ def test_compiled_code_that_others_can_replace_is_not_used(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("value", ["0", "-1", "abc", "100000", "2.5", "٣", "9" * 5000, " 2"])
 def test_a_number_of_threads_that_is_none_is_one_line(tmp_path, value):
-    code = "import sys; from r5dgs_core import cli; sys.exit(cli.main(['warm-up']))"
+    code = "import sys; from r5dgs_core.cli import main as cli; sys.exit(cli.main(['warm-up']))"
     environment = {**os.environ, "NUMBA_NUM_THREADS": value, "PYTHONPATH": str(CORE.parent)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 3 and done.stdout == ""

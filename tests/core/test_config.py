@@ -8,8 +8,8 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
+from r5dgs_core.config import config
 from r5dgs_core.errors import ConfigError
-from r5dgs_core.train import config
 
 
 @hypothesis.given(

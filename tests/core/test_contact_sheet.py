@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from r5dgs_core.data import dataset, images
-from r5dgs_core.report import contact_sheet, evaluate
+from r5dgs_core.evaluation import contact_sheet, evaluate
 from tests import pictures
 
 BACKEND = pictures.BACKEND

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.raster import RasterSettings, coverage, scene_render
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import RasterSettings
+from r5dgs_core.render import coverage, scene_renderer
 from tests import scenes
 
 
 @pytest.fixture(scope="module")
 def posed():
     scene = scenes.make_scene(n=500, objects=4, seed=3)
-    return scene, scene_render.pose_frame(scene, playback.frame(scene, 0.4))
+    return scene, scene_renderer.pose_frame(scene, scene_player.frame(scene, 0.4))
 
 
 def shares(posed, groups, ranks):
@@ -21,7 +22,7 @@ def shares(posed, groups, ranks):
 
 def picture(posed):
     scene, pose = posed
-    return scene_render.render_frame(scene, pose, scene.cameras[0], settings=RasterSettings(near_plane=0.01))
+    return scene_renderer.render_frame(scene, pose, scene.cameras[0], settings=RasterSettings(near_plane=0.01))
 
 
 def test_the_shares_of_all_groups_are_alpha_in_falling_order(posed):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from r5dgs_core.scene import cryptomatte
+from r5dgs_core.formats import cryptomatte
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from r5dgs_core.scene import files
-from r5dgs_core.train import checkpoint, curves, run
+from r5dgs_core import atomic_files
+from r5dgs_core.train import checkpoint, learning_curves, run
 from tests import datasets as tiny_datasets
 
 ROWS = [
@@ -24,41 +24,43 @@ def size(png):
 
 def write_log(folder, rows, tail=""):
     (folder / checkpoint.LOG_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows) + tail)
-    return curves.Curves(folder)
+    return learning_curves.Curves(folder)
 
 
 def test_each_curve_has_a_panel_and_only_what_was_looked_at_is_shown():
-    three, two = curves.draw(ROWS), curves.draw(BLIND)
+    three, two = learning_curves.draw(ROWS), learning_curves.draw(BLIND)
     assert size(three)[0] == size(two)[0] and size(three)[1] * 2 == size(two)[1] * 3
 
 
 def test_some_steps_may_have_no_look_at_held_out_views():
     mixed = [BLIND[0], ROWS[1], BLIND[2], ROWS[3]]
-    assert size(curves.draw(mixed)) == size(curves.draw(ROWS)) and curves.draw(mixed) != curves.draw(ROWS)
+    assert size(learning_curves.draw(mixed)) == size(learning_curves.draw(ROWS)) and learning_curves.draw(
+        mixed
+    ) != learning_curves.draw(ROWS)
 
 
 def test_a_finished_run_is_drawn_whatever_the_time_and_a_torn_line_is_left_out(tmp_path):
     write_log(tmp_path, ROWS, '{"iterat').update(finished=True)
-    assert (tmp_path / checkpoint.CURVES_FILE).read_bytes() == curves.draw(ROWS)
+    assert (tmp_path / checkpoint.CURVES_FILE).read_bytes() == learning_curves.draw(ROWS)
 
 
 def test_a_run_that_goes_on_is_drawn_seldom_enough_to_cost_nothing(tmp_path, monkeypatch):
     now, drawn = [0.0], []
-    monkeypatch.setattr(curves.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(learning_curves.time, "monotonic", lambda: now[0])
 
     def draw(rows):
         drawn.append(now[0])
         now[0] += 3.0  # what a slow machine takes
         return b"png"
 
-    monkeypatch.setattr(curves, "draw", draw)
+    monkeypatch.setattr(learning_curves, "draw", draw)
     pictures = write_log(tmp_path, ROWS)
     while now[0] < 1000:
         now[0] += 1.0
         pictures.update()
-    assert drawn[0] == curves.EVERY_S
+    assert drawn[0] == learning_curves.EVERY_S
     gaps = [later - earlier for earlier, later in zip(drawn, drawn[1:], strict=False)]
-    assert len(drawn) > 3 and all(1.1 * curves.SHARE * gap >= 3.0 for gap in gaps)
+    assert len(drawn) > 3 and all(1.1 * learning_curves.SHARE * gap >= 3.0 for gap in gaps)
 
 
 def test_one_point_is_no_curve(tmp_path):
@@ -76,7 +78,7 @@ def test_a_picture_that_cannot_be_drawn_is_one_warning(tmp_path, monkeypatch, ca
     if fault == "matplotlib":
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     elif fault == "disk":
-        monkeypatch.setattr(files, "write", full_disk)
+        monkeypatch.setattr(atomic_files, "write", full_disk)
     else:
         (tmp_path / checkpoint.LOG_FILE).unlink()
     for _ in range(2):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from r5dgs_core import demo
+from r5dgs_core.cli import demo
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.config import config as configs
+from r5dgs_core.config.config import Config
+from r5dgs_core.config.sections import DensifyDefaultSection, DensifySection
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import RasterStats
-from r5dgs_core.train import checkpoint, densification, strategies
-from r5dgs_core.train import config as configs
-from r5dgs_core.train.config import Config
-from r5dgs_core.train.sections import DensifyDefaultSection, DensifySection
+from r5dgs_core.train import checkpoint
+from r5dgs_core.train.densification import densifier, gradient
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 from tests import scenes
@@ -38,13 +39,13 @@ def make(n=40, size=0.5 * PIXEL, seed=0):
 
 
 def gradients(values):
-    found = densification.ScreenGradients(len(values))
+    found = densifier.ScreenGradients(len(values))
     found.add(torch.as_tensor(values), torch.ones(len(values), dtype=torch.bool))
     return found
 
 
 def conditions(cap=1000, seed=0, extent=1.0, eyes=(), iterations=1000):
-    return densification.Conditions(
+    return densifier.Conditions(
         cap=cap,
         iterations=iterations,
         pixel_size=PIXEL,
@@ -57,19 +58,19 @@ def conditions(cap=1000, seed=0, extent=1.0, eyes=(), iterations=1000):
 
 def densify(gaussians, optimizer, found, cap=1000, section=SECTION, width_limit=10.0, seed=0):
     section = dataclasses.replace(section, prune_width=width_limit / (100 * PIXEL))
-    strategy = strategies.Share(section, conditions(cap, seed), len(gaussians))
+    strategy = gradient.Share(section, conditions(cap, seed), len(gaussians))
     strategy.gradients = found
     strategy.round(gaussians, optimizer)
 
 
 def adapt(gaussians, optimizer, found, cap=1000, seed=0, extent=1.0, sizes=False, **section):
-    strategy = strategies.Adaptive(DensifyDefaultSection(**section), conditions(cap, seed, extent), len(gaussians))
+    strategy = gradient.Adaptive(DensifyDefaultSection(**section), conditions(cap, seed, extent), len(gaussians))
     strategy.gradients = found
     strategy.round(gaussians, optimizer, sizes=sizes)
 
 
 def test_the_mean_counts_only_views_that_show_the_gaussian():
-    found = densification.ScreenGradients(3)
+    found = densifier.ScreenGradients(3)
     found.add(torch.tensor([2.0, 5, 7]), torch.tensor([True, True, False]))
     found.add(torch.tensor([4.0, 5, 7]), torch.tensor([True, False, False]))
     assert found.mean().tolist() == [3, 5, 0]
@@ -133,7 +134,7 @@ def test_faint_and_oversized_ones_go_and_without_gradients_nothing_grows():
 
 def test_no_gaussians_at_all_are_no_error():
     gaussians, optimizer = make(n=0)
-    densify(gaussians, optimizer, densification.ScreenGradients(0))
+    densify(gaussians, optimizer, densifier.ScreenGradients(0))
     assert len(gaussians) == 0
 
 
@@ -154,10 +155,10 @@ def test_background_close_before_a_camera_that_no_other_sees_goes():
     with torch.no_grad():
         gaussians.means.copy_(torch.stack([before_first, before_first, middle, -50 * before_first]))
     gaussians.motion_ids = torch.tensor([0, 1, 0, 0])  # the second belongs to a body
-    assert densification.floaters(gaussians, eyes, 1.0).tolist() == [True, False, False, False]
-    assert densification.single_view(gaussians, eyes).tolist() == [True, False, False, True]
-    assert not densification.floaters(gaussians, eyes, 0.0).any()
-    assert not densification.floaters(gaussians, eyes[:2], 1.0).any()  # no second opinion
+    assert densifier.floaters(gaussians, eyes, 1.0).tolist() == [True, False, False, False]
+    assert densifier.single_view(gaussians, eyes).tolist() == [True, False, False, True]
+    assert not densifier.floaters(gaussians, eyes, 0.0).any()
+    assert not densifier.floaters(gaussians, eyes[:2], 1.0).any()  # no second opinion
 
 
 def test_nothing_grows_under_the_gradient_of_the_configuration():
@@ -169,7 +170,7 @@ def test_nothing_grows_under_the_gradient_of_the_configuration():
 def test_what_no_image_needs_fades_and_is_removed():
     gaussians, optimizer = make(n=6)
     wanted = torch.arange(6) < 4
-    strategy = strategies.Share(SECTION, conditions(), 6)
+    strategy = gradient.Share(SECTION, conditions(), 6)
     optimizer.param_groups[3]["lr"] = 0.05
     for iteration in range(1, 301):
         optimizer.zero_grad()
@@ -181,7 +182,7 @@ def test_what_no_image_needs_fades_and_is_removed():
     torch.testing.assert_close(
         torch.sigmoid(gaussians.opacity_logits).detach(), torch.full((4,), 0.7), atol=0.03, rtol=0
     )
-    kept = strategies.Share(dataclasses.replace(SECTION, opacity=0.0), conditions(), 6)
+    kept = gradient.Share(dataclasses.replace(SECTION, opacity=0.0), conditions(), 6)
     assert kept.penalty(gaussians) is None
 
 
@@ -217,7 +218,7 @@ def test_a_reset_lowers_what_is_opaque_and_forgets_its_moments():
         gaussians.opacity_logits.copy_(torch.tensor([0.9, 0.5, 0.006]).logit())
     (gaussians.opacity_logits.sum() + gaussians.means.sum()).backward()
     optimizer.step()
-    strategy = strategies.Adaptive(DensifyDefaultSection(), conditions(iterations=30000), 3)
+    strategy = gradient.Adaptive(DensifyDefaultSection(), conditions(iterations=30000), 3)
     strategy.after_step(gaussians, optimizer, 2999, 1e-3)
     assert torch.sigmoid(gaussians.opacity_logits)[0] > 0.8
     strategy.gradients = gradients(torch.zeros(3))
@@ -233,7 +234,7 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
     section = DensifyDefaultSection(start=30, every=1000, reset_every=100)
     place = dataclasses.replace(conditions(iterations=500), white=white)
     gaussians, optimizer = make()
-    strategy, found = strategies.Adaptive(section, place, 40), []
+    strategy, found = gradient.Adaptive(section, place, 40), []
     for iteration in range(1, 501):
         with torch.no_grad():
             gaussians.opacity_logits.fill_(1.0)
@@ -245,7 +246,7 @@ def test_opacities_are_reset_as_growth_begins_where_the_background_is_white(whit
 
 def test_rounds_come_when_the_section_says():
     section = DensifyDefaultSection(start=100, stop=0.5, every=50, reset_every=0)
-    strategy = strategies.Adaptive(section, conditions(cap=10**6), 40)
+    strategy = gradient.Adaptive(section, conditions(cap=10**6), 40)
     gaussians, optimizer = make()
     grew = []
     for iteration in range(1, 1001):
@@ -264,7 +265,7 @@ def test_a_strategy_made_again_from_its_tensors_does_what_the_first_does(name):
         place = conditions(cap=60, seed=3)
         config = Config().replace(**{"densify.strategy": name, "densify.start": 0, "densify_default.start": 50})
         gaussians, optimizer = make(size=4 * PIXEL)
-        strategy = strategies.make(config, place, 40)
+        strategy = gradient.make(config, place, 40)
         eye = scenes.orbit_camera(0.0, 48, 36)
         draws = torch.Generator().manual_seed(1)
         stats = RasterStats(torch.rand(40, generator=draws) > 0.3, torch.rand(40, generator=draws) * 9)
@@ -272,7 +273,7 @@ def test_a_strategy_made_again_from_its_tensors_does_what_the_first_does(name):
         strategy.observe(stats, eye)
         if again:
             kept = {n: t.clone() for n, t in strategy.tensors().items()}
-            strategy = strategies.make(config, place, 40)
+            strategy = gradient.make(config, place, 40)
             strategy.restore(kept)
         strategy.after_step(gaussians, optimizer, 100, 1e-3)
         results.append((gaussians.means.detach(), strategy.tensors()))
@@ -285,8 +286,8 @@ def test_the_extent_is_that_of_the_cameras():
     eyes = [scenes.orbit_camera(angle, 48, 36) for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
     centers = np.stack([eye.center for eye in eyes])
     radius = np.linalg.norm(centers - centers.mean(0), axis=1).max()
-    assert densification.extent_of(eyes) == pytest.approx(1.1 * radius)
-    assert densification.extent_of(eyes[:1]) == 0.0
+    assert densifier.extent_of(eyes) == pytest.approx(1.1 * radius)
+    assert densifier.extent_of(eyes[:1]) == 0.0
 
 
 SETTINGS = {

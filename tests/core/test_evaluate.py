@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from r5dgs_core.data import dataset, images, masks
-from r5dgs_core.report import evaluate, table
+from r5dgs_core.evaluation import evaluate, evaluation_table
 from tests import pictures, scenes
 
 BACKEND = pictures.BACKEND
@@ -152,7 +152,7 @@ def test_progress_counts_every_image(scene, data):
 
 def test_the_table_shows_every_number_that_there_is(result):
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(table.make(result))
+    console.print(evaluation_table.make(result))
     text = console.export_text()
     for word in ("PSNR", "SSIM", "mIoU", "motion", "rasterization", "100.00", "mug", "red apple", "toy car", "deg"):
         assert word in text
@@ -162,9 +162,9 @@ def test_the_table_shows_every_number_that_there_is(result):
 def test_brackets_in_names_are_shown_as_they_are(result):
     objects = [{**row, "name": f"{row['name']} [/left]"} for row in result["objects"]]
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(table.make({**result, "scene": "[red]", "objects": objects}))
+    console.print(evaluation_table.make({**result, "scene": "[red]", "objects": objects}))
     rows = [{"object": "mug [/left]", "name": "rotation", "value": 1.0, "threshold": 1.0, "reason": "[/b]"}]
-    console.print(table.needs(rows))
+    console.print(evaluation_table.needs(rows))
     text = console.export_text()
     assert "mug [/left] (1)" in text and "[red]" in text and "[/b]" in text and text.count("[/left]") == 7
 
@@ -173,7 +173,7 @@ def test_several_modes_are_rows_that_fit_a_narrow_terminal(result):
     modes = ("rigid", "rigid/least_squares", "hybrid", "standard")
     splits = {split: {mode: found["rigid"] for mode in modes} for split, found in result["splits"].items()}
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(table.make({**result, "splits": splits}))
+    console.print(evaluation_table.make({**result, "splits": splits}))
     text = console.export_text()
     assert all(text.count(f" {mode} ") == len(splits) for mode in modes[1:])
     for word in ("PSNR", "SSIM", "mIoU", "motion", "100.00", "mug", "deg", "mode rigid"):
@@ -206,7 +206,7 @@ def test_the_table_says_what_its_overlap_is(scene, data):
     ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
     wrong = evaluate.evaluate(dataclasses.replace(scene, object_ids=ids), data, backend=BACKEND)
     console = Console(width=200, record=True, file=io.StringIO())
-    console.print(table.make(wrong))
+    console.print(evaluation_table.make(wrong))
     text = " ".join(console.export_text().split())
     assert "val: 2 held-out images, interpolated; test: 4 held-out images, extrapolated" in text
     assert "Hungarian" in text and "0.000 (1.000 as 2)" in text and "toy car (3) │ 1.000 │ 1.000" in text

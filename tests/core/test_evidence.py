@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.scene import cameras
-from r5dgs_core.train import evidence, initialization, triangulation, views
+from r5dgs_core.train import train_views
+from r5dgs_core.train.initialization import evidence, initialize, triangulation
 from tests import scenes
 
 TIMES = np.linspace(0.0, 1.0, 5)
@@ -26,7 +27,9 @@ def ball_view(camera, t, center, paint, light=None, marked=True, shown=True, wal
     shade = 1.0 if light is None else np.clip(0.7 + 0.3 * normals @ np.asarray(light), 0, 1)[:, None]
     image[hit] = paint(normals) * shade
     mask = np.where(hit & marked, BALL, 0).astype(np.uint16)
-    return views.TrainView("v", camera, float(t), np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), mask, None)
+    return train_views.TrainView(
+        "v", camera, float(t), np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), mask, None
+    )
 
 
 def plain(normals):
@@ -110,27 +113,27 @@ def test_an_object_behind_another_or_out_of_the_frame_is_not_absent():
 
 
 def at(camera, t):
-    return views.TrainView("v", camera, float(t), np.zeros((4, 4, 3), np.uint8), None, None)
+    return train_views.TrainView("v", camera, float(t), np.zeros((4, 4, 3), np.uint8), None, None)
 
 
 def test_knots_are_the_observed_times():
     seen = [at(c, t) for t in (0.0, 0.1, 0.5, 0.7) for c in ring()]
-    assert initialization.observed_times(seen).tolist() == [0.0, 0.1, 0.5, 0.7]
-    assert initialization.observed_times(seen[:1]).tolist() == [0.0]
+    assert initialize.observed_times(seen).tolist() == [0.0, 0.1, 0.5, 0.7]
+    assert initialize.observed_times(seen[:1]).tolist() == [0.0]
     alone = [at(c, t) for c, t in zip(ring(), (0.0, 0.01, 0.011, 0.5), strict=True)]  # each camera one time
-    assert initialization.observed_times(alone).tolist() == [0.0, 0.01, 0.011, 0.5]
+    assert initialize.observed_times(alone).tolist() == [0.0, 0.01, 0.011, 0.5]
 
 
 def test_cameras_a_little_out_of_step_share_their_knots():
     shifts = [0.0, 0.001, -0.002, 0.003]
     seen = [at(c, 0.1 * k + shift) for k in range(1, 9) for c, shift in zip(ring(), shifts, strict=True)]
-    knots = initialization.observed_times(seen)
+    knots = initialize.observed_times(seen)
     assert len(knots) == 8 and knots[0] == seen[2].t and knots[-1] == seen[-1].t
     np.testing.assert_allclose(knots[1:-1], 0.1 * np.arange(2, 8) + 0.0005, atol=1e-9)
 
 
 def test_too_many_times_give_knots_among_them_where_they_are_dense():
     times = np.concatenate([np.linspace(0, 0.2, 300), np.linspace(0.3, 1, 100)])
-    knots = initialization.observed_times([at(ring()[0], t) for t in times], limit=40)
+    knots = initialize.observed_times([at(ring()[0], t) for t in times], limit=40)
     assert len(knots) == 40 and np.isin(knots, np.round(times, 9)).all() and (np.diff(knots) > 0).all()
     assert knots[0] == 0 and knots[-1] == 1 and (knots < 0.25).sum() == pytest.approx(30, abs=1)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import fitting, gravity, rotations
-from r5dgs_core.train import falling
+from r5dgs_core.bake import falling_bodies
+from r5dgs_core.motion import rotations
+from r5dgs_core.motion_fit import model_selection, shared_gravity
 
 TIMES = np.linspace(0, 0.75, 15)
 
@@ -17,8 +18,8 @@ def fits_of(accelerations):
         tau = (TIMES - TIMES[-1])[:, None]
         path = tau * [0.3, 0.5, 0.1] + 0.5 * tau**2 * acceleration + 1e-3 * rng.normal(size=(15, 3))
         path -= path[-1]
-        track = gravity.Track(TIMES, rotations.identity(15), path, np.ones(15))
-        fits[index] = track, fitting.fit(TIMES, track.quats, path, radius=0.3)
+        track = shared_gravity.Track(TIMES, rotations.identity(15), path, np.ones(15))
+        fits[index] = track, model_selection.fit(TIMES, track.quats, path, radius=0.3)
     return fits
 
 
@@ -27,7 +28,7 @@ def test_what_falls_shares_gravity_and_what_brakes_does_not(convention, up):
     down = np.zeros(3)
     down[up] = -6.0
     fits = fits_of([down, down, np.array([-4.0, 0, 0])])
-    shared = falling.share_gravity(fits, convention)
+    shared = falling_bodies.share_gravity(fits, convention)
     np.testing.assert_array_equal(shared[0].acceleration, shared[1].acceleration)
     np.testing.assert_allclose(shared[0].acceleration, down, atol=0.2)
     assert np.delete(shared[0].acceleration, up).tolist() == [0, 0]
@@ -36,5 +37,5 @@ def test_what_falls_shares_gravity_and_what_brakes_does_not(convention, up):
 
 def test_where_nobody_says_what_is_up_nothing_is_shared():
     fits = fits_of([np.array([0, 0, -6.0])] * 2)
-    assert falling.share_gravity(fits, "colmap") == {k: fit.model for k, (_, fit) in fits.items()}
-    assert falling.share_gravity({}, "blender") == {}
+    assert falling_bodies.share_gravity(fits, "colmap") == {k: fit.model for k, (_, fit) in fits.items()}
+    assert falling_bodies.share_gravity({}, "blender") == {}

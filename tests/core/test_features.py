@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.scene import features, scene_file, scene_json
+from r5dgs_core.scene import format_features, scene_file, scene_json
 from tests.data.make_scenes import SCENES
 from tests.scenes import make_scene
 
@@ -98,7 +98,7 @@ def test_version_1_has_no_features(path, tmp_path):
     assert not scene_file.read(odd).origin.any()
 
 
-ORIGIN = dataclasses.asdict(features.ORIGIN)
+ORIGIN = dataclasses.asdict(format_features.ORIGIN)
 
 
 @pytest.mark.parametrize(

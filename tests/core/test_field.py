@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.model.trd import MotionState
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback, residuals, validation
-from r5dgs_core.train import bake, checkpoint, config, field, field_fitting, run
-from r5dgs_core.train.field_motion import Clock
+from r5dgs_core.playback import residuals, scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import validation
+from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train.representations import field, field_fitting
+from r5dgs_core.train.representations.field_motion import Clock
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -162,13 +166,13 @@ def test_the_baked_scene_is_valid_and_shows_what_was_trained(made, scene):
     trainer = Trainer(datasets.read(made.dataset_root), made.config)
     trainer.restore(checkpoint.load(made.folder))
     assert scene.t_max == pytest.approx(0.7)
-    assert {mode.partition("/")[0] for mode in playback.modes(scene)} == set(playback.MODES)
+    assert {mode.partition("/")[0] for mode in scene_player.modes(scene)} == set(scene_player.MODES)
     assert [g.role for g in scene.groups][:3] == ["pinned", "body", "body"] and scene.residual_rows is not None
     pairs = zip(trainer.dataset.train, trainer.views, strict=True)
     for view, trained_view in [pair for pair in pairs if pair[0].t < scene.t_max][::5]:
         with torch.no_grad():
             expected = trainer.render(trained_view.camera, trained_view.t).numpy()
-        shown = scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy()
+        shown = scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.numpy()
         assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
 
 
@@ -180,7 +184,7 @@ def test_mode_standard_goes_on_as_the_trained_dynamics_do(made, scene):
         with torch.no_grad():
             splats = trainer.splats(camera, t)
         world = np.sort(trainer.normalization.points_to_world(splats.means.numpy()), axis=0)
-        played = np.sort(playback.frame(scene, t, "standard").means, axis=0)
+        played = np.sort(scene_player.frame(scene, t, "standard").means, axis=0)
         np.testing.assert_allclose(played, world, atol=2e-3)
 
 
@@ -296,7 +300,7 @@ def test_harmonics_of_what_moves_turn_with_it(tiny, tmp_path):
     camera = trainer.dataset.train[0].camera
     with torch.no_grad():
         expected = trainer.render(view.camera, scene.t_max).numpy()
-    shown = scene_render.render_frame(scene, playback.frame(scene, scene.t_max), camera).color.numpy()
+    shown = scene_renderer.render_frame(scene, scene_player.frame(scene, scene.t_max), camera).color.numpy()
     assert np.abs(shown.clip(0, 1) - expected.clip(0, 1)).mean() < 2e-3
 
 
@@ -320,7 +324,7 @@ def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):
         changed = dataclasses.replace(made, config=made.config.override(overrides))
         scene = bake.bake(changed, data)
         mine = scene.object_ids == body
-        early, late = (playback.frame(scene, t).means[mine].mean(0) for t in (0.0, scene.t_max))
+        early, late = (scene_player.frame(scene, t).means[mine].mean(0) for t in (0.0, scene.t_max))
         return float(np.linalg.norm(late - early))
 
     assert travel() > 0.3

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster.cpu import compilation
 
 ROOT = Path(__file__).parents[2]
 

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import candidates, fitting, models, rotations
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.motion_fit import candidates, model_selection
 from tests import problems
 from tests.problems import MOTIONS, RADIUS, SIZE, T_MAX
 
@@ -13,7 +14,7 @@ HORIZON = np.array([0.25, 1.25])  # t = 1 and t = 2
 def fitted(name, rng, sigma_t=0.0, sigma_r=0.0, times=TIMES, **options):
     truth, _ = MOTIONS[name]
     quats, displacements, last_quat, last = problems.observe(truth, times, rng, sigma_t, sigma_r)
-    fit = fitting.fit(times, quats, displacements, radius=RADIUS, **options)
+    fit = model_selection.fit(times, quats, displacements, radius=RADIUS, **options)
     return fit, problems.error_percent(fit.model, truth, HORIZON, last_quat, last)
 
 
@@ -40,8 +41,8 @@ def test_the_right_family_is_chosen_in_noise_and_beats_the_largest():
         for _ in range(1 + (name != "static")):
             truth = MOTIONS[name][0]
             quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
-            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
-            largest = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
+            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+            largest = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=["full, free centre"])
             right += fit.chosen in names
             total += 1
             ours.append(problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0])
@@ -60,7 +61,7 @@ def test_at_low_noise_the_choice_is_never_clearly_worse_than_the_largest():
             errors.append(
                 [
                     problems.error_percent(
-                        fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=names).model,
+                        model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=names).model,
                         truth,
                         HORIZON[:1],
                         last_quat,
@@ -86,7 +87,7 @@ def test_a_tumbling_box_is_predicted_by_its_inertia():
     for _ in range(3):
         quats, d, last_quat, last, inertia = observe_tumbling(rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
         for result, body in ((ours, inertia), (without, None)):
-            fit = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=body)
+            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=body)
             assert (fit.chosen == "free top") == (body is not None)
             result.append(problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last)[1])
     assert np.median(ours) < 0.5 * np.median(without)
@@ -94,7 +95,7 @@ def test_a_tumbling_box_is_predicted_by_its_inertia():
 
 def test_a_tumbling_box_is_recovered_without_noise():
     quats, d, last_quat, last, inertia = observe_tumbling(np.random.default_rng(21), 1e-7 * SIZE, 1e-7)
-    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=inertia)
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=inertia)
     assert fit.chosen == "free top"
     assert problems.error_percent(fit.model, problems.TUMBLING, HORIZON, last_quat, last).max() < 0.1
     assert np.isfinite(fit.band).all() and (np.diff(fit.band) >= 0).all()
@@ -105,10 +106,10 @@ def test_the_inertia_changes_nothing_for_bodies_that_do_not_tumble():
     rng = np.random.default_rng(22)
     for name in ("static", "uniform", "ballistic", "spin", "hinge", "rolling, slowing", "pendulum"):
         quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.003 * SIZE, 0.01)
-        plain = fitting.fit(TIMES, quats, d, radius=RADIUS)
-        assert fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=box).model == plain.model
+        plain = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+        assert model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=box).model == plain.model
     quats, d, _, _, _ = observe_tumbling(rng, 0.003 * SIZE, 0.01)
-    cube = fitting.fit(TIMES, quats, d, radius=RADIUS, inertia=np.eye(3))
+    cube = model_selection.fit(TIMES, quats, d, radius=RADIUS, inertia=np.eye(3))
     assert cube.chosen != "free top"
 
 
@@ -122,7 +123,7 @@ def test_one_gross_outlier_is_shrugged_off():
         spoiled[6] += [0.5, -0.4, 0.3]
         spoiled_quats[6] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[6])
         for result, (q, x) in ((clean, (quats, d)), (dirty, (spoiled_quats, spoiled))):
-            model = fitting.fit(TIMES, q, x, radius=RADIUS).model
+            model = model_selection.fit(TIMES, q, x, radius=RADIUS).model
             result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
     assert np.median(dirty) <= max(1.3 * np.median(clean), 2.5)
 
@@ -133,7 +134,7 @@ def test_weight_zero_leaves_a_pose_out():
     quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 1e-6, 1e-6)
     d[:4] += 3.0
     weights = np.r_[np.zeros(4), np.ones(len(TIMES) - 4)]
-    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, weights=weights)
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, weights=weights)
     assert fit.chosen == "translation"
     assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 0.1
 
@@ -147,14 +148,14 @@ def test_a_stop_is_found_and_slow_movers_keep_moving():
             np.minimum(TIMES, 0.42)[:, None] * [0, 0, 2.0] + 0.01 * rng.normal(size=(15, 3))
         )
         quats = rotations.multiply(turns, rotations.conjugate(turns[-1]))
-        fit = fitting.fit(TIMES, quats, path - path[-1], radius=RADIUS)
+        fit = model_selection.fit(TIMES, quats, path - path[-1], radius=RADIUS)
         stopped.append(fit.chosen == "static" and fit.rested)
     assert sum(stopped) >= 3
     slow = models.MotionModel("translation", velocity=[0.1 * SIZE, 0, 0])
     frozen = []
     for _ in range(5):
         quats, d, _, _ = problems.observe(slow, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5)
-        frozen.append(fitting.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
+        frozen.append(model_selection.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
     assert sum(frozen) <= 1
 
 
@@ -163,7 +164,7 @@ def test_a_body_that_brakes_and_stands_in_its_last_three_poses_stays():
     for _ in range(4):
         left = np.maximum(TIMES[-3] - TIMES, 0.0)[:, None]
         path = -3.0 * left**2 * [1.0, 0.2, 0.0] + 0.001 * SIZE * rng.normal(size=(15, 3))
-        fit = fitting.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
+        fit = model_selection.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
         assert fit.rested
         _, displacements = models.evaluate(fit.model, np.array([0.25, 1.0]))
         assert np.abs(displacements).max() < 0.01 * SIZE
@@ -175,7 +176,7 @@ def test_the_apex_of_a_throw_is_not_a_stop(acceleration):
     for noise in (0.0, 0.002, 0.01):
         path = -0.5 * acceleration * (TIMES[-1] - TIMES)[:, None] ** 2 * [0.0, 0.0, 1.0]
         path = path + noise * SIZE * rng.normal(size=(15, 3))
-        fit = fitting.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
+        fit = model_selection.fit(TIMES, rotations.identity(15), path - path[-1], radius=RADIUS)
         assert not fit.rested
 
 
@@ -198,7 +199,7 @@ def test_a_pendulum_swings_on_with_its_frequency(phase_per_window):
     rng = np.random.default_rng(15)
     quats, d, last_quat, last = problems.observe(truth, TIMES, rng, 0.002 * SIZE, np.radians(0.3))
     quats[4] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.0, 0])), quats[4])
-    fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
     assert fit.chosen == "pendulum"
     assert problems.error_percent(fit.model, truth, HORIZON, last_quat, last).max() < 5
     assert fit.model.covariance_names[-1] == "frequency"
@@ -211,7 +212,7 @@ def test_less_than_a_quarter_of_a_period_is_no_swing():
     for phase_per_window in (0.5, 1.0):
         truth = swing(phase_per_window)
         quats, d, _, _ = problems.observe(truth, TIMES, np.random.default_rng(16), 1e-4 * SIZE, 1e-4)
-        fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+        fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
         assert fit.chosen not in ("pendulum", "spring")
         assert fit.model.frequency == 0
 
@@ -221,7 +222,7 @@ def test_noise_that_swings_by_chance_is_no_swing():
     for name in ("uniform", "spin", "hinge", "ballistic"):
         for _ in range(2):
             quats, d, _, _ = problems.observe(MOTIONS[name][0], TIMES, rng, 0.005 * SIZE, np.radians(0.6), 0.7)
-            assert fitting.fit(TIMES, quats, d, radius=RADIUS).model.frequency == 0
+            assert model_selection.fit(TIMES, quats, d, radius=RADIUS).model.frequency == 0
 
 
 def test_the_band_holds_the_true_error():
@@ -233,7 +234,7 @@ def test_the_band_holds_the_true_error():
             quats, d, last_quat, last = problems.observe(
                 truth, TIMES, rng, 0.005 * SIZE, np.radians(1) / 3**0.5, correlation
             )
-            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
             error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
             inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
     assert np.mean(inside) >= 0.9
@@ -249,7 +250,7 @@ def test_the_band_is_wider_where_the_held_out_poses_surprised():
     still = np.tile([1.0, 0, 0, 0], (len(TIMES), 1))
     names = ("translation",)
     calm, surprised = (
-        fitting.fit(TIMES, still, d - d[-1], radius=RADIUS, candidates=names)
+        model_selection.fit(TIMES, still, d - d[-1], radius=RADIUS, candidates=names)
         for d in (steady + noise, steady + late + noise)
     )
     assert surprised.scores[0].held_out > 2 > calm.scores[0].held_out
@@ -275,7 +276,7 @@ def test_few_poses_give_a_plain_model_that_runs_through_them(count):
     truth = MOTIONS["rolling"][0]
     times = np.linspace(0, T_MAX, count) if count > 1 else np.array([T_MAX])
     quats, d, last_quat, last = problems.observe(truth, times, np.random.default_rng(0), 1e-6, 1e-6)
-    fit = fitting.fit(times, quats, d, radius=RADIUS)
+    fit = model_selection.fit(times, quats, d, radius=RADIUS)
     if count == 1:
         assert fit.model.is_static
     else:
@@ -284,7 +285,7 @@ def test_few_poses_give_a_plain_model_that_runs_through_them(count):
 
 
 def test_a_body_that_never_moves_is_static_with_few_poses_too():
-    fit = fitting.fit(np.array([0.0, 1.0]), rotations.identity(2), np.zeros((2, 3)), radius=1.0)
+    fit = model_selection.fit(np.array([0.0, 1.0]), rotations.identity(2), np.zeros((2, 3)), radius=1.0)
     assert fit.chosen == "static"
     assert fit.model.is_static or np.abs(fit.model.offset_displacement).max() < 1e-9
 
@@ -293,8 +294,8 @@ def test_scale_and_units_of_time_do_not_change_the_choice():
     rng = np.random.default_rng(11)
     truth = MOTIONS["hinge"][0]
     quats, d, _, _ = problems.observe(truth, TIMES, rng, 0.003, 0.01)
-    plain = fitting.fit(TIMES, quats, d, radius=RADIUS)
-    scaled = fitting.fit(50 + 24 * TIMES, quats, 1000 * d, radius=1000 * RADIUS)
+    plain = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+    scaled = model_selection.fit(50 + 24 * TIMES, quats, 1000 * d, radius=1000 * RADIUS)
     assert plain.chosen == scaled.chosen
     np.testing.assert_allclose(scaled.model.angular_velocity * 24, plain.model.angular_velocity, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(
@@ -311,7 +312,7 @@ def test_the_world_twist_can_be_asked_for():
         radius=RADIUS,
     )
     quats, d, last_quat, last = problems.observe(truth, TIMES, np.random.default_rng(12), 1e-7, 1e-7)
-    fit = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=["world twist"])
+    fit = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=["world twist"])
     assert fit.model.kind == "world_twist"
     assert problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last).max() < 0.1
 
@@ -336,13 +337,13 @@ def test_poses_without_sense_give_finite_motions(count):
     rng = np.random.default_rng(count)
     times = np.sort(rng.uniform(size=count))
     quats = rotations.normalize(rng.normal(size=(count, 4)))
-    fit = fitting.fit(times, quats, rng.normal(size=(count, 3)), radius=RADIUS)
+    fit = model_selection.fit(times, quats, rng.normal(size=(count, 3)), radius=RADIUS)
     for values in (*models.evaluate(fit.model, np.array([0.0, 1.0, 100.0])), fit.band):
         assert np.isfinite(values).all()
 
 
 def test_exact_rest_is_static_to_the_bit():
-    fit = fitting.fit(TIMES, rotations.identity(15), np.zeros((15, 3)), radius=RADIUS)
+    fit = model_selection.fit(TIMES, rotations.identity(15), np.zeros((15, 3)), radius=RADIUS)
     assert fit.model.is_static
     assert fit.chosen == "static"
 
@@ -368,7 +369,7 @@ def test_unusable_tracks_are_refused(change, message):
         **change,
     }
     with pytest.raises(ValueError, match=message):
-        fitting.fit(**arguments)
+        model_selection.fit(**arguments)
 
 
 NOISE = 0.005 * SIZE, np.radians(1) / 3**0.5
@@ -383,8 +384,8 @@ def test_over_many_seeds_the_right_family_is_chosen_and_costs_little():
         ours, known = [], []
         for _ in range(20):
             quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE)
-            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
-            true = fitting.fit(TIMES, quats, d, radius=RADIUS, candidates=names[-1:])
+            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
+            true = model_selection.fit(TIMES, quats, d, radius=RADIUS, candidates=names[-1:])
             right.append(fit.chosen in names)
             for result, model in ((ours, fit.model), (known, true.model)):
                 result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
@@ -401,12 +402,12 @@ def test_over_many_seeds_stops_are_found_and_slow_movers_move():
         path = way * [0.8, 0.1, 0] + NOISE[0] * rng.normal(size=(15, 3))
         turns = rotations.rotvecs_to_quats(way * [0, 0, 2.0] + NOISE[1] * rng.normal(size=(15, 3)))
         quats = rotations.multiply(turns, rotations.conjugate(turns[-1]))
-        fit = fitting.fit(TIMES, quats, path - path[-1], radius=RADIUS)
+        fit = model_selection.fit(TIMES, quats, path - path[-1], radius=RADIUS)
         stopped.append(fit.chosen == "static" and fit.rested)
         axis = rng.normal(size=3)
         slow = models.MotionModel("translation", velocity=0.1 * SIZE * axis / np.linalg.norm(axis))
         quats, d, _, _ = problems.observe(slow, TIMES, rng, *NOISE)
-        frozen.append(fitting.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
+        frozen.append(model_selection.fit(TIMES, quats, d, radius=RADIUS).chosen == "static")
     assert np.mean(stopped) >= 0.9
     assert np.mean(frozen) <= 0.05
 
@@ -419,7 +420,7 @@ def test_over_many_seeds_the_band_holds_the_true_error(correlation):
         truth = MOTIONS[name][0]
         for _ in range(8):
             quats, d, last_quat, last = problems.observe(truth, TIMES, rng, *NOISE, correlation)
-            fit = fitting.fit(TIMES, quats, d, radius=RADIUS)
+            fit = model_selection.fit(TIMES, quats, d, radius=RADIUS)
             error = problems.error_percent(fit.model, truth, HORIZON[:1], last_quat, last)[0]
             inside.append(error <= 100 / SIZE * np.interp(HORIZON[0], fit.band_tau, fit.band))
     assert np.mean(inside) >= 0.9
@@ -437,6 +438,6 @@ def test_over_many_seeds_an_outlier_costs_little():
             spoiled[row] += [0.5, -0.4, 0.3]
             spoiled_quats[row] = rotations.multiply(rotations.rotvecs_to_quats(np.array([0, 1.5, 0])), quats[row])
             for result, (q, x) in ((clean, (quats, d)), (dirty, (spoiled_quats, spoiled))):
-                model = fitting.fit(TIMES, q, x, radius=RADIUS).model
+                model = model_selection.fit(TIMES, q, x, radius=RADIUS).model
                 result.append(problems.error_percent(model, truth, HORIZON[:1], last_quat, last)[0])
     assert np.median(dirty) <= 1.3 * np.median(clean)

@@ -12,7 +12,9 @@ from r5dgs_core.data import dataset as datasets
 from r5dgs_core.model.deformation import Deltas
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import checkpoint, densification, gating
+from r5dgs_core.train import checkpoint
+from r5dgs_core.train.densification import densifier
+from r5dgs_core.train.representations import gating
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -99,9 +101,7 @@ def test_the_picture_does_not_jump_and_what_rests_is_never_evaluated_again(unmas
     assert all(torch.equal(a[still], after[0][still]) for a in after)
     assert all(torch.equal(a[moving], b[moving]) for a, b in zip(after, before, strict=True))
     assert max(float((a - b)[still].norm(dim=1).max()) for a, b in zip(after, before, strict=True)) < 1.1 * limit
-    densification.grow(
-        trainer.gaussians, trainer.optimizer, still[:3], torch.zeros(3, dtype=torch.bool), trainer.generator
-    )
+    densifier.grow(trainer.gaussians, trainer.optimizer, still[:3], torch.zeros(3, dtype=torch.bool), trainer.generator)
     assert (trainer.gaussians.motion_ids[-3:] == 0).all()
 
 

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import fitting, gravity
 from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.motion_fit import model_selection, shared_gravity
 from tests import problems
 from tests.problems import RADIUS, SIZE, T_MAX
 
@@ -30,8 +30,8 @@ def observed(truths, rng, sigma=0.005 * SIZE):
     tracks, fits, lasts = [], [], []
     for truth in truths:
         quats, d, last_quat, last = problems.observe(truth, TIMES, rng, sigma, 2 * sigma)
-        tracks.append(gravity.Track(TIMES, quats, d, np.ones(len(TIMES))))
-        fits.append(fitting.fit(TIMES, quats, d, radius=RADIUS))
+        tracks.append(shared_gravity.Track(TIMES, quats, d, np.ones(len(TIMES))))
+        fits.append(model_selection.fit(TIMES, quats, d, radius=RADIUS))
         lasts.append((last_quat, last))
     return tracks, fits, lasts
 
@@ -41,7 +41,7 @@ def test_bodies_that_fall_share_gravity_and_are_predicted_better(up):
     rng, alone, together, sharing = np.random.default_rng(0), [], [], []
     for _ in range(4):
         tracks, fits, lasts = observed(FALLING, rng)
-        shared, who = gravity.share(tracks, fits, up)
+        shared, who = shared_gravity.share(tracks, fits, up)
         assert {0, 2} <= set(who)
         sharing += who
         for i in who:
@@ -60,7 +60,7 @@ def test_bodies_that_fall_share_gravity_and_are_predicted_better(up):
 def test_who_disagrees_does_not_share():
     tracks, fits, _ = observed([*FALLING[:2], BRAKING, SLIDING], np.random.default_rng(1), 0.002 * SIZE)
     assert fits[2].chosen == "translation, quadratic"
-    shared, who = gravity.share(tracks, fits)
+    shared, who = shared_gravity.share(tracks, fits)
     assert who == (0, 1)
     assert shared[2] is fits[2]
     assert shared[3] is fits[3]
@@ -70,26 +70,26 @@ def test_who_disagrees_does_not_share():
 def test_two_that_disagree_or_one_alone_stay_as_they_are():
     tracks, fits, _ = observed([FALLING[0], BRAKING], np.random.default_rng(2), 0.002 * SIZE)
     for count in (0, 1, 2):
-        shared, who = gravity.share(tracks[:count], fits[:count])
+        shared, who = shared_gravity.share(tracks[:count], fits[:count])
         assert who == ()
         assert all(x is y for x, y in zip(shared, fits, strict=False))
 
 
 def test_bodies_that_brake_alike_do_not_share_where_only_falling_counts():
     tracks, fits, _ = observed([BRAKING, BRAKING], np.random.default_rng(3), 0.002 * SIZE)
-    assert gravity.share(tracks, fits)[1] == (0, 1)
-    assert gravity.share(tracks, fits, np.array([0, 0, 1.0]))[1] == ()
+    assert shared_gravity.share(tracks, fits)[1] == (0, 1)
+    assert shared_gravity.share(tracks, fits, np.array([0, 0, 1.0]))[1] == ()
 
 
 def test_bodies_that_came_to_rest_do_not_share():
     tracks, fits, _ = observed(FALLING, np.random.default_rng(4))
     fits[0] = dataclasses.replace(fits[0], rested=True)
-    assert gravity.share(tracks, fits)[1] == (1, 2)
+    assert shared_gravity.share(tracks, fits)[1] == (1, 2)
 
 
 def test_without_noise_gravity_is_exact():
     tracks, fits, lasts = observed(FALLING, np.random.default_rng(5), 1e-9)
-    shared, who = gravity.share(tracks, fits)
+    shared, who = shared_gravity.share(tracks, fits)
     assert who == (0, 1, 2)
     for truth, fit, last in zip(FALLING, shared, lasts, strict=True):
         assert problems.error_percent(fit.model, truth, np.array([1.25]), *last)[0] < 0.01
@@ -98,4 +98,4 @@ def test_without_noise_gravity_is_exact():
 def test_a_direction_that_is_none_is_refused():
     for up in (np.zeros(3), np.array([1.0, np.nan, 0]), np.ones(2)):
         with pytest.raises(ValueError, match="up"):
-            gravity.share([], [], up)
+            shared_gravity.share([], [], up)

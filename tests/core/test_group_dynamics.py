@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import models, poses, rotations, se3
-from r5dgs_core.scene import group_dynamics, playback
+from r5dgs_core.motion import models, rigid_fit, rotations, se3
+from r5dgs_core.playback import group_dynamics, scene_player
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, make_scene
 
@@ -143,12 +143,12 @@ def test_kabsch_carries_members_where_their_own_dynamics_bring_them(scene):
     noise = rng.normal(scale=[0.1] * 3 + [0.8] * 3 + [0.1] * 3 + [0.8] * 3, size=(len(scene.means), 12))
     rough = dataclasses.replace(scene, dynamics=scene.dynamics + noise * (scene.dynamics != 0))
     t = T_MAX * (1 + group_dynamics.HORIZON)
-    goal = playback.frame(rough, t, "standard").means
+    goal = scene_player.frame(rough, t, "standard").means
     body = scene.motion_ids == 1
-    best = poses.fit_rigid(scene.means[body], goal[body]).residuals.mean()
+    best = rigid_fit.fit_rigid(scene.means[body], goal[body]).residuals.mean()
 
     def error(source):
-        return np.linalg.norm(playback.frame(rough, t, f"rigid/{source}").means[body] - goal[body], axis=-1).mean()
+        return np.linalg.norm(scene_player.frame(rough, t, f"rigid/{source}").means[body] - goal[body], axis=-1).mean()
 
     assert error("kabsch") < 1.02 * best
     assert error("kabsch") <= 1.01 * min(error("least_squares"), error("median"), error("representative"))

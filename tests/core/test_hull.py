@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import hull, normalization, views
+from r5dgs_core.train import normalization, train_views
+from r5dgs_core.train.initialization import visual_hull
 from tests import datasets as tiny_datasets
 
 
@@ -15,13 +16,13 @@ def posed(tiny):
     """Views of one time, the time, and the way to training coordinates."""
     dataset = datasets.read(tiny.root)
     norm = normalization.from_cameras([v.camera for v in dataset.train])
-    every = views.load(dataset, norm, None)
+    every = train_views.load(dataset, norm, None)
     t = every[18].t
     return [v for v in every if v.t == t], t, norm
 
 
 def carve(seen, object_id, center, count=200, seed=0):
-    return hull.carve(seen, object_id, center, 0.6, count, np.random.default_rng(seed))
+    return visual_hull.carve(seen, object_id, center, 0.6, count, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("object_id", [tiny_datasets.BRICK, tiny_datasets.BALL])
@@ -32,7 +33,7 @@ def test_carved_points_fall_on_the_object_wherever_it_is_not_hidden(tiny, posed,
     assert points.shape == colors.shape == (200, 3)
     assert (colors >= 0).all() and (colors <= 1).all()
     for view in seen:
-        columns, rows, valid = hull.pixel_indices(view, points)
+        columns, rows, valid = visual_hull.pixel_indices(view, points)
         assert valid.all()
         assert (view.mask[rows, columns] != 0).all()  # the object, or another one before it
 
@@ -54,7 +55,7 @@ def test_one_wrong_mask_does_not_empty_the_hull(tiny, posed):
     wrong = [dataclasses.replace(seen[0], mask=np.zeros_like(seen[0].mask)), *seen[1:]]
     points, _ = carve(wrong, 1, center)
     for view in seen[1:]:
-        columns, rows, _ = hull.pixel_indices(view, points)
+        columns, rows, _ = visual_hull.pixel_indices(view, points)
         assert (view.mask[rows, columns] != 0).mean() > 0.95
 
 
@@ -64,7 +65,7 @@ def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, 
     unmarked = [dataclasses.replace(v, mask=np.where(v.mask == 1, 0, v.mask)) for v in seen[2:]]
     points, colors = carve([*seen[:2], *unmarked], 1, center)
     for view in seen[:2]:
-        columns, rows, _ = hull.pixel_indices(view, points)
+        columns, rows, _ = visual_hull.pixel_indices(view, points)
         assert (view.mask[rows, columns] != 0).all()
     assert (colors.max(1) > 0.05).all()
 
@@ -91,5 +92,5 @@ def test_views_without_mask_and_points_behind_a_camera_have_no_say(tiny, posed):
     center = (tiny.center(2, t) - norm.origin) / norm.scale
     blind = [*seen, dataclasses.replace(seen[0], mask=None)]
     np.testing.assert_array_equal(carve(blind, 2, center)[0], carve(seen, 2, center)[0])
-    _, _, valid = hull.pixel_indices(seen[0], (seen[0].camera.center - 2 * seen[0].camera.forward)[None])
+    _, _, valid = visual_hull.pixel_indices(seen[0], (seen[0].camera.center - 2 * seen[0].camera.forward)[None])
     assert not valid.any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import field_baking, hygiene
+from r5dgs_core.train.representations import field_to_groups, regrouping
 
 KNOTS = np.linspace(-1, 0, 9)
 NORMAL = np.array([0.0, 0, 1])
@@ -42,11 +42,11 @@ def scene(seed=0, members=200):
 
 def fit_to(path, opacities):
     observed = np.ones((3, len(KNOTS)), bool)
-    return lambda ids: field_baking._groups(path, ids, opacities, np.array([0, 5, 7]), observed, [LEFT], NORMAL)
+    return lambda ids: field_to_groups._groups(path, ids, opacities, np.array([0, 5, 7]), observed, [LEFT], NORMAL)
 
 
 def tidy(path, ids, opacities):
-    return hygiene.tidy(path, ids, opacities, fit_to(path, opacities))
+    return regrouping.tidy(path, ids, opacities, fit_to(path, opacities))
 
 
 def spread_of(groups, truth):
@@ -137,7 +137,7 @@ def test_blocks_change_nothing(monkeypatch):
     path, ids, opacities = scene()
     start = np.roll(ids, 17)
     expected = tidy(path, start, opacities)
-    monkeypatch.setattr(hygiene, "AT_ONCE", 7)
+    monkeypatch.setattr(regrouping, "AT_ONCE", 7)
     found = tidy(path, start, opacities)
     np.testing.assert_array_equal(found[0], expected[0])
     assert found[2] == expected[2]
@@ -156,7 +156,9 @@ def test_groups_without_members_take_and_give_nothing():
 def test_a_shadow_follows_its_caster_unless_it_stayed_behind_at_the_end():
     path, ids, opacities = scene()
     mine = ids == SHADOW
-    assert field_baking.follows(path[mine], opacities[mine], fit_to(path, opacities)(ids)[LEFT].displacements, NORMAL)
+    assert field_to_groups.follows(
+        path[mine], opacities[mine], fit_to(path, opacities)(ids)[LEFT].displacements, NORMAL
+    )
     stayed = path.copy()
     stayed[mine, -4:] = stayed[mine, -1:]
     _, groups, moves = tidy(stayed, ids, opacities)
@@ -174,8 +176,8 @@ def test_the_floor_imitates_a_shadow_where_it_moves_as_the_light_would_have_it(t
     tilt = rotations.rotvecs_to_quats(np.array([turn, 0, 0]))
     path, normal = rotations.rotate(tilt, path), rotations.rotate(tilt, NORMAL)
     observed = np.ones((3, len(KNOTS)), bool)
-    groups = field_baking._groups(path, ids, opacities, np.array([0, 5, 7]), observed, [], normal)
-    casters = hygiene.imitators(path, ids, opacities, groups, normal)
+    groups = field_to_groups._groups(path, ids, opacities, np.array([0, 5, 7]), observed, [], normal)
+    casters = regrouping.imitators(path, ids, opacities, groups, normal)
     expected = np.zeros(len(ids), int)
     expected[400:600] = LEFT
     assert (casters != expected).sum() <= 5 and not casters[expected == 0].any()

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
+from r5dgs_core.evaluation import evaluate, metrics
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.raster import rasterize_splats
-from r5dgs_core.report import evaluate, metrics
 from r5dgs_core.scene import scene
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.train import config, identity, identity_losses
-from r5dgs_core.train.posing import Splats
-from r5dgs_core.train.views import TrainView
+from r5dgs_core.train.identity import identity_losses, identity_training
+from r5dgs_core.train.representations.fused_posing import Splats
+from r5dgs_core.train.train_views import TrainView
 
 
 def row_of_blobs(opacities=(0.9, 0.9, 0.9)):
@@ -36,8 +37,8 @@ CLASSES = {0: 0, 3: 1, 5: 2}
 
 def label(classes, view, splats, fallback):
     """Classes of the Gaussians, by the vote of one view."""
-    weights = identity.votes([view], lambda _: splats, classes, len(fallback))
-    return identity.elect(weights, torch.tensor(fallback)).tolist()
+    weights = identity_training.votes([view], lambda _: splats, classes, len(fallback))
+    return identity_training.elect(weights, torch.tensor(fallback)).tolist()
 
 
 def test_each_gaussian_gets_the_class_of_the_pixels_that_it_paints():
@@ -53,7 +54,7 @@ def test_gaussians_that_no_mask_shows_keep_what_they_had():
 def test_ids_without_a_class_do_not_vote():
     view, splats = row_of_blobs()
     assert label({0: 0, 3: 1}, view, splats, [1, 0, 0]) == [0, 0, 1]
-    assert identity.class_map(view, {0: 0, 3: 1})[0].tolist() == [0] * 10 + [-1] * 10 + [1] * 10
+    assert identity_training.class_map(view, {0: 0, 3: 1})[0].tolist() == [0] * 10 + [-1] * 10 + [1] * 10
 
 
 @pytest.mark.parametrize("steps", [0, 60])
@@ -62,7 +63,7 @@ def test_encodings_start_at_their_labels_and_learn_the_masks(steps):
     wrong = torch.tensor([0, 2, 2])
     settings = {"identity.iterations": steps, "identity.rate": 0.1, "identity.classifier_rate": 0.05}
     losses = []
-    encodings, weight, bias = identity.train_encodings(
+    encodings, weight, bias = identity_training.train_encodings(
         [view],
         lambda _: splats,
         CLASSES,
@@ -82,7 +83,7 @@ def test_more_classes_than_dimensions_are_no_obstacle():
     view, splats = row_of_blobs()
     many = {0: 0, 3: 18, 5: 19} | {i: i - 99 for i in range(100, 117)}
     labels, settings = torch.tensor([0, 19, 18]), config.Config().replace(**{"identity.iterations": 1})
-    _, weight, _ = identity.train_encodings(
+    _, weight, _ = identity_training.train_encodings(
         [view], lambda _: splats, many, labels, settings, splats.means, torch.Generator().manual_seed(0)
     )
     assert weight.shape == (20, scene.IDENTITY_DIM) and torch.isfinite(weight).all()
@@ -110,7 +111,7 @@ def posed(gaussians):
 
 def make_joint(view, gaussians, training, **changes):
     settings = {"identity.training": training, "identity.rate": 0.05, "identity.classifier_rate": 0.02}
-    identities = identity.joint([view], CLASSES, config.Config().replace(**settings, **changes))
+    identities = identity_training.joint([view], CLASSES, config.Config().replace(**settings, **changes))
     assert identities is not None
     identities.begin(gaussians)
     return identities
@@ -150,7 +151,7 @@ def accuracy(identities, gaussians, view):
     with torch.no_grad():
         image = blended(identities, gaussians, posed(gaussians), view)
         answers = (image @ identities.params["classifier.weight"].T + identities.params["classifier.bias"]).argmax(-1)
-    return float((answers == identity.class_map(view, CLASSES)).float().mean())
+    return float((answers == identity_training.class_map(view, CLASSES)).float().mean())
 
 
 def disagreement(identities, gaussians):
@@ -246,7 +247,7 @@ def test_after_the_run_too_neighbours_teach_what_no_pixel_shows():
     right = []
     for spatial in (0.0, 5.0):
         changes = {"identity.iterations": 100, "identity.spatial": spatial, "identity.rate": 0.05}
-        encodings, weight, bias = identity.train_encodings(
+        encodings, weight, bias = identity_training.train_encodings(
             [view],
             lambda _: posed(gaussians),
             CLASSES,
@@ -268,7 +269,7 @@ def test_after_the_run_too_neighbours_teach_what_no_pixel_shows():
 def test_a_gaussian_counts_among_its_neighbours_as_asked(representation, asked, counted):
     """Counting it takes the farthest of k away: with one neighbour nothing is left to differ from."""
     changes = {"train.representation": representation, "identity.include_self": asked, "identity.neighbours": 1}
-    agreement = identity.Agreement(config.Config().replace(**changes, **{"identity.spatial": 1.0}))
+    agreement = identity_training.Agreement(config.Config().replace(**changes, **{"identity.spatial": 1.0}))
     points = identity_losses.Neighbourhood(torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
     draws = torch.Generator().manual_seed(1)
     encodings, weight = torch.randn(50, 16, generator=draws), torch.randn(3, 16, generator=draws)
@@ -315,11 +316,11 @@ def test_gaussians_take_only_parameters_that_are_known_and_fit(name, count):
 def test_there_are_no_joint_identities_where_nothing_tells_objects_apart():
     view, _ = row_of_blobs()
     asked = config.Config().replace(**{"identity.training": "joint"})
-    assert identity.joint([view], CLASSES, config.Config()) is None
-    assert identity.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
-    assert identity.joint([view], {0: 0}, asked) is None
-    assert identity.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
-    assert identity.joint([view], CLASSES, asked) is not None
+    assert identity_training.joint([view], CLASSES, config.Config()) is None
+    assert identity_training.joint([view], CLASSES, asked.replace(**{"identity.iterations": 0})) is None
+    assert identity_training.joint([view], {0: 0}, asked) is None
+    assert identity_training.joint([dataclasses.replace(view, mask=None)], CLASSES, asked) is None
+    assert identity_training.joint([view], CLASSES, asked) is not None
 
 
 @pytest.mark.parametrize("training", ["joint", "detached"])

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.train import identity_losses
+from r5dgs_core.train.identity import identity_losses
 
 
 def answers(*shape, seed=0, spread=2.0):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import bake, checkpoint, run
+from r5dgs_core.train import checkpoint, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 

@@ -5,7 +5,7 @@ import OpenImageIO as oiio
 import pytest
 
 from r5dgs_core.data import images
-from r5dgs_core.scene import image_files
+from r5dgs_core.formats import image_files
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core import cli
+from r5dgs_core.cli import main
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import CheckpointError, ConfigError, SceneFileError
-from r5dgs_core.importing import assembly, camera_file, deformable, importer, run_folder, weights
+from r5dgs_core.importing import assembly, cameras_json, deformable, importer, run_folder, weights
 from r5dgs_core.scene import scene_file
 from tests import foreign_runs as foreign
 from tests.foreign_runs import T_MAX
@@ -198,9 +198,9 @@ def test_settings_are_read_and_never_run(tmp_path):
 
 def test_cameras_are_those_of_the_file(tmp_path):
     path = tmp_path / "cameras.json"
-    assert camera_file.read(path) == ()
+    assert cameras_json.read(path) == ()
     foreign.write_common(tmp_path, foreign.cloud(), 1, "")
-    (camera,) = camera_file.read(path)
+    (camera,) = cameras_json.read(path)
     expected = foreign.view()
     np.testing.assert_allclose(camera.T_cam_world, expected.T_cam_world, atol=1e-12)
     np.testing.assert_allclose(camera.intrinsics, expected.intrinsics, atol=1e-9)
@@ -212,7 +212,7 @@ def test_cameras_are_those_of_the_file(tmp_path):
     ):
         path.write_text(json.dumps([entries[0], {**entries[1], **change}]))
         with pytest.raises(CheckpointError, match=message):
-            camera_file.read(path)
+            cameras_json.read(path)
 
 
 def test_principal_axes_keep_the_given_ones_of_unit_quaternions():
@@ -289,14 +289,14 @@ def test_options_are_checked(options, message):
 
 def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
-    assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "none"]) == 0
+    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "none"]) == 0
     assert f"{out}: 24 Gaussians, 0 objects, t_max 1" in capsys.readouterr().out
-    assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
+    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
     assert "import 24: of 24 Gaussians" in capsys.readouterr().out
     scene = scene_file.read(out)
     assert scene.name == "run" and len(scene.track_times) == 3
     assert scene.provenance["imported"]["settings"]["is_blender"] is True
-    assert cli.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "json"]) == 0
+    assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert events[0] == {"event": "import", "done": 24, "total": 24, "unit": "Gaussians"}
     assert events[-1] == {"event": "imported", "path": str(out), "gaussians": 24}
@@ -305,10 +305,10 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
 def test_a_failed_import_leaves_the_old_scene(deformed, tmp_path, capsys):
     out = tmp_path / "scene.r5dgs"
     out.write_bytes(b"old")
-    assert cli.main(["import", str(deformed), "--out", str(out), "--iteration", "5"]) == 3
+    assert main.main(["import", str(deformed), "--out", str(out), "--iteration", "5"]) == 3
     assert "N = 5, found the iterations 20000" in capsys.readouterr().err
     assert out.read_bytes() == b"old"
-    assert cli.main(["import", str(deformed), "--out", str(tmp_path / "scene.ply")]) == 2
+    assert main.main(["import", str(deformed), "--out", str(tmp_path / "scene.ply")]) == 2
     assert "expected a name that ends in .r5dgs" in capsys.readouterr().err
 
 

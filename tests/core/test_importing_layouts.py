@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from r5dgs_core.importing import importer
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import scene_file
 from tests import foreign_runs as foreign
 from tests.foreign_runs import T_MAX, Drawn
 
@@ -19,7 +20,7 @@ KNOTS = 8
 LATER = T_MAX + 0.1
 
 
-def covariances(frame: playback.Frame) -> np.ndarray:
+def covariances(frame: scene_player.Frame) -> np.ndarray:
     """Of the Gaussians of a frame. [N, 3, 3]"""
     linear = foreign.matrices(torch.from_numpy(frame.quats).double()).numpy()
     linear = linear * np.exp(frame.log_scales.astype(np.float64))[:, None, :]
@@ -28,7 +29,7 @@ def covariances(frame: playback.Frame) -> np.ndarray:
 
 def assert_drawn(scene, t: float, expected: Drawn, mode: str = "rigid", tolerance: float = 1e-4) -> None:
     """Centres and covariances of the scene at a time are the expected ones."""
-    frame = playback.frame(scene, t, mode)
+    frame = scene_player.frame(scene, t, mode)
     np.testing.assert_allclose(frame.means, expected.means.numpy(), atol=tolerance)
     wanted = expected.covariances.numpy()
     size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
@@ -38,7 +39,9 @@ def assert_drawn(scene, t: float, expected: Drawn, mode: str = "rigid", toleranc
 def assert_pictured(scene, t: float, cloud, expected: Drawn, background: float, mode: str = "rigid") -> None:
     """The scene's picture is the one that the rule of its layout blends."""
     camera = scene.cameras[0]
-    seen = scene_render.render_frame(scene, playback.frame(scene, t, mode), camera, backend="reference").color.numpy()
+    seen = scene_renderer.render_frame(
+        scene, scene_player.frame(scene, t, mode), camera, backend="reference"
+    ).color.numpy()
     wanted = foreign.picture(cloud, expected, camera, background)
     np.testing.assert_allclose(seen, wanted, atol=2e-3)
     assert wanted.std() > 0.05
@@ -134,7 +137,7 @@ def test_trace_turns_before_the_canonical_rotation_and_flies_on(tmp_path, light)
     foreign.write_weights(folder / "deform" / "iteration_40000" / "deform.pth", deform | foreign.gate_weights())
     foreign.write_weights(folder / "deform" / "iteration_40000" / "vel.pth", velocity)
     scene = imported(folder, tmp_path, knots=KNOTS)
-    assert scene.t_max == T_MAX and playback.available(scene, "standard")
+    assert scene.t_max == T_MAX and scene_player.available(scene, "standard")
     assert scene.world_convention == "blender" and scene.near_plane == 0.8
 
     def rule(t: float) -> Drawn:
@@ -210,7 +213,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
     for name, weights in {"deform": deform, "vel": velocity, "code_field": codes}.items():
         foreign.write_weights(folder / f"{name}.pth", weights)
     scene = imported(tmp_path / "run", tmp_path, knots=KNOTS)
-    assert playback.available(scene, "standard") and not playback.available(scene, "rigid_paper")
+    assert scene_player.available(scene, "standard") and not scene_player.available(scene, "rigid_paper")
 
     def rule(t: float) -> Drawn:
         code, shares = code_and_shares(codes, cloud)
@@ -227,7 +230,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
     for t in scene.track_times:
         assert_drawn(scene, t, rule(t))
     near, far = T_MAX + 0.02, T_MAX + 0.04
-    errors = [np.abs(playback.frame(scene, t, "standard").means - rule(t).means.numpy()).max() for t in (near, far)]
+    errors = [np.abs(scene_player.frame(scene, t, "standard").means - rule(t).means.numpy()).max() for t in (near, far)]
     assert errors[1] < 2e-4
     assert_drawn(scene, far, rule(far), "standard", 2e-4)
     scene = importer.dataclasses.replace(scene, near_plane=0.2)

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from r5dgs_core.motion import keyframes, models, rotations, se3
+from r5dgs_core.motion import key_reduction, models, rotations, se3
 from r5dgs_core.motion.models import MotionModel
 from tests.problems import MOTIONS, RADIUS, SIZE
 
@@ -37,13 +37,13 @@ CASES = {name: model for name, (model, _) in MOTIONS.items()} | {"hard": HARD}
 
 
 def reduced(model, tolerance=TOLERANCE, t1=2.0, **options):
-    return keyframes.reduce(keyframes.model_sampler(model, 0.0), 0.0, t1, tolerance, RADIUS, **options)
+    return key_reduction.reduce(key_reduction.model_sampler(model, 0.0), 0.0, t1, tolerance, RADIUS, **options)
 
 
 def largest_error(curves, model, times):
     quats, displacements = models.evaluate(model, times)
-    shift = np.linalg.norm(keyframes.evaluate(curves.location, times) - displacements, axis=-1)
-    angle = rotations.angle_between(keyframes.evaluate(curves.rotation, times, unit=True), quats)
+    shift = np.linalg.norm(key_reduction.evaluate(curves.location, times) - displacements, axis=-1)
+    angle = rotations.angle_between(key_reduction.evaluate(curves.rotation, times, unit=True), quats)
     return float((shift + 2 * RADIUS * np.sin(0.5 * angle)).max())
 
 
@@ -100,7 +100,7 @@ def test_thousands_of_keys_are_as_good_as_few_and_hardly_more_than_one_after_ano
     model = {"fast": FAST, "calm": CALM}[name]
     curves = reduced(model, tolerance)
     assert largest_error(curves, model, np.linspace(0, 2, 200_001)) <= 1.001 * tolerance
-    monkeypatch.setattr(keyframes, "_ONE_BY_ONE", 1 << 30)
+    monkeypatch.setattr(key_reduction, "_ONE_BY_ONE", 1 << 30)
     serial = reduced(model, tolerance)
     assert len(serial.location.times) > 500
     for striped, one_by_one in ((curves.location, serial.location), (curves.rotation, serial.rotation)):
@@ -131,35 +131,40 @@ def test_joined_curves_keep_the_kink_and_both_sides():
     before, after = MotionModel("translation", velocity=[1, 0, 0]), MotionModel("translation", velocity=[0, 2, 0])
 
     def first(times):
-        quats, d, rates, slopes = keyframes.model_sampler(before, 0.0)(times)
+        quats, d, rates, slopes = key_reduction.model_sampler(before, 0.0)(times)
         return quats, d - 1.0 * np.array([1, 0, 0]), rates, slopes
 
-    left = keyframes.reduce(first, 0.0, 1.0, TOLERANCE, RADIUS)
-    right = keyframes.reduce(keyframes.model_sampler(after, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
-    joined = keyframes.join(left, right)
+    left = key_reduction.reduce(first, 0.0, 1.0, TOLERANCE, RADIUS)
+    right = key_reduction.reduce(key_reduction.model_sampler(after, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
+    joined = key_reduction.join(left, right)
     assert joined.location.times.tolist() == [0, 1, 2]
     np.testing.assert_allclose(joined.location.left_slopes[1], [1, 0, 0])
     np.testing.assert_allclose(joined.location.right_slopes[1], [0, 2, 0])
-    np.testing.assert_allclose(keyframes.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
-    assert keyframes.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
+    np.testing.assert_allclose(key_reduction.evaluate(joined.location, np.array([0.5, 1.5])), [[-0.5, 0, 0], [0, 1, 0]])
+    assert key_reduction.evaluate(joined.location, np.array([-1.0, 9.0])).tolist() == [[-1, 0, 0], [0, 2, 0]]
 
 
 def test_what_rests_before_it_moves_rests_until_the_join():
     moving = MotionModel("ballistic_spin", velocity=[1, 0, 0], angular_velocity=[0, 0, 2.0])
-    rest = keyframes.reduce(keyframes.model_sampler(models.STATIC, 0.0), 0.0, 1.0, TOLERANCE, RADIUS)
-    joined = keyframes.join(rest, keyframes.reduce(keyframes.model_sampler(moving, 1.0), 1.0, 2.0, TOLERANCE, RADIUS))
+    rest = key_reduction.reduce(key_reduction.model_sampler(models.STATIC, 0.0), 0.0, 1.0, TOLERANCE, RADIUS)
+    joined = key_reduction.join(
+        rest, key_reduction.reduce(key_reduction.model_sampler(moving, 1.0), 1.0, 2.0, TOLERANCE, RADIUS)
+    )
     times = np.linspace(0, 1, 31)
-    assert (keyframes.evaluate(joined.location, times) == 0).all()
-    assert (keyframes.evaluate(joined.rotation, times, unit=True) == [1, 0, 0, 0]).all()
-    later = keyframes.Curves(*(dataclasses.replace(k, times=k.times - 1) for k in (joined.location, joined.rotation)))
+    assert (key_reduction.evaluate(joined.location, times) == 0).all()
+    assert (key_reduction.evaluate(joined.rotation, times, unit=True) == [1, 0, 0, 0]).all()
+    later = key_reduction.Curves(
+        *(dataclasses.replace(k, times=k.times - 1) for k in (joined.location, joined.rotation))
+    )
     assert largest_error(later, moving, np.linspace(0, 1, 301)) <= TOLERANCE
 
 
 def test_rest_joined_to_rest_is_one_key():
     first, second = (
-        keyframes.reduce(keyframes.model_sampler(models.STATIC, 0.0), t, t + 1, TOLERANCE, RADIUS) for t in (0.0, 1.0)
+        key_reduction.reduce(key_reduction.model_sampler(models.STATIC, 0.0), t, t + 1, TOLERANCE, RADIUS)
+        for t in (0.0, 1.0)
     )
-    joined = keyframes.join(first, second)
+    joined = key_reduction.join(first, second)
     assert joined.location.times.tolist() == joined.rotation.times.tolist() == [0.0]
 
 
@@ -168,10 +173,10 @@ def test_joining_keeps_quaternion_signs_continuous():
     left = reduced(model, t1=1.0)
 
     def later(times):
-        quats, d, rates, slopes = keyframes.model_sampler(model, 0.0)(times)
+        quats, d, rates, slopes = key_reduction.model_sampler(model, 0.0)(times)
         return -quats, d, -rates, slopes
 
-    joined = keyframes.join(left, keyframes.reduce(later, 1.0, 2.0, TOLERANCE, RADIUS))
+    joined = key_reduction.join(left, key_reduction.reduce(later, 1.0, 2.0, TOLERANCE, RADIUS))
     assert (np.diff(joined.rotation.times) > 0).all()
     assert largest_error(joined, model, np.linspace(0, 2, 901)) <= TOLERANCE
 
@@ -180,11 +185,11 @@ def test_flipping_signs_of_samples_changes_nothing():
     model = MOTIONS["ballistic, spinning"][0]
 
     def flipped(times):
-        quats, d, rates, slopes = keyframes.model_sampler(model, 0.0)(times)
+        quats, d, rates, slopes = key_reduction.model_sampler(model, 0.0)(times)
         signs = np.where(np.arange(len(times)) % 3 == 1, -1.0, 1.0)[:, None]
         return quats * signs, d, rates * signs, slopes
 
-    curves = keyframes.reduce(flipped, 0.0, 2.0, TOLERANCE, RADIUS)
+    curves = key_reduction.reduce(flipped, 0.0, 2.0, TOLERANCE, RADIUS)
     assert largest_error(curves, model, np.linspace(0, 2, 901)) <= TOLERANCE
 
 
@@ -195,11 +200,11 @@ def test_equal_input_gives_equal_keys():
 
 
 def test_unusable_arguments_are_refused():
-    sampler = keyframes.model_sampler(HARD, 0.0)
+    sampler = key_reduction.model_sampler(HARD, 0.0)
     with pytest.raises(ValueError, match="t0"):
-        keyframes.reduce(sampler, 1.0, 1.0, 1e-3, 1.0)
+        key_reduction.reduce(sampler, 1.0, 1.0, 1e-3, 1.0)
     with pytest.raises(ValueError, match="tolerance"):
-        keyframes.reduce(sampler, 0.0, 1.0, 0.0, 1.0)
+        key_reduction.reduce(sampler, 0.0, 1.0, 0.0, 1.0)
 
 
 FRAME = 1 / 60
@@ -217,10 +222,10 @@ WILD = {
 }
 
 
-def work(monkeypatch, model, span, frame, most=keyframes.MOST_INTERVALS):
+def work(monkeypatch, model, span, frame, most=key_reduction.MOST_INTERVALS):
     """Keys of a motion over a span, the times that were sampled for them, and the steps of integration."""
     counts = {"times": 0, "steps": 0}
-    sampler, exp = keyframes.model_sampler(model, 0.0, most), se3.exp
+    sampler, exp = key_reduction.model_sampler(model, 0.0, most), se3.exp
 
     def counted(times):
         counts["times"] += len(times)
@@ -231,8 +236,8 @@ def work(monkeypatch, model, span, frame, most=keyframes.MOST_INTERVALS):
         return exp(w, v)
 
     monkeypatch.setattr(se3, "exp", counted_exp)
-    frames = keyframes.FrameTimes(0.0, frame)
-    curves = keyframes.reduce(counted, 0.0, span, 1e-6, RADIUS, nearest=0.01 * frame, frames=frames, most=most)
+    frames = key_reduction.FrameTimes(0.0, frame)
+    curves = key_reduction.reduce(counted, 0.0, span, 1e-6, RADIUS, nearest=0.01 * frame, frames=frames, most=most)
     monkeypatch.setattr(se3, "exp", exp)
     return curves, counts
 
@@ -259,8 +264,8 @@ def test_what_keys_cannot_follow_is_exact_at_every_frame_and_is_marked(monkeypat
         assert not curves.followed
         quats, displacements = models.evaluate(WILD[name], FRAME * np.arange(21))
         at = FRAME * np.arange(21)
-        shift = np.abs(keyframes.evaluate(curves.location, at) - displacements).max()
-        turn = rotations.angle_between(keyframes.evaluate(curves.rotation, at, unit=True), quats).max()
+        shift = np.abs(key_reduction.evaluate(curves.location, at) - displacements).max()
+        turn = rotations.angle_between(key_reduction.evaluate(curves.rotation, at, unit=True), quats).max()
         assert shift <= 1e-6 and turn <= 1e-6
         assert max(curves.location.times[-1], curves.rotation.times[-1]) == 20.5 * FRAME
 

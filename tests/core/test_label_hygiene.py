@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import torch
 
+from r5dgs_core.bake import bake
+from r5dgs_core.evaluation import object_table
 from r5dgs_core.motion import rotations
-from r5dgs_core.report import object_table
-from r5dgs_core.train import bake, checkpoint, groups, label_hygiene, run
+from r5dgs_core.train import checkpoint, observed_motion, run
+from r5dgs_core.train.identity import label_cleanup
 from tests import datasets as tiny_datasets
 from tests import scenes
 
@@ -55,7 +57,7 @@ def test_planted_wrong_labels_are_found_and_nothing_else_is_touched():
     floor = np.flatnonzero((truth == 0) & (points[:, 0] < -2))[:20]
     weights, said = plant(votes_for(truth), truth, inner, RIGHT, 0.502)
     weights, said = plant(weights, said, floor, LEFT)
-    found, changes = label_hygiene.clean(weights, said, points, opacities)
+    found, changes = label_cleanup.clean(weights, said, points, opacities)
     np.testing.assert_array_equal(found, truth)
     assert changes.neighbours + changes.outliers == 40 and changes.motion == 0 and changes.gaussians == len(truth)
 
@@ -65,16 +67,16 @@ def test_strong_votes_are_never_overruled():
     inner = np.flatnonzero(truth == LEFT)[:30]
     weights, said = plant(votes_for(truth), truth, inner, RIGHT, 0.8)
     going, moving = truth, np.ones(4, bool)
-    found, changes = label_hygiene.clean(weights, said, points, opacities, going, moving)
+    found, changes = label_cleanup.clean(weights, said, points, opacities, going, moving)
     np.testing.assert_array_equal(found, said)
-    assert changes == label_hygiene.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.Changes(gaussians=len(truth))
 
 
 def test_objects_that_touch_keep_their_border_and_thin_ones_survive():
     points, truth, opacities = scene()
-    found, changes = label_hygiene.clean(votes_for(truth, 0.7), truth, points, opacities)
+    found, changes = label_cleanup.clean(votes_for(truth, 0.7), truth, points, opacities)
     np.testing.assert_array_equal(found, truth)
-    assert changes == label_hygiene.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.Changes(gaussians=len(truth))
 
 
 def test_masks_that_miss_an_object_now_and_then_do_not_shrink_it():
@@ -82,11 +84,11 @@ def test_masks_that_miss_an_object_now_and_then_do_not_shrink_it():
     weights = votes_for(truth, 0.65)
     edge = np.flatnonzero((truth == LEFT) & (points[:, 2] > 0.9) & (points[:, 0] < -0.3))
     weights[edge] = [PIXELS * 0.52, PIXELS * 0.48, 0, 0]  # with all masks the object would have most
-    found, _ = label_hygiene.clean(weights, np.where(weights.any(1), weights.argmax(1), 0), points, opacities)
+    found, _ = label_cleanup.clean(weights, np.where(weights.any(1), weights.argmax(1), 0), points, opacities)
     np.testing.assert_array_equal(found[edge], LEFT)
     clean = votes_for(truth)
     clean[edge] = weights[edge]
-    found, _ = label_hygiene.clean(clean, clean.argmax(1), points, opacities)
+    found, _ = label_cleanup.clean(clean, clean.argmax(1), points, opacities)
     np.testing.assert_array_equal(found[edge], 0)
 
 
@@ -94,9 +96,9 @@ def test_masks_that_contradict_each_other_change_nothing():
     points, truth, opacities = scene()
     weights = np.random.default_rng(1).dirichlet(np.full(4, 3.0), len(truth)) * PIXELS
     weights[np.arange(len(truth)), truth] += 0.2 * PIXELS
-    found, changes = label_hygiene.clean(weights, truth, points, opacities, truth, np.ones(4, bool))
+    found, changes = label_cleanup.clean(weights, truth, points, opacities, truth, np.ones(4, bool))
     np.testing.assert_array_equal(found, truth)
-    assert changes == label_hygiene.Changes(gaussians=len(truth))
+    assert changes == label_cleanup.Changes(gaussians=len(truth))
 
 
 def test_what_no_mask_shows_takes_the_label_around_it():
@@ -104,7 +106,7 @@ def test_what_no_mask_shows_takes_the_label_around_it():
     unseen = np.flatnonzero((truth == RIGHT) & (np.abs(points[:, 0] - 0.5) < 0.3))[::5]
     weights, said = votes_for(truth), truth.copy()
     weights[unseen], said[unseen] = 0.0, 0
-    found, _ = label_hygiene.clean(weights, said, points, opacities)
+    found, _ = label_cleanup.clean(weights, said, points, opacities)
     np.testing.assert_array_equal(found[unseen], RIGHT)
 
 
@@ -116,12 +118,12 @@ def test_small_parts_far_from_their_object_go_and_large_ones_stay():
         every, labels = np.concatenate([points, far]), np.append(truth, np.full(count, LEFT))
         weights = votes_for(labels)
         weights[-count:] = [0.45 * PIXELS, 0.55 * PIXELS, 0, 0]
-        found, changes = label_hygiene.clean(weights, labels, every, np.full(len(labels), 0.8))
+        found, changes = label_cleanup.clean(weights, labels, every, np.full(len(labels), 0.8))
         np.testing.assert_array_equal(found[-count:], expected)
         np.testing.assert_array_equal(found[:-count], truth)
         assert changes.outliers == (count if expected == 0 else 0)
         weights[-count:] = [0.1 * PIXELS, 0.9 * PIXELS, 0, 0]  # well supported: where it lies says nothing
-        found, _ = label_hygiene.clean(weights, labels, every, np.full(len(labels), 0.8))
+        found, _ = label_cleanup.clean(weights, labels, every, np.full(len(labels), 0.8))
         np.testing.assert_array_equal(found, labels)
 
 
@@ -132,10 +134,10 @@ def test_undecided_gaussians_go_with_what_they_move_with():
     right = {}
     for moves in (False, True):
         moving = np.array([False, moves, moves, moves])
-        found, changes = label_hygiene.clean(weights, said, points, opacities, truth, moving)
+        found, changes = label_cleanup.clean(weights, said, points, opacities, truth, moving)
         right[moves] = (found[border] == LEFT).mean()
         assert (changes.motion > 0) == moves
-    unknown, _ = label_hygiene.clean(weights, said, points, opacities)
+    unknown, _ = label_cleanup.clean(weights, said, points, opacities)
     assert right[True] > 0.9 and right[False] < 0.8
     assert (unknown[border] == LEFT).mean() == right[False]  # a scene that stands still says nothing by its motion
 
@@ -144,9 +146,9 @@ def test_a_halo_that_rests_while_its_object_moves_is_background():
     points, truth, opacities = scene()
     halo = np.flatnonzero((truth == 0) & (np.abs(points[:, :2] - [-0.5, 0.5]) < 0.5).all(1))
     weights, said = plant(votes_for(truth), truth, halo, LEFT, 0.53)
-    around = label_hygiene.clean(weights, said, points, opacities)[0][halo]
+    around = label_cleanup.clean(weights, said, points, opacities)[0][halo]
     moving = np.array([False, True, True, True])
-    told, _ = label_hygiene.clean(weights, said, points, opacities, truth, moving)
+    told, _ = label_cleanup.clean(weights, said, points, opacities, truth, moving)
     assert (told[halo] == 0).sum() > (around == 0).sum()
 
 
@@ -154,7 +156,7 @@ def test_an_outline_that_background_and_object_share_evenly_stays_with_the_backg
     points, truth, opacities = scene()
     rows = np.flatnonzero(truth == LEFT)[:25]
     weights, said = plant(votes_for(truth), truth, rows, 0, 0.501)
-    found, _ = label_hygiene.clean(weights, said, points, opacities, truth, np.ones(4, bool))
+    found, _ = label_cleanup.clean(weights, said, points, opacities, truth, np.ones(4, bool))
     np.testing.assert_array_equal(found, said)
 
 
@@ -163,10 +165,10 @@ def test_faint_gaussians_do_not_come_to_an_object():
     rows = np.flatnonzero(truth == LEFT)[:25]
     weights, said = plant(votes_for(truth), truth, rows, 0, 0.501, pixels=1.0)
     opacities[rows] = 0.1
-    found, _ = label_hygiene.clean(weights, said, points, opacities, truth, np.ones(4, bool))
+    found, _ = label_cleanup.clean(weights, said, points, opacities, truth, np.ones(4, bool))
     np.testing.assert_array_equal(found[rows], 0)
     opacities[rows] = 0.9
-    found, _ = label_hygiene.clean(weights, said, points, opacities, truth, np.ones(4, bool))
+    found, _ = label_cleanup.clean(weights, said, points, opacities, truth, np.ones(4, bool))
     np.testing.assert_array_equal(found[rows], LEFT)
 
 
@@ -177,7 +179,7 @@ def test_the_numbers_of_the_objects_and_the_order_of_the_gaussians_do_not_matter
         np.full(4, 0.3), len(truth)
     )
     said, going, moving = weights.argmax(1), truth, np.array([False, True, False, True])
-    found, changes = label_hygiene.clean(weights, said, points, opacities, going, moving)
+    found, changes = label_cleanup.clean(weights, said, points, opacities, going, moving)
     assert (found != said).sum() > 0
     name = np.array([0, 3, 1, 2])  # of each class; the background stays what it is
     renamed = np.empty_like(weights)
@@ -185,7 +187,7 @@ def test_the_numbers_of_the_objects_and_the_order_of_the_gaussians_do_not_matter
     told = np.zeros(4, bool)
     told[name] = moving
     order = draw.permutation(len(truth))
-    again, same = label_hygiene.clean(
+    again, same = label_cleanup.clean(
         renamed[order], name[said][order], points[order], opacities[order], name[going][order], told
     )
     np.testing.assert_array_equal(again, name[found][order])
@@ -196,17 +198,17 @@ def test_nothing_and_little_are_left_as_they_are():
     for count in (0, 1, 2, 5):
         points = np.arange(3.0 * count).reshape(count, 3)
         weights = np.tile([0.0, 5.0, 0.0], (count, 1))
-        found, changes = label_hygiene.clean(weights, np.ones(count, int), points, np.full(count, 0.5))
+        found, changes = label_cleanup.clean(weights, np.ones(count, int), points, np.full(count, 0.5))
         assert found.tolist() == [1] * count and changes.gaussians == count
     same = np.zeros((30, 3))  # all in one place, and an object (2) that has no Gaussians
-    found, _ = label_hygiene.clean(np.tile([0.0, 5.0, 0.0], (30, 1)), np.ones(30, int), same, np.full(30, 0.5))
+    found, _ = label_cleanup.clean(np.tile([0.0, 5.0, 0.0], (30, 1)), np.ones(30, int), same, np.full(30, 0.5))
     assert found.tolist() == [1] * 30
     alone = np.zeros((30, 2))
     alone[:, 0] = 5.0
     alone[3] = [2.6, 2.5]
     labels = np.zeros(30, int)
     labels[3] = 1  # its only Gaussian, and weak: the object is not emptied
-    found, _ = label_hygiene.clean(alone, labels, np.random.default_rng(0).normal(size=(30, 3)), np.full(30, 0.5))
+    found, _ = label_cleanup.clean(alone, labels, np.random.default_rng(0).normal(size=(30, 3)), np.full(30, 0.5))
     np.testing.assert_array_equal(found, labels)
 
 
@@ -215,19 +217,19 @@ def test_companions_are_bodies_that_move_and_the_bind_state_is_at_the_last_knot(
     nowhere, path = np.zeros((3, 3)), np.array([[0, 0, 0], [0.2, 0, 0], [0.4, 0, 0]])
     seen = np.ones(3, bool)
     made = [
-        groups.GroupTrack(0, "pinned", np.zeros(3), still, nowhere, seen),
-        groups.GroupTrack(7, "body", np.array([1.0, 0, 0]), half, nowhere, seen),
-        groups.GroupTrack(9, "body", np.zeros(3), still, path, seen),
-        groups.GroupTrack(4, "body", np.zeros(3), still, nowhere, seen),
-        groups.GroupTrack(9, "shadow", np.zeros(3), still, path, seen, 2, np.eye(3)),
+        observed_motion.GroupTrack(0, "pinned", np.zeros(3), still, nowhere, seen),
+        observed_motion.GroupTrack(7, "body", np.array([1.0, 0, 0]), half, nowhere, seen),
+        observed_motion.GroupTrack(9, "body", np.zeros(3), still, path, seen),
+        observed_motion.GroupTrack(4, "body", np.zeros(3), still, nowhere, seen),
+        observed_motion.GroupTrack(9, "shadow", np.zeros(3), still, path, seen, 2, np.eye(3)),
     ]
     ids = np.repeat(np.arange(5), 20)
     means = np.random.default_rng(0).normal(scale=0.3, size=(100, 3))
-    points = label_hygiene.bound(made, ids, means)
+    points = label_cleanup.bound(made, ids, means)
     np.testing.assert_allclose(points[ids == 0], means[ids == 0])
     np.testing.assert_allclose(points[ids == 1], [2, 0, 0] + means[ids == 1] * [-1, -1, 1], atol=1e-12)
     np.testing.assert_allclose(points[ids == 4], means[ids == 4] + [0.4, 0, 0])
-    going, moving = label_hygiene.companions(made, ids, points, np.array([0, 4, 7, 9]))
+    going, moving = label_cleanup.companions(made, ids, points, np.array([0, 4, 7, 9]))
     assert going.tolist() == np.repeat([0, 2, 3, 1, 0], 20).tolist()
     assert moving.tolist() == [False, False, True, True]
 
@@ -238,8 +240,8 @@ def test_a_run_cleans_its_labels_says_how_many_and_can_be_told_not_to(tiny, tmp_
     for name, further in (("on", ()), ("off", ("identity.hygiene=false",))):
         made[name] = run.train(tiny.root, tmp_path / name, tiny_datasets.settings(*steps, *further))
         states[name] = checkpoint.load(made[name].folder).tensors
-    assert label_hygiene.CHANGES not in states["off"]
-    counts = label_hygiene.changes_of(states["on"])
+    assert label_cleanup.CHANGES not in states["off"]
+    counts = label_cleanup.changes_of(states["on"])
     differ = int((states["on"]["labels"] != states["off"]["labels"]).sum())
     assert counts["gaussians"] == len(states["on"]["labels"])
     assert counts["neighbours"] + counts["motion"] + counts["outliers"] == differ > 0

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r5dgs_core.report import legend
-from r5dgs_core.semantics import standpoints
+from r5dgs_core.evaluation import legend
+from r5dgs_core.render import viewpoints
 from tests import scenes
 
 BACKEND = "reference"
@@ -96,7 +96,7 @@ def test_a_legend_is_large_enough_to_read_and_says_whether_it_is_past_t_max(scen
     real = legend.annotate
     monkeypatch.setattr(legend, "annotate", lambda *given: titles.append(given[-1]) or real(*given))
     small = scenes.orbit_camera(0.5, 32, 24)
-    picture = legend.draw(scene, standpoints.Standpoint(small, 0.3), backend="auto")
+    picture = legend.draw(scene, viewpoints.Standpoint(small, 0.3), backend="auto")
     assert picture.shape[1] == legend.LONGEST
-    assert legend.draw(scene, standpoints.Standpoint(small, 1.0), longest=64, backend=BACKEND).shape[1] == 64
+    assert legend.draw(scene, viewpoints.Standpoint(small, 1.0), longest=64, backend=BACKEND).shape[1] == 64
     assert "past t_max" not in titles[0] and "past t_max = 0.75" in titles[1] and small.name in titles[0]

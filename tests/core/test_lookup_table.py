@@ -6,19 +6,14 @@ import re
 import numpy as np
 import pytest
 
-from r5dgs_core import cli, commands_words, errors
-from r5dgs_core.exit_status import ExitStatus
-from r5dgs_core.scene import cameras, lookup, meanings, scene_file
+from r5dgs_core import errors
+from r5dgs_core.cli import language, main
+from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.language import best_views, build_table, calibration, common_nouns, query
+from r5dgs_core.language.encoders import encoder_base, registry
+from r5dgs_core.scene import cameras, scene_file
 from r5dgs_core.scene.lookup_table import EncoderCard
-from r5dgs_core.semantics import (
-    best_views,
-    calibration,
-    common_nouns,
-    encoder_registry,
-    encoders,
-    lookup_table,
-    query,
-)
+from r5dgs_core.search import embedding_search, object_search
 from tests import encoder_folders
 from tests.scenes import make_scene
 
@@ -34,7 +29,7 @@ class Plain:
 
     def __init__(self, kind="text", digest="ab" * 32, seed=0):
         rng = np.random.default_rng(seed)
-        self._axes = {word: encoders.unit(rng.normal(size=64)) for word in WORDS}
+        self._axes = {word: encoder_base.unit(rng.normal(size=64)) for word in WORDS}
         self._rng = rng
         self.card = EncoderCard(kind, "plain", digest, 64, ("{}",))
         self.seen = []
@@ -45,14 +40,14 @@ class Plain:
     def embed_images(self, images):
         self.seen += list(images)
         colors = [np.concatenate([image.mean((0, 1)), np.zeros(61)]) for image in images]
-        return encoders.unit(np.stack(colors))
+        return encoder_base.unit(np.stack(colors))
 
     def _embed(self, text):
         noun = common_nouns.known(text)
         if noun is None:
-            return self._axes.setdefault(text, encoders.unit(np.random.default_rng(len(text)).normal(size=64)))
+            return self._axes.setdefault(text, encoder_base.unit(np.random.default_rng(len(text)).normal(size=64)))
         kinds = [self._axes[kind] for kind in sorted(common_nouns.broader()[noun])]
-        return encoders.unit(self._axes[noun] + 0.8 * np.sum(kinds, axis=0) if kinds else self._axes[noun])
+        return encoder_base.unit(self._axes[noun] + 0.8 * np.sum(kinds, axis=0) if kinds else self._axes[noun])
 
 
 def named(*names, captions=None, **options):
@@ -80,7 +75,7 @@ def test_nouns_have_their_kinds():
     assert common_nouns.known("the blue crates") == "crate" and common_nouns.known("press ram") is None
     assert len(WORDS) > 500 and list(WORDS) == sorted(set(WORDS))
     assert set(common_nouns.things()) < set(WORDS) and "fruit" not in common_nouns.things()
-    assert all(len(lookup.wishes(word)) == 1 for word in WORDS)
+    assert all(len(object_search.wishes(word)) == 1 for word in WORDS)
 
 
 def test_thresholds_let_so_many_false_nouns_pass_as_is_allowed():
@@ -115,41 +110,41 @@ def test_pictures_are_calibrated_by_nouns_that_do_not_name_them():
 
 
 def test_words_find_what_is_of_their_kind_and_nothing_else():
-    made = lookup_table.make(named("lemon", "apple", "donut", "hammer"), Plain())
-    find = lambda text: [m.object_id for m in lookup.search(made.scene, text)]  # noqa: E731
+    made = build_table.make(named("lemon", "apple", "donut", "hammer"), Plain())
+    find = lambda text: [m.object_id for m in object_search.search(made.scene, text)]  # noqa: E731
     assert sorted(find("fruit")) == [1, 2] and find("pastry") == [3] and find("tools") == [4]
     assert find("elephant") == [] and find("lemon") == [1] and made.notes == ()
     assert sorted(find("fruit and a tool")) == [1, 2, 4]
-    for match in lookup.search(made.scene, "fruit"):
+    for match in object_search.search(made.scene, "fruit"):
         assert (
             match.relevancy is not None
             and match.cosine > made.scene.lookup.thresholds[_row(made.scene, match.object_id)]
         )
-    low = lookup.search(made.scene, "elephant", threshold=0.0)
+    low = object_search.search(made.scene, "elephant", threshold=0.0)
     assert {match.object_id for match in low} == {1, 2, 3, 4} and max(match.score for match in low) < 0.5
 
 
 def test_the_table_holds_names_extra_words_and_common_nouns_once():
     scene = named("lemon", "press ram")
-    made = lookup_table.make(scene, Plain(), ["zeppelins", "Lemons", "salt and pepper", "  "]).scene
+    made = build_table.make(scene, Plain(), ["zeppelins", "Lemons", "salt and pepper", "  "]).scene
     assert made.vocabulary[:3] == ("lemon", "press ram", "zeppelins") and "salt and pepper" not in made.vocabulary
-    said = [tuple(lookup.wishes(word)[0]) for word in made.vocabulary]
-    assert len(set(said)) == len(said) and {tuple(lookup.wishes(word)[0]) for word in WORDS} <= set(said)
+    said = [tuple(object_search.wishes(word)[0]) for word in made.vocabulary]
+    assert len(set(said)) == len(said) and {tuple(object_search.wishes(word)[0]) for word in WORDS} <= set(said)
     np.testing.assert_allclose(np.linalg.norm(made.vocabulary_embeddings, axis=1), 1, atol=1e-3)
-    assert made.lookup.pooling == "max" and made.lookup.canonical == encoders.CANONICAL
+    assert made.lookup.pooling == "max" and made.lookup.canonical == encoder_base.CANONICAL
 
 
 def test_a_caption_answers_for_a_name_that_says_nothing():
     scene = named("object 1", "hammer", "Object_3", captions={1: "a lemon"})
-    made = lookup_table.make(scene, Plain())
+    made = build_table.make(scene, Plain())
     assert [view.source for view in made.scene.lookup.views[_row(scene, 1)]] == ["a lemon"]
-    assert [m.object_id for m in lookup.search(made.scene, "fruit")] == [1]
+    assert [m.object_id for m in object_search.search(made.scene, "fruit")] == [1]
     assert made.scene.lookup.thresholds[_row(scene, 3)] is None
     assert not made.scene.embeddings[_row(scene, 3)].any() and "Object_3" in made.notes[0]
     with pytest.raises(errors.BackendError, match="no object has anything to embed; without a name, alias or caption"):
-        lookup_table.make(named("object 1", "2"), Plain())
+        build_table.make(named("object 1", "2"), Plain())
     with pytest.raises(errors.BackendError, match="the scene has no objects"):
-        lookup_table.make(make_scene(n=30, objects=0), Plain())
+        build_table.make(make_scene(n=30, objects=0), Plain())
 
 
 @pytest.mark.parametrize("kind", ["text", "clip"])
@@ -163,7 +158,7 @@ def test_an_object_without_gaussians_gets_no_embedding_and_that_is_said(kind):
         groups=tuple(dataclasses.replace(g, anchor_index=-1) for g in scene.groups),
     )
     told = []
-    made = lookup_table.make(bare, Plain(kind), progress=lambda what, done, total: told.append((what, done == total)))
+    made = build_table.make(bare, Plain(kind), progress=lambda what, done, total: told.append((what, done == total)))
     assert made.scene.lookup.thresholds[_row(bare, 2)] is None and not made.scene.embeddings[_row(bare, 2)].any()
     assert made.scene.lookup.thresholds[_row(bare, 1)] is not None
     assert "without Gaussians, and so without an embedding: hammer" in made.notes
@@ -246,7 +241,7 @@ def test_hidden_views_are_worth_less(seen):
 
 def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
     encoder = Plain("clip")
-    made = lookup_table.make(seen, encoder)
+    made = build_table.make(seen, encoder)
     table = made.scene.lookup
     assert table.pooling == "mean" and "ghost" in made.notes[0] and table.thresholds[_row(seen, 4)] is None
     views = table.views[_row(seen, 1)]
@@ -254,7 +249,7 @@ def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
         image.min() >= 0 for image in encoder.seen
     )
     assert {view.source for view in views} <= {camera.name for camera in seen.cameras} and views[0].box is not None
-    mean = encoders.unit(made.scene.view_embeddings[_row(seen, 1), : len(views)].mean(0))
+    mean = encoder_base.unit(made.scene.view_embeddings[_row(seen, 1), : len(views)].mean(0))
     np.testing.assert_allclose(made.scene.embeddings[_row(seen, 1)], mean, atol=2e-3)
     back = [view for own in table.views for view in own if not np.isfinite(view.threshold)]
     assert back == []
@@ -264,20 +259,20 @@ def test_pictures_make_the_table_of_an_encoder_that_sees(seen):
 def test_tiny_encoders_go_all_the_way(kind, seen, tmp_path):
     folder = getattr(encoder_folders, kind)(tmp_path / kind)
     path = scene_file.write(seen, tmp_path / "seen.r5dgs")
-    commands_words.run_lookup(path, str(folder))
+    language.run_lookup(path, str(folder))
     stored = scene_file.read(path)
     assert stored.lookup.encoder.name == kind
-    encoder = encoder_registry.open_encoder(folder)
+    encoder = registry.open_encoder(folder)
     assert [m.object_id for m in query.find(stored, "mug", encoder)] == [1]
-    fresh = encoders.embed_phrases(encoder, ["teapot"])[0]
-    row = lookup.vocabulary_row(stored.vocabulary, ["teapot"])
+    fresh = encoder_base.embed_phrases(encoder, ["teapot"])[0]
+    row = object_search.vocabulary_row(stored.vocabulary, ["teapot"])
     np.testing.assert_allclose(stored.vocabulary_embeddings[row], fresh, atol=2e-3)
-    same = meanings.ask(lookup.Meanings.of(stored), fresh)
+    same = embedding_search.ask(object_search.Meanings.of(stored), fresh)
     assert len(same) == (4 if kind == "sentences" else 3)
 
 
 def test_another_encoder_is_refused_with_the_remedy(seen):
-    made = lookup_table.make(seen, Plain()).scene
+    made = build_table.make(seen, Plain()).scene
     assert query.find(made, "globes", Plain())[0].object_id == 2
     with pytest.raises(errors.BackendError, match=r"made by the text encoder 'plain' \(SHA-256 abab.*make the table"):
         query.find(made, "globe", Plain(digest="cd" * 32))
@@ -286,7 +281,7 @@ def test_another_encoder_is_refused_with_the_remedy(seen):
 
 
 def by_name(where):
-    """In place of `encoder_registry.open_encoder`: a folder's name decides the digest."""
+    """In place of `registry.open_encoder`: a folder's name decides the digest."""
     return Plain(digest=str(where).ljust(64, "0"))
 
 
@@ -296,8 +291,8 @@ def content(tmp_path_factory):
     path = tmp_path_factory.mktemp("words") / "named.r5dgs"
     before = scene_file.read(scene_file.write(named("lemon", "apple", "donut", "hammer"), path, exact=True))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(encoder_registry, "open_encoder", by_name)
-        commands_words.run_lookup(path, "plain")
+        patch.setattr(registry, "open_encoder", by_name)
+        language.run_lookup(path, "plain")
     after = scene_file.read(path)
     for field in ("means", "quats", "log_scales", "opacity_logits", "sh", "track_poses"):
         np.testing.assert_array_equal(getattr(after, field), getattr(before, field))
@@ -307,43 +302,43 @@ def content(tmp_path_factory):
 @pytest.fixture
 def file(content, tmp_path, monkeypatch):
     """That file, and its encoder behind its name."""
-    monkeypatch.setattr(encoder_registry, "open_encoder", by_name)
+    monkeypatch.setattr(registry, "open_encoder", by_name)
     path = tmp_path / "named.r5dgs"
     path.write_bytes(content)
     return path
 
 
 def test_the_commands_find_by_meaning_without_an_encoder(file, capsys):
-    assert cli.main(["query", str(file), "fruit", "--json"]) == 0
+    assert main.main(["query", str(file), "fruit", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert {row["name"] for row in said["matches"]} == {"lemon", "apple"} and said["note"] == ""
     assert all(row["relevancy"] > 0.5 and row["score"] >= said["threshold"] for row in said["matches"])
-    assert cli.main(["query", str(file), "elephant"]) == 1
+    assert main.main(["query", str(file), "elephant"]) == 1
     assert "nothing matches 'elephant'; the scene has: lemon, apple, donut, hammer" in capsys.readouterr().out
-    assert cli.main(["query", str(file), "glorp"]) == 1
+    assert main.main(["query", str(file), "glorp"]) == 1
     assert "'glorp' is not among the stored words; give the table's encoder" in capsys.readouterr().out
-    assert cli.main(["query", str(file), "donut and a lemon"]) == 0
+    assert main.main(["query", str(file), "donut and a lemon"]) == 0
     assert "name 'donut'" in capsys.readouterr().out
-    assert cli.main(["name", str(file), "donut", "donut [/left]"]) == cli.main(["query", str(file), "donut"]) == 0
+    assert main.main(["name", str(file), "donut", "donut [/left]"]) == main.main(["query", str(file), "donut"]) == 0
     assert "donut [/left] │" in capsys.readouterr().out  # no markup
 
 
 def test_the_encoder_of_the_table_answers_other_words(file, capsys):
-    assert cli.main(["query", str(file), "rusty hammers", "--encoder", "plain"]) == 0
+    assert main.main(["query", str(file), "rusty hammers", "--encoder", "plain"]) == 0
     assert "hammer" in capsys.readouterr().out
-    assert cli.main(["query", str(file), "glorp and rusty hammers and lemon", "--encoder", "plain"]) == 0
+    assert main.main(["query", str(file), "glorp and rusty hammers and lemon", "--encoder", "plain"]) == 0
     said = capsys.readouterr().out
     assert "nothing matches 'glorp'" in said and "matches 'rusty" not in said  # that even the encoder does not know
-    assert cli.main(["query", str(file), "elephant, lemon", "--json"]) == 0
+    assert main.main(["query", str(file), "elephant, lemon", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["note"] == "nothing matches 'elephant'"
-    assert cli.main(["query", str(file), "lemon", "--encoder", "other"]) == 3
+    assert main.main(["query", str(file), "lemon", "--encoder", "other"]) == 3
     assert "cannot be asked with" in capsys.readouterr().err
 
 
 def test_naming_an_object_changes_that_alone(file, capsys):
     before = scene_file.read(file)
     arguments = ["name", str(file), "3", "glazed donut", "--alias", "snack", "--alias", "bun", "--caption", "a sweet"]
-    assert cli.main(arguments) == 0
+    assert main.main(arguments) == 0
     said = capsys.readouterr().out
     assert "object 3 is 'glazed donut', also snack, bun" in said and "make it again: r5dgs lookup" in said
     after = scene_file.read(file)
@@ -352,14 +347,14 @@ def test_naming_an_object_changes_that_alone(file, capsys):
     )
     np.testing.assert_array_equal(after.means, before.means)
     assert after.lookup == before.lookup
-    assert [m.object_id for m in lookup.search(after, "snack")] == [3]
-    assert cli.main(["name", str(file), "glazed donut", "--alias", "bun"]) == 0
+    assert [m.object_id for m in object_search.search(after, "snack")] == [3]
+    assert main.main(["name", str(file), "glazed donut", "--alias", "bun"]) == 0
     assert scene_file.read(file).object(3).aliases == ("snack", "bun")
 
 
 def test_an_id_is_no_name_of_another_object(file):
-    assert cli.main(["name", str(file), "1", "3"]) == 0  # object 1 is called "3" now
-    assert cli.main(["name", str(file), "3", "donut"]) == 0
+    assert main.main(["name", str(file), "1", "3"]) == 0  # object 1 is called "3" now
+    assert main.main(["name", str(file), "3", "donut"]) == 0
     after = scene_file.read(file)
     assert (after.object(1).name, after.object(3).name) == ("3", "donut")
 
@@ -380,7 +375,7 @@ def test_an_id_is_no_name_of_another_object(file):
 )
 def test_mistakes_are_one_line_and_leave_the_file(file, capsys, arguments, message):
     content = file.read_bytes()
-    status = cli.main([str(file) if a == "FILE" else a for a in arguments])
+    status = main.main([str(file) if a == "FILE" else a for a in arguments])
     assert status in (ExitStatus.USAGE, ExitStatus.ERROR)
     assert file.read_bytes() == content
     assert re.search(message, capsys.readouterr().err)
@@ -392,21 +387,23 @@ def test_captions_come_from_a_file(file, tmp_path, capsys):
     out = tmp_path / "out.r5dgs"
     content = file.read_bytes()
     asked = ["lookup", str(file), "--encoder", "plain", "--captions", str(captions)]
-    assert cli.main([*asked, "--out", str(out), "--progress", "json"]) == 0
+    assert main.main([*asked, "--out", str(out), "--progress", "json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["path"] == str(out) and file.read_bytes() == content
     scene = scene_file.read(out)
     assert scene.object(1).caption == "a sour citrus" and scene.object(4).aliases == ("mallet",)
     assert scene.object(4).name == "tool 1" and "mallet" in scene.vocabulary
     for wrong in ("[]", "{", '{"1": 3}', '{"1": {"color": "red"}}', '{"1": {"aliases": "red"}}', '{"1": {"name": 1}}'):
         captions.write_text(wrong)
-        assert cli.main(asked) == 3
+        assert main.main(asked) == 3
         assert str(captions) in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not os.environ.get("R5DGS_TEXT_ENCODER"), reason="R5DGS_TEXT_ENCODER names no sentence model")
 def test_a_real_sentence_model_finds_by_meaning_and_says_nothing_matches():
-    encoder = encoder_registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
-    made = lookup_table.make(named("mug", "lemon", "apple", "donut", "cutting board", "bowl"), encoder).scene
-    found = {text: {m.object_id for m in lookup.search(made, text)} for text in ("fruit", "pastry", "cup", "elephant")}
+    encoder = registry.open_encoder(os.environ["R5DGS_TEXT_ENCODER"])
+    made = build_table.make(named("mug", "lemon", "apple", "donut", "cutting board", "bowl"), encoder).scene
+    found = {
+        text: {m.object_id for m in object_search.search(made, text)} for text in ("fruit", "pastry", "cup", "elephant")
+    }
     assert found == {"fruit": {2, 3}, "pastry": {4}, "cup": {1}, "elephant": set()}
     assert [m.object_id for m in query.find(made, "something to drink from", encoder)] == [1]

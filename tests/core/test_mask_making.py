@@ -7,10 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from r5dgs_core import commands_masks, errors
+from r5dgs_core import errors
+from r5dgs_core.cli import masks as cli_masks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images, mask_notes, masks
-from r5dgs_core.semantics import mask_folders, mask_making, videos
+from r5dgs_core.masks import make_masks, mask_folders, videos
 
 
 class Numbered:
@@ -71,7 +72,7 @@ def test_a_camera_in_motion_is_one_video_as_long_as_it_does_not_leap(views):
 
 def test_what_is_made_can_be_read_back_and_is_told(views, tmp_path):
     events = []
-    made = mask_making.make(views, Numbered(), tmp_path / "m", progress=events.append)
+    made = make_masks.make(views, Numbered(), tmp_path / "m", progress=events.append)
     assert (made.images, made.videos, made.kept, made.objects) == (36, 6, 0, 36)
     notes = mask_notes.read(tmp_path / "m")
     assert notes.finished and notes.numbering == mask_notes.VIDEO and notes.backend == "numbered"
@@ -85,45 +86,45 @@ def test_what_is_made_can_be_read_back_and_is_told(views, tmp_path):
 def test_a_stop_loses_the_video_that_was_being_made_and_no_other(views, tmp_path):
     names = [video.name for video in videos.of(views)]
     with pytest.raises(KeyboardInterrupt):
-        mask_making.make(views, Numbered(stop_at=(names[2], 3)), tmp_path)
+        make_masks.make(views, Numbered(stop_at=(names[2], 3)), tmp_path)
     assert not mask_notes.read(tmp_path).finished
     assert list(mask_notes.read(tmp_path).videos) == names[:2]
     again = Numbered()
-    made = mask_making.make(views, again, tmp_path)
+    made = make_masks.make(views, again, tmp_path)
     assert again.asked == names[2:] and made.kept == 2 and made.images == 36
     assert mask_notes.read(tmp_path).finished
     third = Numbered()
-    assert mask_making.make(views, third, tmp_path).kept == 6 and third.asked == []
+    assert make_masks.make(views, third, tmp_path).kept == 6 and third.asked == []
 
 
 def test_a_mask_that_was_deleted_is_made_again(views, tmp_path):
-    mask_making.make(views, Numbered(), tmp_path)
+    make_masks.make(views, Numbered(), tmp_path)
     (tmp_path / f"{views[4].name}.png").unlink()
     again = Numbered()
-    mask_making.make(views, again, tmp_path)
+    make_masks.make(views, again, tmp_path)
     assert again.asked == [views[4].camera.name] and (tmp_path / f"{views[4].name}.png").exists()
 
 
 def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views, tmp_path, tiny):
     with pytest.raises(errors.DatasetError, match="holds 36 masks that nobody says how they were made.*--overwrite"):
-        mask_making.make(views, Numbered(), tiny.root / "object_mask")
-    mask_making.make(views, Numbered(), tmp_path)
+        make_masks.make(views, Numbered(), tiny.root / "object_mask")
+    make_masks.make(views, Numbered(), tmp_path)
     with pytest.raises(errors.DatasetError, match=r"other settings \(kind\).*--out.*--overwrite"):
-        mask_making.make(views, Numbered(kind=2), tmp_path)
-    assert mask_making.make(views, Numbered(kind=2), tmp_path, overwrite=True).kept == 0
+        make_masks.make(views, Numbered(kind=2), tmp_path)
+    assert make_masks.make(views, Numbered(kind=2), tmp_path, overwrite=True).kept == 0
     assert mask_notes.read(tmp_path).made_with == {"kind": 2}
     together = Numbered(kind=2)
     together.numbering = mask_notes.SCENE
     with pytest.raises(errors.DatasetError, match=r"other settings \(numbering\)"):
-        mask_making.make(views, together, tmp_path)
+        make_masks.make(views, together, tmp_path)
     mask_notes.write(mask_notes.MaskNotes(unknown=255), tmp_path)  # by hand, as docs/masks.md says
     with pytest.raises(errors.DatasetError, match="were made with what masks.json does not say; name another folder"):
-        mask_making.make(views, Numbered(), tmp_path)
+        make_masks.make(views, Numbered(), tmp_path)
 
 
 def test_ids_of_one_video_are_the_folders_own(views, tmp_path):
     alone = [view for view in views if view.camera.name == views[0].camera.name]
-    mask_making.make(alone, Numbered(), tmp_path)
+    make_masks.make(alone, Numbered(), tmp_path)
     assert json.loads((tmp_path / "objects.json").read_text())["3"] == "object 3"
 
 
@@ -138,7 +139,7 @@ def test_masks_of_a_folder_are_taken_over_as_ids(copied, tmp_path, capsys):
         big = np.repeat(np.repeat(ids, 2, 0), 2, 1)
         masks.write(source / f"{view.name.split('/')[1]}.png", big)
     shutil.rmtree(copied / "object_mask" / "train")
-    made = commands_masks.run_masks(copied, source=source, unknown=255)
+    made = cli_masks.run_masks(copied, source=source, unknown=255)
     assert (made.images, made.objects, made.numbering) == (36, 2, "scene")
     assert made.unknown == pytest.approx(1 / 36)
     assert "36 of 36 training images, 2 objects" in (told := capsys.readouterr().out)
@@ -153,18 +154,18 @@ def test_coloured_masks_of_a_folder_become_ids(copied, tmp_path):
     palette = np.array([(0, 0, 0), (250, 10, 10), (10, 10, 250)], np.uint8)
     for view in datasets.read(copied).train:
         images.write_png(tmp_path / "rgb" / f"{view.name}.png", palette[datasets.load_mask(view)])
-    commands_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "ids")
+    cli_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "ids")
     view = datasets.read(copied).train[7]
     got = masks.read(tmp_path / "ids" / f"{view.name}.png")
     np.testing.assert_array_equal(got, np.array([0, 2, 1])[datasets.load_mask(view)])
     with pytest.raises(errors.ConfigError, match="--unknown 255: the masks in .* are coded by colour"):
-        commands_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "other", unknown=255)
+        cli_masks.run_masks(copied, source=tmp_path / "rgb", out=tmp_path / "other", unknown=255)
 
 
 def test_masks_in_their_place_are_checked_and_left_alone(copied, capsys):
     before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
     for backend in ("precomputed", "blender"):
-        made = commands_masks.run_masks(copied, backend=backend)
+        made = cli_masks.run_masks(copied, backend=backend)
         assert (made.images, made.objects, made.unknown) == (36, 2, 0)
         assert "nothing was written" in capsys.readouterr().out
     assert {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()} == before
@@ -175,11 +176,11 @@ def test_a_capture_names_every_id_and_has_every_mask(copied):
     first = views[0].mask_path
     masks.write(first, np.full((36, 48), 9))
     with pytest.raises(errors.DatasetError, match=r"id 9 has no name in objects\.json.*precomputed"):
-        commands_masks.run_masks(copied, backend="blender")
+        cli_masks.run_masks(copied, backend="blender")
     first.unlink()
     with pytest.raises(errors.DatasetError, match=r"train/r_000 has no mask.*precomputed"):
-        commands_masks.run_masks(copied, backend="blender")
-    assert commands_masks.run_masks(copied).images == 35
+        cli_masks.run_masks(copied, backend="blender")
+    assert cli_masks.run_masks(copied).images == 35
 
 
 def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, tmp_path):
@@ -187,7 +188,7 @@ def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, t
     shutil.copytree(copied / "object_mask", tmp_path / "theirs")
     masks.write(tmp_path / "theirs" / f"{view.name}.png", np.ones((36, 36), np.int32))
     with pytest.raises(errors.DatasetError, match=r"r_003\.png: the mask is 36x36, its image 48x36"):
-        commands_masks.run_masks(copied, source=tmp_path / "theirs", out=tmp_path / "ids")
+        cli_masks.run_masks(copied, source=tmp_path / "theirs", out=tmp_path / "ids")
     assert not mask_notes.read(tmp_path / "ids").finished
 
 
@@ -206,7 +207,7 @@ def test_masks_of_another_shape_are_named_before_anything_is_half_done(copied, t
 )
 def test_options_that_do_not_belong_together_are_refused(tiny, options, message):
     with pytest.raises(errors.ConfigError, match=message):
-        commands_masks.run_masks(tiny.root, **options)
+        cli_masks.run_masks(tiny.root, **options)
 
 
 def test_a_folder_without_masks_is_named(tiny, tmp_path):
@@ -224,9 +225,9 @@ def test_masks_that_a_backend_does_not_make_leave_nothing_of_others_behind(copie
     shutil.copytree(copied / "object_mask", source)
     (source / f"{views[4].name}.png").unlink()
     alone = [view for view in views if view.camera.name == views[4].camera.name]
-    mask_making.make(alone, Numbered(), out)
+    make_masks.make(alone, Numbered(), out)
     assert (out / "objects.json").exists()
-    commands_masks.run_masks(copied, source=source, out=out, overwrite=True)
+    cli_masks.run_masks(copied, source=source, out=out, overwrite=True)
     made = datasets.read(copied, str(out))
     assert [view.name for view in made.train if view.mask_path is None] == [views[4].name]
     assert made.object_names == datasets.read(copied).object_names
@@ -237,25 +238,25 @@ def test_255_is_not_called_unknown_where_nothing_is_written(copied):
     with pytest.raises(
         errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or say it in .*masks"
     ):
-        commands_masks.run_masks(copied, unknown=255)
+        cli_masks.run_masks(copied, unknown=255)
     (copied / "object_mask" / "masks.json").write_text('{"format_version": 1, "unknown": 255}')
-    assert commands_masks.run_masks(copied, unknown=255).images == 36
+    assert cli_masks.run_masks(copied, unknown=255).images == 36
 
 
 def test_names_of_the_ids_of_one_video_hold_in_the_data_sets_own_folder_too(copied):
     shutil.rmtree(copied / "object_mask")
     views = datasets.read(copied).train
     alone = [view for view in views if view.camera.name == views[0].camera.name]
-    mask_making.make(alone, Numbered(), copied / "object_mask")
+    make_masks.make(alone, Numbered(), copied / "object_mask")
     data = datasets.read(copied)
     assert data.object_names == {k: f"object {k}" for k in range(1, 7)} and data.ground_truth is None
 
 
 def test_a_video_that_got_more_images_is_made_again(views, tmp_path):
     some = [view for view in views if view.name != views[4].name]
-    mask_making.make(some, Numbered(), tmp_path)
+    make_masks.make(some, Numbered(), tmp_path)
     again = Numbered()
-    assert mask_making.make(views, again, tmp_path).images == 36
+    assert make_masks.make(views, again, tmp_path).images == 36
     assert again.asked == [views[4].camera.name]
 
 
@@ -264,7 +265,7 @@ def test_names_of_a_folders_own_ids_are_taken_over_with_its_masks(copied, tmp_pa
     source, out = tmp_path / "theirs", tmp_path / "out"
     shutil.copytree(copied / "object_mask", source)
     (source / "objects.json").write_text('{"1": {"name": "zebra", "aliases": ["horse"]}, "2": "yak"}')
-    commands_masks.run_masks(copied, source=source, out=out)
+    cli_masks.run_masks(copied, source=source, out=out)
     made = datasets.read(copied, str(out))
     assert made.object_names == {1: "zebra", 2: "yak"} and made.object_aliases[1] == ("horse",)
     assert made.ground_truth is None

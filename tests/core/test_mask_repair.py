@@ -8,11 +8,13 @@ import shutil
 import numpy as np
 import pytest
 
-from r5dgs_core import cli, commands_association, errors
+from r5dgs_core import errors
+from r5dgs_core.association import associate, mask_repair, render_segments
+from r5dgs_core.cli import associate as cli_associate
+from r5dgs_core.cli import main
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
 from r5dgs_core.scene import scene_file
-from r5dgs_core.semantics import association, drawn_bags, mask_repair
 from tests import datasets as tiny_datasets
 
 
@@ -55,7 +57,7 @@ def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
     with pytest.raises(errors.DatasetError, match="r5dgs associate RUN"):
         datasets.read(tiny.root, str(folder)).require_one_numbering()
 
-    commands_association.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+    cli_associate.run_associate(trained.folder, tiny.root, masks=folder, out=out)
 
     repaired = datasets.read(tiny.root, str(out))
     repaired.require_one_numbering()
@@ -73,7 +75,7 @@ def test_a_numbering_per_video_becomes_one(trained, tiny, tmp_path):
 
 def test_a_single_switch_is_found_and_named(trained, tiny, switched, tmp_path, capsys):
     out = tmp_path / "out"
-    assert cli.main(["associate", str(trained.folder), "--masks", str(switched), "--out", str(out)]) == 0
+    assert main.main(["associate", str(trained.folder), "--masks", str(switched), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert (
         "2 relabelled, 0 unknown" in said
@@ -101,7 +103,7 @@ def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path,
     data = rewrite(
         tiny.root, folder, lambda view, ids: np.where(ids == 1, 0, ids) if view.name == "train/r_008" else ids
     )
-    commands_association.run_associate(trained.folder, tiny.root, masks=folder, out=out)
+    cli_associate.run_associate(trained.folder, tiny.root, masks=folder, out=out)
     for view, true in zip(datasets.read(tiny.root, str(out)).train, data.train, strict=True):
         new, ids = datasets.load_mask(view), datasets.load_mask(true)
         if view.name == "train/r_008":
@@ -115,10 +117,10 @@ def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path,
 
 def test_a_scene_file_does_as_well_as_its_run(baked, trained, tiny, switched, tmp_path):
     scene_file.write(baked, tmp_path / "scene.r5dgs")
-    one = commands_association.run_associate(
+    one = cli_associate.run_associate(
         tmp_path / "scene.r5dgs", tiny.root, masks=switched, out=tmp_path / "one", progress_kind="json"
     )
-    two = commands_association.run_associate(trained.folder, masks=switched, out=tmp_path / "two")
+    two = cli_associate.run_associate(trained.folder, masks=switched, out=tmp_path / "two")
     for path in one.rglob("*.png"):
         assert path.read_bytes() == (two / path.relative_to(one)).read_bytes()
 
@@ -126,16 +128,16 @@ def test_a_scene_file_does_as_well_as_its_run(baked, trained, tiny, switched, tm
 def test_masks_that_are_read_are_not_written_over(trained, switched):
     before = {path: path.read_bytes() for path in switched.rglob("*.png")}
     with pytest.raises(errors.ConfigError, match="holds the incoming masks; name another folder"):
-        commands_association.run_associate(trained.folder, masks=switched, out=switched)
+        cli_associate.run_associate(trained.folder, masks=switched, out=switched)
     assert before == {path: path.read_bytes() for path in switched.rglob("*.png")}
 
 
 def test_a_scene_file_alone_is_not_enough(tmp_path):
     (tmp_path / "scene.r5dgs").touch()
     with pytest.raises(errors.ConfigError, match="needs the data set and a folder, --data and --out"):
-        commands_association.run_associate(tmp_path / "scene.r5dgs")
+        cli_associate.run_associate(tmp_path / "scene.r5dgs")
     with pytest.raises(errors.SceneFileError, match=r"nowhere: expected a run folder or a \.r5dgs file, found nothing"):
-        commands_association.run_associate(tmp_path / "nowhere")
+        cli_associate.run_associate(tmp_path / "nowhere")
 
 
 def test_no_masks_at_all_is_an_error(baked, tiny):
@@ -152,8 +154,8 @@ def split_into_videos(root, folder):
 def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny, tmp_path, capsys, monkeypatch):
     """They would be trained with, an object of one video as that of another."""
     data, videos = split_into_videos(tiny.root, tmp_path / "videos")
-    monkeypatch.setattr(association, "GAIN", 1e9)
-    out = commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=tmp_path / "out")
+    monkeypatch.setattr(associate, "GAIN", 1e9)
+    out = cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=tmp_path / "out")
     said = capsys.readouterr().out
     assert "the incoming ids stay" in said and "within single videos" in said and "r5dgs train" not in said
     assert mask_notes.read(out).videos == videos
@@ -166,7 +168,7 @@ def test_images_that_were_numbered_apart_are_so_in_bags(baked, tiny, tmp_path):
     data, _ = split_into_videos(tiny.root, tmp_path / "videos")
     first = [view for view in datasets.read(tiny.root).train if view.camera.name == data.train[0].camera.name]
     parts = [dataclasses.replace(view, mask_video=f"part {k // 3}") for k, view in enumerate(first)]
-    bags = drawn_bags.draw(baked, parts, [datasets.load_mask(view) for view in parts])
+    bags = render_segments.draw(baked, parts, [datasets.load_mask(view) for view in parts])
     assert [bag.view for bag in bags] == [0, 0, 0, 1, 1, 1]
 
 
@@ -175,13 +177,13 @@ def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(
     shutil.copytree(tiny.root / "object_mask", out)
     before = {path: path.read_bytes() for path in out.rglob("*.png")}
     with pytest.raises(errors.DatasetError, match="holds 36 masks that r5dgs associate did not write.*--out"):
-        commands_association.run_associate(trained.folder, masks=switched, out=out)
+        cli_associate.run_associate(trained.folder, masks=switched, out=out)
     assert before == {path: path.read_bytes() for path in out.rglob("*.png")}
     shutil.rmtree(out)
     split_into_videos(tiny.root, tmp_path / "videos")
-    commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
     (switched / "train" / "r_004.png").unlink()
-    commands_association.run_associate(trained.folder, masks=switched, out=out)
+    cli_associate.run_associate(trained.folder, masks=switched, out=out)
     made = datasets.read(tiny.root, str(out))
     assert [view.name for view in made.train if view.mask_path is None] == ["train/r_004"]
     assert made.object_names == datasets.read(tiny.root).object_names and made.ground_truth is not None
@@ -190,7 +192,7 @@ def test_masks_of_others_are_not_written_over_and_own_ones_leave_nothing_behind(
 def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_path, monkeypatch):
     out = tmp_path / "out"
     split_into_videos(tiny.root, tmp_path / "videos")
-    commands_association.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
+    cli_associate.run_associate(trained.folder, masks=tmp_path / "videos", out=out)
     written = []
 
     def stopped(path, ids):
@@ -202,7 +204,7 @@ def test_a_stop_leaves_no_masks_of_two_numberings(trained, tiny, switched, tmp_p
     write = masks.write
     monkeypatch.setattr(masks, "write", stopped)
     with pytest.raises(KeyboardInterrupt):
-        commands_association.run_associate(trained.folder, masks=switched, out=out)
+        cli_associate.run_associate(trained.folder, masks=switched, out=out)
     assert sorted(out.rglob("*.png")) == sorted(written) and not mask_notes.read(out).finished
 
 

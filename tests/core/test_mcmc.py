@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.config.sections import DensifyMcmcSection
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.train import mcmc
-from r5dgs_core.train.sections import DensifyMcmcSection
+from r5dgs_core.train.densification import mcmc
 from tests.core.test_densification import conditions, make
 
 SECTION = DensifyMcmcSection()

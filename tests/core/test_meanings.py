@@ -7,9 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
-from r5dgs_core.scene import lookup, meanings, scene_file, scene_info, scene_json
+from r5dgs_core.playback import scene_info
+from r5dgs_core.scene import scene_file, scene_json
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.stored_embeddings import Meanings
+from r5dgs_core.search import embedding_search, object_search
 from tests.scenes import make_scene
 
 CARD = EncoderCard("text", "tiny", "ab" * 32, 4, ("{}", "a photo of a {}"))
@@ -41,13 +43,13 @@ def table_of(rows, thresholds, *, margin=2.0, pooling="mean", views=None):
 @given(cosines, st.lists(cosines, min_size=1, max_size=5), st.floats(1, 50))
 def test_relevancy_is_the_least_of_the_pairs(cosine, canonical, scale):
     pairs = [np.exp(scale * cosine) / (np.exp(scale * cosine) + np.exp(scale * other)) for other in canonical]
-    assert meanings.relevancy(cosine, np.array(canonical), scale) == pytest.approx(min(pairs), abs=1e-9)
+    assert embedding_search.relevancy(cosine, np.array(canonical), scale) == pytest.approx(min(pairs), abs=1e-9)
 
 
 @pytest.mark.filterwarnings("error")
 def test_relevancy_is_a_number_at_any_scale():
-    assert meanings.relevancy(-1.0, np.array([1.0]), 1000.0) < 1e-300
-    assert meanings.relevancy(1.0, np.array([-1.0]), 1000.0) == 1.0
+    assert embedding_search.relevancy(-1.0, np.array([1.0]), 1000.0) < 1e-300
+    assert embedding_search.relevancy(1.0, np.array([-1.0]), 1000.0) == 1.0
 
 
 @given(cosines, st.floats(-0.9, 0.9), st.booleans())
@@ -55,10 +57,10 @@ def test_a_score_passes_exactly_where_the_cosine_reaches_the_threshold(cosine, t
     known = table_of([around(cosine)], [threshold])
     if not canonical:
         known = dataclasses.replace(known, canonical_embeddings=np.zeros((0, 4)))
-    (one,) = meanings.ask(known, np.eye(4)[0])
+    (one,) = embedding_search.ask(known, np.eye(4)[0])
     assert one.cosine == pytest.approx(cosine) and 0 <= one.score <= 0.95
     if abs(cosine - threshold) > 1e-6:
-        assert (one.score >= meanings.PASS) == (cosine > threshold)
+        assert (one.score >= embedding_search.PASS) == (cosine > threshold)
 
 
 @given(cosines, st.floats(0.01, 0.5))
@@ -66,30 +68,30 @@ def test_scores_do_not_depend_on_how_near_all_cosines_of_an_encoder_lie(cosine, 
     """An encoder whose cosines are twice as close has thresholds and a margin that are so, too."""
     wide = table_of([around(cosine)], [threshold], margin=0.4)
     close = table_of([around(cosine / 2)], [threshold / 2], margin=0.2)
-    (one,), (other,) = (meanings.ask(each, np.eye(4)[0]) for each in (wide, close))
+    (one,), (other,) = (embedding_search.ask(each, np.eye(4)[0]) for each in (wide, close))
     assert one.score == pytest.approx(other.score, abs=1e-9)
 
 
 @given(st.lists(st.floats(0, 0.99), min_size=2, max_size=6), st.floats(0.01, 0.9))
 def test_scores_of_one_threshold_are_in_the_order_of_cosines(found, threshold):
-    answers = meanings.ask(table_of([around(c) for c in found], [threshold] * len(found)), np.eye(4)[0])
+    answers = embedding_search.ask(table_of([around(c) for c in found], [threshold] * len(found)), np.eye(4)[0])
     assert [one.score for one in answers] == sorted((one.score for one in answers), reverse=True)
     assert all(a.cosine >= b.cosine - 1e-4 for a, b in itertools.pairwise(answers) if a.score > b.score)
 
 
 def test_several_match_where_several_fit_and_none_far_below_the_best():
     known = table_of([around(0.9), around(0.85), around(0.6), around(0.2)], [0.5] * 4, margin=0.2)
-    scores = {one.object_id: one.score for one in meanings.ask(known, np.eye(4)[0])}
-    assert {object_id for object_id, score in scores.items() if score >= meanings.PASS} == {1, 2}
+    scores = {one.object_id: one.score for one in embedding_search.ask(known, np.eye(4)[0])}
+    assert {object_id for object_id, score in scores.items() if score >= embedding_search.PASS} == {1, 2}
     wide = dataclasses.replace(known, table=dataclasses.replace(known.table, margin=0.4))
-    assert sum(one.score >= meanings.PASS for one in meanings.ask(wide, np.eye(4)[0])) == 3
+    assert sum(one.score >= embedding_search.PASS for one in embedding_search.ask(wide, np.eye(4)[0])) == 3
 
 
 def test_nothing_matches_under_the_thresholds_and_an_object_without_embedding_says_nothing():
     known = table_of([around(0.4), np.zeros(4), around(0.45)], [0.5, None, 0.5])
-    answers = meanings.ask(known, np.eye(4)[0])
-    assert [one.object_id for one in answers] == [3, 1] and all(one.score < meanings.PASS for one in answers)
-    assert meanings.ask(table_of(np.zeros((0, 4)), []), np.eye(4)[0]) == []
+    answers = embedding_search.ask(known, np.eye(4)[0])
+    assert [one.object_id for one in answers] == [3, 1] and all(one.score < embedding_search.PASS for one in answers)
+    assert embedding_search.ask(table_of(np.zeros((0, 4)), []), np.eye(4)[0]) == []
 
 
 def test_the_best_view_answers_or_their_mean():
@@ -97,52 +99,55 @@ def test_the_best_view_answers_or_their_mean():
     stored = np.stack([around(0.9), around(0.1)])[None]
     mean = unit(*stored[0].mean(0))
     best = table_of([mean], [0.5], pooling="max", views=(views, stored))
-    assert meanings.ask(best, np.eye(4)[0])[0].cosine == pytest.approx(0.9)
+    assert embedding_search.ask(best, np.eye(4)[0])[0].cosine == pytest.approx(0.9)
     other = dataclasses.replace(best, table=dataclasses.replace(best.table, pooling="mean"))
-    assert meanings.ask(other, np.eye(4)[0])[0].cosine == pytest.approx(mean[0])
+    assert embedding_search.ask(other, np.eye(4)[0])[0].cosine == pytest.approx(mean[0])
 
 
 def test_a_name_settles_a_wish_and_others_are_asked_by_meaning():
     known = table_of([around(0.9), around(0.95)], [0.5, 0.5])
-    labels = [lookup.Label(1, "ball"), lookup.Label(2, "globe")]
-    assert [m.object_id for m in lookup.search_labels(labels, "spheres", meanings=known)] == [2, 1]
-    named = [lookup.Label(1, "ball", ("sphere",)), lookup.Label(2, "globe")]
-    assert [m.object_id for m in lookup.search_labels(named, "sphere", meanings=known)] == [1]
-    both = lookup.search_labels(labels, "ball and a sphere", meanings=known)
+    labels = [object_search.Label(1, "ball"), object_search.Label(2, "globe")]
+    assert [m.object_id for m in object_search.search_labels(labels, "spheres", meanings=known)] == [2, 1]
+    named = [object_search.Label(1, "ball", ("sphere",)), object_search.Label(2, "globe")]
+    assert [m.object_id for m in object_search.search_labels(named, "sphere", meanings=known)] == [1]
+    both = object_search.search_labels(labels, "ball and a sphere", meanings=known)
     assert [(m.object_id, m.cosine is None) for m in both] == [(1, True), (2, False)]
 
 
 def test_a_known_word_is_neither_a_typo_nor_the_beginning_of_another():
-    labels = [lookup.Label(1, "cart"), lookup.Label(2, "racecar")]
-    assert {m.object_id for m in lookup.search_labels(labels, "car")} == {1, 2}
+    labels = [object_search.Label(1, "cart"), object_search.Label(2, "racecar")]
+    assert {m.object_id for m in object_search.search_labels(labels, "car")} == {1, 2}
     known = dataclasses.replace(table_of([around(0.1), around(0.1)], [0.5, 0.5]), vocabulary=("car",))
-    assert [m.object_id for m in lookup.search_labels(labels, "car", meanings=known)] == [2]
+    assert [m.object_id for m in object_search.search_labels(labels, "car", meanings=known)] == [2]
     fitting = table_of([around(0.9), around(0.1)], [0.5, 0.5])
     fitting = dataclasses.replace(fitting, vocabulary=("car",))
-    assert {m.object_id for m in lookup.search_labels(labels, "car", meanings=fitting)} == {1, 2}
+    assert {m.object_id for m in object_search.search_labels(labels, "car", meanings=fitting)} == {1, 2}
 
 
 def test_an_encoder_is_asked_for_words_that_are_neither_names_nor_stored():
     known = table_of([around(0.9), around(0.3)], [0.5, 0.5])
-    labels = [lookup.Label(1, "ball"), lookup.Label(2, "desk")]
+    labels = [object_search.Label(1, "ball"), object_search.Label(2, "desk")]
     asked = []
 
     def embed(phrase):
         asked.append(phrase)
         return np.eye(4)[0]
 
-    found = lookup.search_labels(labels, "desk, sphere and something to throw", meanings=known, embed=embed)
+    found = object_search.search_labels(labels, "desk, sphere and something to throw", meanings=known, embed=embed)
     assert asked == ["something to throw"] and [m.object_id for m in found] == [2, 1]
-    (meant,) = lookup.search_labels(labels, "something to throw", meanings=known, embed=embed)
+    (meant,) = object_search.search_labels(labels, "something to throw", meanings=known, embed=embed)
     assert "something to throw" in meant.why and meant.relevancy > 0.9 and meant.cosine == pytest.approx(0.9)
-    assert lookup.unknown(labels, "desk, sphere and something to throw", known) == ["something to throw"]
-    assert lookup.unknown(labels, "desk and sphere", None) == ["sphere"]
+    assert object_search.unknown(labels, "desk, sphere and something to throw", known) == ["something to throw"]
+    assert object_search.unknown(labels, "desk and sphere", None) == ["sphere"]
 
 
 def test_a_vocabulary_is_read_like_a_prompt():
     words = ("salt and pepper", "cutting boards", "The Mug")
-    assert lookup.vocabulary_row(words, ["cutting", "board"]) == 1 and lookup.vocabulary_row(words, ["mug"]) == 2
-    assert lookup.vocabulary_row(words, ["salt"]) is None
+    assert (
+        object_search.vocabulary_row(words, ["cutting", "board"]) == 1
+        and object_search.vocabulary_row(words, ["mug"]) == 2
+    )
+    assert object_search.vocabulary_row(words, ["salt"]) is None
 
 
 @pytest.fixture

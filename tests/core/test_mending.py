@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.association import associate, mending, segment_stack
 from r5dgs_core.data.masks import UNKNOWN
-from r5dgs_core.semantics import association, bags, mending
 
 SIZE, TIMES = 24, 6
 PIXELS = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)  # of a scene in which every pixel shows a Gaussian of its own
@@ -21,11 +21,13 @@ def truth() -> np.ndarray:
     return mask
 
 
-def associated(masks: list[np.ndarray]) -> tuple[list[bags.ImageBags], association.Association]:
+def associated(masks: list[np.ndarray]) -> tuple[list[segment_stack.ImageBags], associate.Association]:
     """Bags of masks of one view over time, and their association."""
     indices, weights = PIXELS.reshape(-1, 1), np.ones((SIZE * SIZE, 1))
-    given = [bags.from_pixels(mask, indices, weights, SIZE * SIZE, view=0, time=t) for t, mask in enumerate(masks)]
-    return given, association.associate(given)
+    given = [
+        segment_stack.from_pixels(mask, indices, weights, SIZE * SIZE, view=0, time=t) for t, mask in enumerate(masks)
+    ]
+    return given, associate.associate(given)
 
 
 def mended(masks: list[np.ndarray], **changes: object) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from r5dgs_core.report import metrics
+from r5dgs_core.evaluation import metrics
 
 
 def picture(seed: int, height: int = 23, width: int = 31) -> np.ndarray:

@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.bake import bake, needs
+from r5dgs_core.config import config, training_needs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.scene.scene import MotionGroup
-from r5dgs_core.train import bake, checkpoint, config, config_needs, groups, needs, run
+from r5dgs_core.train import checkpoint, observed_motion, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -110,7 +112,7 @@ def test_the_tiny_scene_is_judged_by_what_it_shows(baked):
 
 
 EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
-EVERYTHING["moves"] = groups.Moves(3, moving=9)
+EVERYTHING["moves"] = observed_motion.Moves(3, moving=9)
 NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
 
 
@@ -179,7 +181,7 @@ def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
 def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_needed(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("needs.view_dependent_colour=on"))
     assert trainer.gaussians.params["sh_rest"].shape[1] == 3
-    kept = config_needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
+    kept = training_needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
     assert kept.train.sh_degree == 2
 
 
@@ -202,9 +204,9 @@ def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
 
 
 def test_the_table_says_what_was_regrouped():
-    row = table(moves=groups.Moves(3, 2, 1, 1, 60))["regrouping"]
+    row = table(moves=observed_motion.Moves(3, 2, 1, 1, 60))["regrouping"]
     assert (row["value"], row["decision"]) == (6, "on")
     for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "1 shadows rest"):
         assert part in row["reason"]
-    assert table(moves=groups.Moves(moving=60))["regrouping"]["decision"] == "off"
+    assert table(moves=observed_motion.Moves(moving=60))["regrouping"]["decision"] == "off"
     assert table()["regrouping"]["decision"] == "off"

@@ -7,13 +7,16 @@ import zipfile
 import numpy as np
 import pytest
 
-from r5dgs_core import commands, errors
+from r5dgs_core import errors
+from r5dgs_core.bake import bake
+from r5dgs_core.cli import runs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images, origin
-from r5dgs_core.raster import scene_render
-from r5dgs_core.report import evaluate
-from r5dgs_core.scene import cameras, playback, scene_file, scene_info
-from r5dgs_core.train import bake, checkpoint, run
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.playback import scene_info, scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, scene_file
+from r5dgs_core.train import checkpoint, run
 from tests import colmap_files, scenes
 from tests import datasets as tiny_datasets
 
@@ -33,7 +36,8 @@ def psnr(a, b):
 
 def drawn(scene, views):
     return [
-        scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy() for view in views
+        scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.numpy()
+        for view in views
     ]
 
 
@@ -143,7 +147,7 @@ def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_i
     path = scene_file.write(older, tmp_path / "older.r5dgs")
     with zipfile.ZipFile(path) as archive:
         assert json.loads(archive.read("scene.json"))["format_version"] == 1
-    scene, found = commands.open_target(path, data.root)
+    scene, found = runs.open_target(path, data.root)
     assert "Bake its run again" in caplog.text
     assert found is not None and not found.origin.any()
     view = found.val[0]

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core.data import masks
-from r5dgs_core.report import overlap
+from r5dgs_core.evaluation import miou
 
 TRUTH = np.array([[0, 0, 1, 1], [0, 0, 1, 1], [5, 5, 0, 0]])
 
 
 def measured(*pairs, ids=(1, 5)):
-    tally = overlap.Overlap(ids)
+    tally = miou.Overlap(ids)
     for rendered, mask in pairs:
         tally.add(np.asarray(rendered), np.asarray(mask))
     return tally.result()
@@ -23,7 +23,7 @@ def measured(*pairs, ids=(1, 5)):
 def test_every_number_is_that_of_its_definition():
     rendered = np.array([[0, 0, 1, 0], [0, 5, 1, 1], [5, 5, 0, 0]])
     found = measured((rendered, TRUTH))
-    assert tuple(found) == overlap.KEYS
+    assert tuple(found) == miou.KEYS
     assert found["iou_objects"] == {"1": pytest.approx(3 / 4), "5": pytest.approx(2 / 3)}
     assert found["miou"] == found["miou_matched"] == pytest.approx((3 / 4 + 2 / 3) / 2)
     assert found["iou_background"] == pytest.approx(5 / 7)
@@ -37,7 +37,7 @@ def test_what_is_drawn_where_the_mask_is_unknown_changes_nothing(seed):
     mask, rendered = rng.choice([0, 1, 5, masks.UNKNOWN], (6, 7)), rng.choice([0, 1, 5], (6, 7))
     other = np.where(mask == masks.UNKNOWN, rng.choice([0, 1, 5], (6, 7)), rendered)
     assert measured((rendered, mask)) == measured((other, mask))
-    np.testing.assert_array_equal(overlap.objects_of(mask), (mask == 1) | (mask == 5))
+    np.testing.assert_array_equal(miou.objects_of(mask), (mask == 1) | (mask == 5))
 
 
 def test_unknown_is_not_the_background():
@@ -70,7 +70,7 @@ def test_an_object_that_the_scene_lacks_counts_as_missed_and_takes_no_id():
 
 
 def test_without_masks_or_without_objects_there_is_no_score():
-    assert measured() == dict.fromkeys(overlap.KEYS)
+    assert measured() == dict.fromkeys(miou.KEYS)
     empty = measured((np.zeros((3, 3), int), np.zeros((3, 3), int)))
     assert empty["miou"] is empty["miou_matched"] is None and empty["iou_background"] == 1.0
     nothing = measured((np.zeros((3, 3), int), np.full((3, 3), masks.UNKNOWN)))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core.errors import ConfigError
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import cameras, playback
-from r5dgs_core.semantics import pictures, standpoints
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import highlight, scene_renderer, viewpoints
+from r5dgs_core.scene import cameras
 from tests import scenes
 
 BACKEND = "reference"
@@ -17,8 +17,8 @@ LATER = 1.1
 
 
 def drawn(scene, t, background):
-    frame = playback.frame(scene, t)
-    return scene_render.render_frame(scene, frame, CAMERA, background=background, backend=BACKEND)
+    frame = scene_player.frame(scene, t)
+    return scene_renderer.render_frame(scene, frame, CAMERA, background=background, backend=BACKEND)
 
 
 def rows_of(scene, object_id):
@@ -31,7 +31,7 @@ def rows_of(scene, object_id):
 
 @pytest.mark.parametrize("t", [0.2, LATER])
 def test_an_object_alone_is_a_scene_of_its_own_gaussians(scene, t):
-    found = pictures.isolate(scene, [2], CAMERA, t, backend=BACKEND)
+    found = highlight.isolate(scene, [2], CAMERA, t, backend=BACKEND)
     alone = drawn(rows_of(scene, 2), t, None)
     np.testing.assert_allclose(found[..., 3], alone.alpha.numpy(), atol=1e-6)
     premultiplied = np.clip(alone.color.numpy(), 0, found[..., 3:])
@@ -41,9 +41,9 @@ def test_an_object_alone_is_a_scene_of_its_own_gaussians(scene, t):
 
 def test_all_objects_together_are_the_whole_picture(scene):
     everything = [item.id for item in scene.objects]
-    alone = pictures.isolate(scene, everything, CAMERA, 0.4, backend=BACKEND)
+    alone = highlight.isolate(scene, everything, CAMERA, 0.4, backend=BACKEND)
     np.testing.assert_allclose(alone[..., 3], drawn(scene, 0.4, None).alpha.numpy(), atol=1e-6)
-    shown = pictures.highlight(scene, everything, CAMERA, 0.4, backend=BACKEND)
+    shown = highlight.highlight(scene, everything, CAMERA, 0.4, backend=BACKEND)
     whole = np.clip(drawn(scene, 0.4, "scene").color.numpy(), 0, 1)
     solid = alone[..., 3] > 0.999
     assert solid.any()
@@ -52,11 +52,11 @@ def test_all_objects_together_are_the_whole_picture(scene):
 
 def test_what_is_not_asked_for_is_gray_and_dim(scene):
     whole = np.clip(drawn(scene, 0.4, "scene").color.numpy(), 0, 1)
-    nothing = pictures.highlight(scene, [], CAMERA, 0.4, backend=BACKEND)
+    nothing = highlight.highlight(scene, [], CAMERA, 0.4, backend=BACKEND)
     assert np.ptp(nothing, axis=-1).max() < 1e-6
-    assert (nothing.max(axis=-1) <= pictures.DIMMED * whole.max(axis=-1) + 1e-6).all()
-    some = pictures.highlight(scene, [2], CAMERA, 0.4, backend=BACKEND)
-    hidden = pictures.isolate(scene, [2], CAMERA, 0.4, backend=BACKEND)[..., 3] == 0
+    assert (nothing.max(axis=-1) <= highlight.DIMMED * whole.max(axis=-1) + 1e-6).all()
+    some = highlight.highlight(scene, [2], CAMERA, 0.4, backend=BACKEND)
+    hidden = highlight.isolate(scene, [2], CAMERA, 0.4, backend=BACKEND)[..., 3] == 0
     np.testing.assert_array_equal(some[hidden], nothing[hidden])
     assert np.abs(some - nothing).max() > 0.1
 
@@ -69,43 +69,43 @@ def test_an_object_is_alone_even_where_others_hide_it(scene):
         means=np.where((scene.object_ids == 3)[:, None], CAMERA.center + 0.5 * toward, scene.means).astype(np.float32),
         log_scales=np.where((scene.object_ids == 3)[:, None], 0.0, scene.log_scales).astype(np.float32),
     )
-    before = pictures.isolate(scene, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
-    after = pictures.isolate(wall, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
+    before = highlight.isolate(scene, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
+    after = highlight.isolate(wall, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
     np.testing.assert_array_equal(before, after)
 
 
 def test_cameras_are_found_by_name_and_by_number(scene):
-    assert standpoints.named(scene, scene.cameras[1].name) is scene.cameras[1]
-    assert standpoints.named(scene, "1") is scene.cameras[1]
+    assert viewpoints.named(scene, scene.cameras[1].name) is scene.cameras[1]
+    assert viewpoints.named(scene, "1") is scene.cameras[1]
     swapped = tuple(dataclasses.replace(c, name=n) for c, n in zip(scene.cameras, "10", strict=True))
-    assert standpoints.named(dataclasses.replace(scene, cameras=swapped), "1").name == "1"
+    assert viewpoints.named(dataclasses.replace(scene, cameras=swapped), "1").name == "1"
     for wrong in ("2", "-1", "left", ""):
         with pytest.raises(ConfigError, match="expected 0 to 1, or a name of a camera: orbit_0.30"):
-            standpoints.named(scene, wrong)
+            viewpoints.named(scene, wrong)
     with pytest.raises(ConfigError, match="stores no cameras"):
-        standpoints.named(dataclasses.replace(scene, cameras=()), "0")
+        viewpoints.named(dataclasses.replace(scene, cameras=()), "0")
 
 
 def test_the_best_standpoint_sees_the_most_objects(scene):
     away = scenes.looking_camera([9.0, 0, 1], [1.0, 0, 0], 0.9, 48, 36, "away")
     near = scenes.looking_camera(scene.means[scene.object_ids == 2].mean(0) + [0.4, 0, 0], [-1.0, 0, 0], 0.5, 48, 36)
-    among = [standpoints.Standpoint(camera, 0.3) for camera in (away, near, scenes.orbit_camera(0.3))]
+    among = [viewpoints.Standpoint(camera, 0.3) for camera in (away, near, scenes.orbit_camera(0.3))]
     ids = [item.id for item in scene.objects if item.id > 0]
-    assert standpoints.best(scene, among, ids, backend=BACKEND) is among[2]
-    assert standpoints.best(scene, among[:2], [2], backend=BACKEND) is among[1]
-    assert standpoints.best(scene, among[:1], [2], backend=BACKEND) is among[0]
+    assert viewpoints.best(scene, among, ids, backend=BACKEND) is among[2]
+    assert viewpoints.best(scene, among[:2], [2], backend=BACKEND) is among[1]
+    assert viewpoints.best(scene, among[:1], [2], backend=BACKEND) is among[0]
 
 
 def test_candidates_are_cameras_at_times(scene):
-    every = standpoints.candidates(scene)
+    every = viewpoints.candidates(scene)
     assert {round(s.t, 6) for s in every} == {0.0, round(scene.t_max / 2, 6), scene.t_max}
     assert len(every) == 3 * len(scene.cameras)
-    (one,) = standpoints.candidates(scene, "0", LATER)
+    (one,) = viewpoints.candidates(scene, "0", LATER)
     assert one.t == LATER and one.camera is scene.cameras[0]
     many = dataclasses.replace(scene, cameras=scene.cameras * 100)
-    assert len(standpoints.candidates(many, t=0.0)) == standpoints.MOST_CAMERAS
+    assert len(viewpoints.candidates(many, t=0.0)) == viewpoints.MOST_CAMERAS
     with pytest.raises(ConfigError, match="--time nan"):
-        standpoints.candidates(scene, t=float("nan"))
+        viewpoints.candidates(scene, t=float("nan"))
 
 
 @pytest.mark.parametrize("convention", sorted(cameras.WORLD_TO_BLENDER))
@@ -113,7 +113,7 @@ def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
     scene = scenes.make_scene(n=400, objects=3, seed=2, world_convention=convention)
     turn = cameras.WORLD_TO_BLENDER[convention].T
     turned = dataclasses.replace(scene, means=(scene.means @ turn.T).astype(np.float32), cameras=())
-    camera = standpoints.overview(turned)
+    camera = viewpoints.overview(turned)
     pixels, depth = cameras.project(camera, turned.means[turned.object_ids > 0].astype(np.float64))
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
     assert inside.mean() > 0.95
@@ -122,12 +122,12 @@ def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
     assert np.linalg.det(rotation) == pytest.approx(1)
     up = turn @ [0, 0, 1.0]
     assert rotation[1] @ up < -0.5 and camera.forward @ up < -0.2  # y of the picture points down, and it looks down
-    (only,) = {s.camera.name for s in standpoints.candidates(turned)}
+    (only,) = {s.camera.name for s in viewpoints.candidates(turned)}
     assert only == "overview"
 
 
 def test_a_resized_camera_keeps_its_picture():
-    camera = standpoints.sized(CAMERA, 96)
+    camera = viewpoints.sized(CAMERA, 96)
     assert (camera.width, camera.height) == (96, 72)
     points = np.array([[0.1, 0.2, 0.3], [-0.5, 0.1, 0.0]])
     np.testing.assert_allclose(cameras.project(camera, points)[0], 2 * cameras.project(CAMERA, points)[0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
-from r5dgs_core.scene import ply
+from r5dgs_core.formats import ply
 from tests.scenes import make_scene
 
 

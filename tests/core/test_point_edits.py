@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.editing import point_edits
+from r5dgs_core.editing.point_edits import PointEdit
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import carried, point_edits
-from r5dgs_core.scene.point_edits import PointEdit
-from r5dgs_core.scene.residuals import Residuals
+from r5dgs_core.playback import affine_transform
+from r5dgs_core.playback.residuals import Residuals
 from tests import scenes
 
 
@@ -49,8 +50,8 @@ def mapped(points, matrix):
 
 def drawn(extended, place, t=None):
     """Return the points of an edit as they are placed in the extended scene."""
-    bend = None if t is None else carried.bend_of(Residuals(extended), t, place.start, place.count)
-    return carried.place(extended, place.start, place.count, place.matrix, bend=bend)
+    bend = None if t is None else affine_transform.bend_of(Residuals(extended), t, place.start, place.count)
+    return affine_transform.place(extended, place.start, place.count, place.matrix, bend=bend)
 
 
 def covariances(splats):
@@ -86,14 +87,14 @@ def test_a_map_is_found_though_some_points_were_moved_on_their_own(scene, rng):
     matrix, means = some_map(), mapped(scene.means[ROWS], some_map())
     means[:20] += rng.normal(size=(20, 3)).astype(np.float32)
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
-    actual, expected = drawn(extended, place), carried.place(scene, 40, 80, matrix)
+    actual, expected = drawn(extended, place), affine_transform.place(scene, 40, 80, matrix)
     assert_same(actual, dataclasses.replace(expected, means=means))
 
 
 def test_points_that_share_no_map_keep_their_shapes(scene, rng):
     means = rng.normal(size=(80, 3)).astype(np.float32)
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
-    expected = carried.place(scene, 40, 80, np.eye(4))
+    expected = affine_transform.place(scene, 40, 80, np.eye(4))
     assert_same(drawn(extended, place), dataclasses.replace(expected, means=means))
 
 
@@ -102,7 +103,9 @@ def test_points_that_stay_in_place_keep_their_shapes_though_most_are_turned(scen
     means[:20] = scene.means[ROWS[:20]]
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
     actual = drawn(extended, place)
-    expected = carried.join([carried.place(scene, 40, 20, np.eye(4)), carried.place(scene, 60, 60, matrix)])
+    expected = affine_transform.join(
+        [affine_transform.place(scene, 40, 20, np.eye(4)), affine_transform.place(scene, 60, 60, matrix)]
+    )
     assert_same(actual, expected)
 
 
@@ -123,7 +126,9 @@ def test_copies_have_a_map_each(scene):
     first, second = np.eye(4), some_map()
     means = np.concatenate([mapped(scene.means[ROWS], second), scene.means[ROWS]])
     extended, (place,) = point_edits.extend(scene, [PointEdit(np.tile(ROWS, 2), means)])
-    expected = carried.join([carried.place(scene, 40, 80, second), carried.place(scene, 40, 80, first)])
+    expected = affine_transform.join(
+        [affine_transform.place(scene, 40, 80, second), affine_transform.place(scene, 40, 80, first)]
+    )
     assert_same(drawn(extended, place), expected, atol=5e-5)
 
 
@@ -131,10 +136,10 @@ def test_shading_and_bending_follow_copies(scene):
     t, matrix = 0.4 * scene.t_max, some_map()
     means = np.concatenate([scene.means[ROWS], mapped(scene.means[ROWS], matrix)])
     extended, (place,) = point_edits.extend(scene, [PointEdit(np.tile(ROWS, 2), means)])
-    bend = carried.bend_of(Residuals(scene), t, 40, 80)
-    expected = carried.join([carried.place(scene, 40, 80, m, bend=bend) for m in (np.eye(4), matrix)])
+    bend = affine_transform.bend_of(Residuals(scene), t, 40, 80)
+    expected = affine_transform.join([affine_transform.place(scene, 40, 80, m, bend=bend) for m in (np.eye(4), matrix)])
     assert_same(drawn(extended, place, t=t), expected, atol=2e-4)
-    without = carried.join([carried.place(scene, 40, 80, m) for m in (np.eye(4), matrix)])
+    without = affine_transform.join([affine_transform.place(scene, 40, 80, m) for m in (np.eye(4), matrix)])
     assert np.abs(expected.means - without.means).max() > 0.01  # they bend
 
 

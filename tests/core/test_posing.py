@@ -5,8 +5,8 @@ import torch
 
 from r5dgs_core.model.tracks import GroupPoses
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import compile as kernels
-from r5dgs_core.train import posing
+from r5dgs_core.raster.cpu import compilation as kernels
+from r5dgs_core.train.representations import fused_posing
 
 NAMES = ("means", "quats", "log_scales", "logits", "colors", "shading", "light", "group_quats", "rotmats", "shifts")
 OUTPUTS = ("means", "quats", "scales", "opacities", "colors")
@@ -28,7 +28,7 @@ def inputs(n, groups=4, seed=0):
 def fused(values, ids, centers):
     v = values
     poses = GroupPoses(v["group_quats"], v["rotmats"], v["shifts"])
-    return posing.pose(
+    return fused_posing.pose(
         v["means"], v["quats"], v["log_scales"], v["logits"], v["colors"], v["shading"], v["light"], ids, poses, centers
     )  # fmt: skip
 
@@ -41,7 +41,7 @@ def plain(values, ids, centers):
     change = (rotmats.transpose(1, 2) @ v["light"]) - v["light"]
     factor = (1 + (change * v["shading"]).sum(-1)).clamp(min=0)
     colors = v["colors"].clamp(min=0) * factor[:, None]
-    return posing.Splats(means, quats, v["log_scales"].exp(), v["logits"].sigmoid(), colors)
+    return fused_posing.Splats(means, quats, v["log_scales"].exp(), v["logits"].sigmoid(), colors)
 
 
 def weighted_sum(splats, seed=9):

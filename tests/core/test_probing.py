@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.report import evaluate
-from r5dgs_core.train import checkpoint, probing, run
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train import probe as train_probe
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -41,7 +42,7 @@ def test_the_look_agrees_with_the_evaluation(tiny, trained, baked):
     dataset = datasets.read(tiny.root)
     trainer = Trainer(dataset, trained.config)
     trainer.restore(checkpoint.load(trained.folder))
-    probe = probing.Probe(trainer, 5)
+    probe = train_probe.Probe(trainer, 5)
     assert len(probe) == len(dataset.val) == 2
     result = evaluate.evaluate(baked, dataset)
     assert probe.psnr() == pytest.approx(result["splits"]["val"]["rigid"]["psnr"], abs=0.1)
@@ -49,7 +50,7 @@ def test_the_look_agrees_with_the_evaluation(tiny, trained, baked):
 
 def test_few_views_are_taken_where_few_are_wanted(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings())
-    assert len(probing.Probe(trainer, 1)) == 1
+    assert len(train_probe.Probe(trainer, 1)) == 1
 
 
 def test_without_held_out_views_nothing_is_looked_at(tmp_path):
@@ -63,5 +64,5 @@ def test_without_held_out_views_nothing_is_looked_at(tmp_path):
 def test_the_psnr_is_that_of_a_constant_error(levels):
     target = np.zeros((4, 5, 3), np.uint8)
     image = np.full((4, 5, 3), levels / 255, np.float32)
-    assert probing.psnr(image, target) == pytest.approx(20 * np.log10(255 / levels))
-    assert probing.psnr(target.astype(np.float32), target) == 99
+    assert train_probe.psnr(image, target) == pytest.approx(20 * np.log10(255 / levels))
+    assert train_probe.psnr(target.astype(np.float32), target) == 99

@@ -4,9 +4,11 @@ import dataclasses
 
 import pytest
 
-from r5dgs_core import commands_words, errors
-from r5dgs_core.scene import lookup, prompts, scene_file
-from r5dgs_core.semantics import query
+from r5dgs_core import errors
+from r5dgs_core.cli import language
+from r5dgs_core.language import query
+from r5dgs_core.scene import scene_file
+from r5dgs_core.search import object_search, prompts
 from tests.scenes import make_scene
 
 MUG, APPLE, CAR, LEMON, BLOCK, GLOBE = range(1, 7)
@@ -35,7 +37,7 @@ def test_everything_is_all_objects_without_the_background(scene, text):
     "text", ["nothing", "none", "None of them", "no objects", "not everything", "everything but all"]
 )
 def test_nothing_is_no_object(scene, text):
-    assert found(scene, text) == set() and lookup.is_nothing(lookup.labels_of(scene), text)
+    assert found(scene, text) == set() and object_search.is_nothing(object_search.labels_of(scene), text)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +95,7 @@ def test_leaving_out_what_is_unknown_is_an_error_and_no_selection(scene, text):
 
 def test_the_error_says_what_may_have_been_meant(scene):
     with pytest.raises(errors.ConfigError, match="did you mean 'mug'"):
-        lookup.search(scene, "everything except the bug")
+        object_search.search(scene, "everything except the bug")
 
 
 @pytest.mark.parametrize("text", ["not", "everything but", "all except for ", "without"])
@@ -116,22 +118,26 @@ def test_an_object_with_such_a_name_is_found_by_it(scene, name):
 
 
 def test_words_inside_names_leave_nothing_out():
-    labels = [lookup.Label(1, "butter"), lookup.Label(2, "knot"), lookup.Label(3, "mug without handle")]
+    labels = [
+        object_search.Label(1, "butter"),
+        object_search.Label(2, "knot"),
+        object_search.Label(3, "mug without handle"),
+    ]
     for label in labels:
-        assert [match.object_id for match in lookup.search_labels(labels, label.name)] == [label.object_id]
+        assert [match.object_id for match in object_search.search_labels(labels, label.name)] == [label.object_id]
     phrase = ("a mug without a handle", ["mug", "without", "handle"])
     assert prompts.parse("a mug without a handle") == prompts.Prompt(wanted=(phrase,))
 
 
 def test_unknown_phrases_that_are_left_out_are_asked_of_the_encoder(scene):
-    labels = lookup.labels_of(scene)
-    assert lookup.unknown(labels, "everything but sour things", None) == ["sour things"]
-    assert lookup.not_excluded(labels, "everything but sour things and mug") == ["sour things"]
-    assert lookup.unanswered(labels, "mug and zeppelin but not the car") == ["zeppelin"]
+    labels = object_search.labels_of(scene)
+    assert object_search.unknown(labels, "everything but sour things", None) == ["sour things"]
+    assert object_search.not_excluded(labels, "everything but sour things and mug") == ["sour things"]
+    assert object_search.unanswered(labels, "mug and zeppelin but not the car") == ["zeppelin"]
 
 
 def test_the_command_says_that_no_object_is_asked_for(scene, tmp_path, capsys):
     path = scene_file.write(scene, tmp_path / "scene.r5dgs")
-    assert commands_words.run_query(path, "none")[1] == []
+    assert language.run_query(path, "none")[1] == []
     assert "'none' asks for no object" in capsys.readouterr().out
-    assert len(commands_words.run_query(path, "not the mug")[1]) == len(ALL) - 1
+    assert len(language.run_query(path, "not the mug")[1]) == len(ALL) - 1

@@ -11,23 +11,10 @@ import pytest
 import torch
 
 from r5dgs_core import errors
-from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import (
-    RasterSettings,
-    RasterStats,
-    backends,
-    cpu,
-    cpu_blending,
-    cpu_blending_backward,
-    cpu_projection,
-    cpu_tiles,
-    rasterize,
-    rasterize_splats,
-    splatting,
-    warming,
-)
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.scene import cameras
+from r5dgs_core.raster import RasterSettings, RasterStats, backends, rasterize, rasterize_splats, rasterizer
+from r5dgs_core.raster.cpu import blend, blend_backward, compilation, cpu_backend, projection, tiles
+from r5dgs_core.render import warm_up
+from r5dgs_core.scene import cameras, sh_color
 from tests.splats import camera, draw, relative, splats
 
 # float32 against float64: rounding grows with the number of layers; the largest seen on these scenes is about 3e-6
@@ -222,7 +209,7 @@ def test_rows_are_sorted_by_depth_and_then_by_row_on_any_number_of_threads(seed)
     try:
         for count in (1, 2, 3):
             compilation.set_threads(count)
-            np.testing.assert_array_equal(cpu_tiles.sort_by_depth(depths, radii), expected)
+            np.testing.assert_array_equal(tiles.sort_by_depth(depths, radii), expected)
     finally:
         compilation.set_threads(before)
 
@@ -241,12 +228,12 @@ def test_two_python_threads_may_draw_at_once():
 
 
 def test_every_kernel_is_compiled_once_for_all_inputs():
-    warming.warm_up()
+    warm_up.warm_up()
     for n_channels, background, labels in ((1, None, None), (3, torch.rand(3), torch.arange(50)), (19, None, None)):
         draw(splats(50, n_channels), camera(), "cpu", background, labels=labels)
     kernels = [
-        *(cpu_projection.project, cpu_projection.project_backward, cpu_tiles.sort_part),
-        *(cpu_tiles.count_pairs, cpu_tiles.fill_pairs, cpu_blending.blend, cpu_blending_backward.blend_backward),
+        *(projection.project, projection.project_backward, tiles.sort_part),
+        *(tiles.count_pairs, tiles.fill_pairs, blend.blend, blend_backward.blend_backward),
     ]
     assert {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels} == {
         kernel.py_func.__name__: 1 for kernel in kernels
@@ -327,8 +314,8 @@ def test_the_image_may_be_changed_in_place():
 @pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
 def test_without_gradients_nothing_is_kept_for_them(without, monkeypatch):
     leaves, kept = [t.float().requires_grad_() for t in splats(50, 3)], []
-    original = cpu._forward
-    monkeypatch.setattr(cpu, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
+    original = cpu_backend._forward
+    monkeypatch.setattr(cpu_backend, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
     with without():
         still = rasterize_splats(*leaves, camera()).image
     assert kept[0][0] is None and not still.requires_grad
@@ -462,7 +449,7 @@ def test_a_label_that_cannot_be_counted_is_named():
 
 def gaussians(n=300, k=16, seed=16):
     means, quats, scales, opacities, colors = (t.float() for t in splats(n, 3, seed=seed))
-    sh = torch.cat([spherical_harmonics.rgb_to_dc(colors)[:, None], 0.2 * torch.randn(n, k - 1, 3)], 1)
+    sh = torch.cat([sh_color.rgb_to_dc(colors)[:, None], 0.2 * torch.randn(n, k - 1, 3)], 1)
     return SimpleNamespace(
         means=means, quats=quats, log_scales=scales.log(), opacity_logits=torch.logit(opacities, 1e-4), sh=sh
     )
@@ -473,7 +460,7 @@ def test_colours_come_from_the_harmonics_along_the_line_of_sight(k):
     scene, view = gaussians(k=k), camera()
     directions = scene.means - torch.tensor(view.center, dtype=torch.float32)
     directions = directions / directions.norm(dim=1, keepdim=True)
-    colors = (0.5 + spherical_harmonics.evaluate(scene.sh, directions)).clamp_min(0)
+    colors = (0.5 + sh_color.evaluate(scene.sh, directions)).clamp_min(0)
     expected = rasterize_splats(
         scene.means, scene.quats, scene.log_scales.exp(), scene.opacity_logits.sigmoid(), colors, view
     )
@@ -506,7 +493,7 @@ def test_final_colours_take_the_place_of_the_harmonics():
     shown.sum().backward()
     assert colors.grad.abs().sum() > 0
     torch.testing.assert_close(
-        rasterize(scene, view, colors=splatting.seen_colors(scene, view)).color, rasterize(scene, view).color
+        rasterize(scene, view, colors=rasterizer.seen_colors(scene, view)).color, rasterize(scene, view).color
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from r5dgs_core.raster import RasterSettings, rasterize_splats
-from r5dgs_core.raster.backdrop import Backdrop
+from r5dgs_core.render.static_layer import Backdrop
 from tests.splats import camera, splats
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.model import spherical_harmonics
-from r5dgs_core.raster import backends, harmonics, rasterize, splatting
-from r5dgs_core.raster import compile as compilation
+from r5dgs_core.raster import backends, rasterize, rasterizer, shade
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 from tests import scenes, splats
 
@@ -51,8 +51,8 @@ def assert_near(found, expected, tolerance, name=""):
 def test_colours_and_every_gradient_are_those_of_plain_autograd(n, count):
     tensors, where = draw(n, count)
     wide = {name: value.double() for name, value in tensors.items()}
-    value, gradients = differentiate(lambda **t: harmonics.seen_colors(**t, **where), tensors)
-    expected, wanted = differentiate(lambda **t: harmonics.seen_colors(**t, **where), wide)
+    value, gradients = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)
+    expected, wanted = differentiate(lambda **t: shade.seen_colors(**t, **where), wide)
     if n > 100:
         assert (expected == 0).any() and (expected > 1).any()  # clamped below, not above
     assert_near(value, expected, 2e-6)
@@ -65,15 +65,13 @@ def test_the_gradient_along_the_line_of_sight_is_zero_and_across_it_a_difference
     tensors, _ = draw(50, count)
     means = (tensors["means"].double() + torch.tensor([0, 9.0, 0])).requires_grad_()
     sh = tensors["sh"]
-    harmonics.seen_colors(means.float(), sh, EYE).sum().backward()
+    shade.seen_colors(means.float(), sh, EYE).sum().backward()
     offsets = means.detach() - torch.from_numpy(EYE)
     assert (means.grad * offsets).sum(-1).abs().max() < 1e-5 * means.grad.abs().max() * offsets.norm(dim=-1).max()
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[axis] = 1e-5
-        ahead, behind = (
-            harmonics.seen_colors(means.detach() + side * step, sh.double(), EYE).sum(-1) for side in (1, -1)
-        )
+        ahead, behind = (shade.seen_colors(means.detach() + side * step, sh.double(), EYE).sum(-1) for side in (1, -1))
         torch.testing.assert_close((ahead - behind) / 2e-5, means.grad[:, axis].double(), rtol=1e-4, atol=1e-5)
 
 
@@ -83,9 +81,9 @@ def test_coefficients_may_come_in_two_parts(count):
     means, factor = tensors["means"], tensors["factor"]
     parts = {"sh": tensors["sh"][:, :1], "rest": tensors["sh"][:, 1:]}
     whole, gradients = differentiate(
-        lambda sh: harmonics.seen_colors(means, sh, factor=factor, **where), {"sh": tensors["sh"]}
+        lambda sh: shade.seen_colors(means, sh, factor=factor, **where), {"sh": tensors["sh"]}
     )
-    value, of_parts = differentiate(lambda **t: harmonics.seen_colors(means, factor=factor, **t, **where), parts)
+    value, of_parts = differentiate(lambda **t: shade.seen_colors(means, factor=factor, **t, **where), parts)
     assert torch.equal(value, whole)
     assert torch.equal(torch.cat([of_parts["sh"], of_parts["rest"]], 1), gradients["sh"])
 
@@ -96,8 +94,8 @@ def test_results_do_not_depend_on_the_number_of_threads():
     try:
         for threads in (1, 2, 3):
             compilation.set_threads(threads)
-            value, gradients = differentiate(lambda **t: harmonics.seen_colors(**t, **where), tensors)
-            sky = harmonics.sky(tensors["sh"][0].numpy(), scenes.orbit_camera(0.3, 90, 300))
+            value, gradients = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)
+            sky = shade.sky(tensors["sh"][0].numpy(), scenes.orbit_camera(0.3, 90, 300))
             results.append([value, *gradients.values(), torch.from_numpy(sky)])
     finally:
         compilation.set_threads(before)
@@ -110,10 +108,10 @@ def test_a_gaussian_at_the_eye_shows_degree_zero_and_sends_no_gradient_to_its_ce
     tensors, _ = draw(40, 16)
     eye = tensors["means"][3].double().numpy()
     colors, gradients = differentiate(
-        lambda means, sh: harmonics.seen_colors(means, sh, eye, fused=fused),
+        lambda means, sh: shade.seen_colors(means, sh, eye, fused=fused),
         {name: tensors[name] for name in ("means", "sh")},
     )
-    torch.testing.assert_close(colors[3], spherical_harmonics.dc_to_rgb(tensors["sh"][3, 0]).clamp_min(0))
+    torch.testing.assert_close(colors[3], sh_color.dc_to_rgb(tensors["sh"][3, 0]).clamp_min(0))
     assert (gradients["means"][3] == 0).all() and (gradients["sh"][3, 1:] == 0).all()
     assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
     assert (gradients["means"][4] != 0).any()
@@ -124,8 +122,8 @@ def test_far_from_the_origin_colours_are_those_near_it_to_the_bit():
     means = (4 * tensors["means"]).round() / 4  # a grid that float32 still has at 2^20
     far = means + 2.0**20
     assert torch.equal(far - 2.0**20, means)
-    near = harmonics.seen_colors(means, tensors["sh"], EYE)
-    assert torch.equal(harmonics.seen_colors(far, tensors["sh"], EYE + 2.0**20), near)
+    near = shade.seen_colors(means, tensors["sh"], EYE)
+    assert torch.equal(shade.seen_colors(far, tensors["sh"], EYE + 2.0**20), near)
 
 
 @pytest.mark.parametrize("fused", [True, False])
@@ -135,14 +133,14 @@ def test_what_is_clamped_sends_no_gradient(count, fused):
     dark = tensors["sh"].clone()
     dark[:, 0, 1] -= 50
     colors, gradients = differentiate(
-        lambda means, sh: 0 * means.sum() + harmonics.seen_colors(means, sh, EYE, fused=fused),
+        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, fused=fused),
         {"means": tensors["means"], "sh": dark},
     )
     assert (colors[:, 1] == 0).all() and (gradients["sh"][..., 1] == 0).all()
     assert (gradients["sh"][..., 0] != 0).any()
     dark[:, 0] -= 50
     _, gradients = differentiate(
-        lambda means, sh: 0 * means.sum() + harmonics.seen_colors(means, sh, EYE, fused=fused),
+        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, fused=fused),
         {"means": tensors["means"], "sh": dark},
     )
     assert (gradients["means"] == 0).all()
@@ -150,7 +148,7 @@ def test_what_is_clamped_sends_no_gradient(count, fused):
 
 def test_no_gaussians_have_no_colours_and_no_gradients():
     tensors, where = draw(0, 9)
-    colors, gradients = differentiate(lambda **t: harmonics.seen_colors(**t, **where), tensors)
+    colors, gradients = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)
     assert colors.shape == (0, 3)
     assert {name: tuple(g.shape) for name, g in gradients.items()} == {"means": (0, 3), "sh": (0, 9, 3), "factor": (0,)}
 
@@ -163,7 +161,7 @@ def test_gradients_through_the_rasterizer_are_those_of_plain_colours(count):
 
     def render(fused, **named):
         gaussians = SimpleNamespace(**named, opacity_logits=torch.logit(opacities, 1e-4))
-        colors = None if fused else splatting.seen_colors(gaussians, view, fused=False)
+        colors = None if fused else rasterizer.seen_colors(gaussians, view, fused=False)
         return rasterize(gaussians, view, colors=colors).color
 
     value, gradients = differentiate(lambda **t: render(True, **t), tensors)
@@ -189,12 +187,12 @@ def test_a_coefficient_that_is_not_a_number_is_an_error_and_not_a_black_dot():
 def test_what_the_caller_does_to_its_poses_after_a_call_does_not_reach_the_gradients(kind):
     tensors, where = draw(40, 4)
     where = {name: np.ascontiguousarray(value) for name, value in where.items()}
-    expected = differentiate(lambda **t: harmonics.seen_colors(**t, **where), tensors)[1]
+    expected = differentiate(lambda **t: shade.seen_colors(**t, **where), tensors)[1]
     if kind == "tensor":
         where["pose_ids"] = torch.from_numpy(where["pose_ids"])
 
     def shade_and_forget(**named):
-        colors = harmonics.seen_colors(**named, **where)
+        colors = shade.seen_colors(**named, **where)
         for value in where.values():
             value[:] = 0
         return colors
@@ -220,7 +218,7 @@ def test_what_the_caller_does_to_its_poses_after_a_call_does_not_reach_the_gradi
 def test_what_does_not_fit_is_refused(change, message):
     tensors, where = draw(5, 4)
     with pytest.raises(ValueError, match=message):
-        harmonics.seen_colors(**{**tensors, **where, **change})
+        shade.seen_colors(**{**tensors, **where, **change})
 
 
 def test_degree_zero_needs_no_kernel_and_other_tensors_take_none(monkeypatch):
@@ -230,12 +228,12 @@ def test_degree_zero_needs_no_kernel_and_other_tensors_take_none(monkeypatch):
     monkeypatch.setattr(compilation, "run", refuse)
     constant, _ = draw(5, 1)
     expected = (0.5 + 0.28209479177387814 * constant["sh"][:, 0]).clamp_min(0) * constant["factor"][:, None]
-    torch.testing.assert_close(harmonics.seen_colors(**constant, eyes=EYE), expected)
+    torch.testing.assert_close(shade.seen_colors(**constant, eyes=EYE), expected)
     tensors, where = draw(5, 4)
-    harmonics.seen_colors(**{name: value.double() for name, value in tensors.items()}, **where)
-    harmonics.seen_colors(**tensors, **where, fused=False)
+    shade.seen_colors(**{name: value.double() for name, value in tensors.items()}, **where)
+    shade.seen_colors(**tensors, **where, fused=False)
     with pytest.raises(AssertionError, match="a kernel ran"):
-        harmonics.seen_colors(**tensors, **where)
+        shade.seen_colors(**tensors, **where)
 
 
 @pytest.mark.parametrize("count", [1, *COUNTS])
@@ -244,20 +242,20 @@ def test_the_sky_is_the_harmonics_along_each_ray(count, monkeypatch):
     sh[0] = 0
     intrinsics = np.array([[40.0, 3.0, 11.0], [0, 55.0, 70.0], [0, 0, 1]])
     for camera in (scenes.orbit_camera(0.7, 60, 130), Camera(70, 30, intrinsics, scenes.orbit_camera(2.0).T_cam_world)):
-        image = harmonics.sky(sh, camera)
+        image = shade.sky(sh, camera)
         assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.float32
         assert count == 1 or ((image == 0).any() and (image == 1).any())
         with monkeypatch.context() as without_numba:
             without_numba.setattr(backends, "numba_is_there", lambda: False)
-            np.testing.assert_allclose(image, harmonics.sky(sh, camera), atol=1e-6)
+            np.testing.assert_allclose(image, shade.sky(sh, camera), atol=1e-6)
 
 
 def test_without_numba_scenes_keep_their_colours(monkeypatch):
-    from r5dgs_core.raster import scene_render
-    from r5dgs_core.scene import playback
+    from r5dgs_core.playback import scene_player
+    from r5dgs_core.render import scene_renderer
 
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
-    posed = scene_render.pose_frame(scene, playback.frame(scene, 1.1))
-    fused = scene_render.colors(posed, camera)
+    posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, 1.1))
+    fused = scene_renderer.colors(posed, camera)
     monkeypatch.setattr(backends, "numba_is_there", lambda: False)
-    np.testing.assert_allclose(scene_render.colors(posed, camera), fused, atol=2e-6)
+    np.testing.assert_allclose(scene_renderer.colors(posed, camera), fused, atol=2e-6)

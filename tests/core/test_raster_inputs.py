@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import RasterSettings, cpu_projection, rasterize, rasterize_splats
+from r5dgs_core.raster import RasterSettings, rasterize, rasterize_splats
+from r5dgs_core.raster.cpu import projection
 from r5dgs_core.scene import cameras
 from tests.splats import camera, splats
 
@@ -105,7 +106,7 @@ def test_where_nothing_is_seen_there_is_no_id_even_if_any_alpha_were_enough(back
 
 
 def test_boxes_can_count_the_tiles_of_the_largest_image():
-    assert cpu_projection.MOST_TILES * cpu_projection.TILE >= cameras.MOST_PIXELS
+    assert projection.MOST_TILES * projection.TILE >= cameras.MOST_PIXELS
 
 
 # Gaussians

@@ -4,19 +4,19 @@ import numba
 import numpy as np
 import pytest
 
-from r5dgs_core.raster import doubles, lanes, vectors
+from r5dgs_core.raster.cpu.simd import float32x16, float64x8, vectors
 
 
 @numba.njit
 def apply_exp2(values, result):
-    for at in range(0, len(values), lanes.LANES):
-        lanes.store(result, at, lanes.exp2(lanes.load(values, at)))
+    for at in range(0, len(values), float32x16.LANES):
+        float32x16.store(result, at, float32x16.exp2(float32x16.load(values, at)))
 
 
 @numba.njit
 def apply_reciprocal(values, result):
-    for at in range(0, len(values), lanes.LANES):
-        lanes.store(result, at, lanes.reciprocal(lanes.load(values, at)))
+    for at in range(0, len(values), float32x16.LANES):
+        float32x16.store(result, at, float32x16.reciprocal(float32x16.load(values, at)))
 
 
 def test_reciprocal_is_good_to_float32_rounding():
@@ -28,29 +28,34 @@ def test_reciprocal_is_good_to_float32_rounding():
 
 @numba.njit
 def choose(a, b, c, result):
-    x, y, z = lanes.load(a, 0), lanes.load(b, 0), lanes.load(c, 0)
-    condition = (x >= y) & ~(lanes.splat(np.float32(0)) >= z) | (y > lanes.broadcast(a, 3))
-    lanes.store(
+    x, y, z = float32x16.load(a, 0), float32x16.load(b, 0), float32x16.load(c, 0)
+    condition = (x >= y) & ~(float32x16.splat(np.float32(0)) >= z) | (y > float32x16.broadcast(a, 3))
+    float32x16.store(
         result, 0, vectors.select(condition, vectors.fma(x, y, z), vectors.smaller(x, y) - vectors.larger(y, z))
     )
     bits = vectors.bits_of(condition)
-    lanes.store(result, lanes.LANES, vectors.select(lanes.mask_of(bits), -x, y / x))
+    float32x16.store(result, float32x16.LANES, vectors.select(float32x16.mask_of(bits), -x, y / x))
     return vectors.any_of(condition), vectors.unlikely(vectors.any_of(condition)), bits
 
 
 @numba.njit
 def add_up(values, result):
-    zero = lanes.splat(np.float32(0))
-    a, b, c, d = lanes.load(values, 0), lanes.load(values, 16), lanes.load(values, 32), lanes.load(values, 48)
+    zero = float32x16.splat(np.float32(0))
+    a, b, c, d = (
+        float32x16.load(values, 0),
+        float32x16.load(values, 16),
+        float32x16.load(values, 32),
+        float32x16.load(values, 48),
+    )
     vectors = (a, b, c, d, a + b, a - b, a * b, zero, c + d, c - d, c * d, b + c, b - c, b * c, a + d, a - d)
-    lanes.store(result, 0, lanes.totals(vectors))
+    float32x16.store(result, 0, float32x16.totals(vectors))
 
 
 @numba.njit
 def copy_blocks(image, other, result, other_result, width):
-    lanes.store_rows(result, 5, width, lanes.load_rows(image, 5, width))
-    three = lanes.load_rows_of_three(other, 6, 3 * width)
-    lanes.store_rows_of_three(other_result, 6, 3 * width, three[0], three[1] + three[1], three[2])
+    float32x16.store_rows(result, 5, width, float32x16.load_rows(image, 5, width))
+    three = float32x16.load_rows_of_three(other, 6, 3 * width)
+    float32x16.store_rows_of_three(other_result, 6, 3 * width, three[0], three[1] + three[1], three[2])
 
 
 @numba.njit
@@ -74,24 +79,24 @@ def test_lanes_choose_like_numpy():
     random = np.random.default_rng(0)
     seen = set()
     for shift in (-30.0, 0.0):
-        a, b, c = (random.normal(size=lanes.LANES).astype(np.float32) for _ in range(3))
+        a, b, c = (random.normal(size=float32x16.LANES).astype(np.float32) for _ in range(3))
         b[b > a[3] + shift] = a[3] + shift
         a[4:] += np.float32(shift)
-        result = np.empty(2 * lanes.LANES, np.float32)
+        result = np.empty(2 * float32x16.LANES, np.float32)
         any_holds, same, bits = choose(a, b, c, result)
         condition = (a >= b) & (c > 0) | (b > a[3])
         expected = np.where(condition, a.astype(np.float64) * b + c, np.minimum(a, b) - np.maximum(b, c))
-        np.testing.assert_allclose(result[: lanes.LANES], expected, rtol=1e-6, atol=1e-6)
-        np.testing.assert_array_equal(result[lanes.LANES :], np.where(condition, -a, b / a))
+        np.testing.assert_allclose(result[: float32x16.LANES], expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(result[float32x16.LANES :], np.where(condition, -a, b / a))
         assert any_holds == same == condition.any()
-        assert bits == (condition * 2 ** np.arange(lanes.LANES)).sum()
+        assert bits == (condition * 2 ** np.arange(float32x16.LANES)).sum()
         seen.add(bits)
     assert len(seen) == 2
 
 
 def test_totals_are_the_sums_of_each_vector():
     values = np.random.default_rng(1).normal(size=64).astype(np.float32)
-    result = np.empty(lanes.LANES, np.float32)
+    result = np.empty(float32x16.LANES, np.float32)
     add_up(values, result)
     a, b, c, d = values.astype(np.float64).reshape(4, 16)
     vectors = (a, b, c, d, a + b, a - b, a * b, 0 * a, c + d, c - d, c * d, b + c, b - c, b * c, a + d, a - d)
@@ -118,14 +123,14 @@ def test_the_lowest_bit_is_found(bit):
 
 @numba.njit
 def work_on_doubles(table, bases, result, rows, wide):
-    a, b = doubles.column(table, 2, 8, 3, 1), doubles.column(table, 2, 8, 3, 2)
-    root, third = doubles.sqrt(a), doubles.floor(a * doubles.spread(3.0))
-    columns = (a, b, root, third, doubles.log2(a), vectors.select(a > b, a, b), doubles.entry(bases, 1), -a)
-    doubles.store_table(rows, 1, columns)
-    doubles.set_column(result, 0, 2, 1, root)
-    low, high = doubles.widen(lanes.load(table, 0))
-    doubles.store_doubles(wide, 0, low)
-    doubles.store_doubles(wide, 8, high)
+    a, b = float64x8.column(table, 2, 8, 3, 1), float64x8.column(table, 2, 8, 3, 2)
+    root, third = float64x8.sqrt(a), float64x8.floor(a * float64x8.spread(3.0))
+    columns = (a, b, root, third, float64x8.log2(a), vectors.select(a > b, a, b), float64x8.entry(bases, 1), -a)
+    float64x8.store_table(rows, 1, columns)
+    float64x8.set_column(result, 0, 2, 1, root)
+    low, high = float64x8.widen(float32x16.load(table, 0))
+    float64x8.store_doubles(wide, 0, low)
+    float64x8.store_doubles(wide, 8, high)
 
 
 def test_doubles_read_and_write_columns_and_tables():
@@ -143,9 +148,9 @@ def test_doubles_read_and_write_columns_and_tables():
 
 @numba.njit
 def logarithms(values, result):
-    for at in range(0, len(values), doubles.DOUBLES):
-        vector = doubles.column(values, at, len(values) - 1, 1, 0)
-        doubles.store_doubles(result, at, doubles.log2(vector))
+    for at in range(0, len(values), float64x8.DOUBLES):
+        vector = float64x8.column(values, at, len(values) - 1, 1, 0)
+        float64x8.store_doubles(result, at, float64x8.log2(vector))
 
 
 def test_log2_is_good_to_float64_rounding():

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import RasterSettings, backdrop, rasterize_splats, scene_render, stage
-from r5dgs_core.raster.scene_render import Instance
-from r5dgs_core.scene import playback
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster import RasterSettings, rasterize_splats
+from r5dgs_core.render import incremental_renderer, scene_renderer, static_layer
+from r5dgs_core.render.scene_renderer import Instance
 from tests import scenes
 from tests.core.test_scene_render import group_instances, matrix
 
@@ -25,35 +26,35 @@ def scene(request):
 def made(monkeypatch):
     """Counts the backdrops that are made."""
     count = []
-    original = backdrop.Backdrop.__init__
+    original = static_layer.Backdrop.__init__
 
     def counted(self, *arguments, **options):
         count.append(1)
         original(self, *arguments, **options)
 
-    monkeypatch.setattr(backdrop.Backdrop, "__init__", counted)
+    monkeypatch.setattr(static_layer.Backdrop, "__init__", counted)
     return count
 
 
 def assert_shows(theatre, scene, instances, camera, sky=True):
-    found = theatre.render(instances, camera, sky=stage.Sky() if sky else None)
-    posed = scene_render.pose_instances(scene, instances)
+    found = theatre.render(instances, camera, sky=incremental_renderer.Sky() if sky else None)
+    posed = scene_renderer.pose_instances(scene, instances)
     owners = np.repeat(np.arange(len(instances), dtype=np.int32), [instance.count for instance in instances])
     posed = dataclasses.replace(posed, object_ids=owners)
-    expected = scene_render.render_frame(scene, posed, camera, background="scene" if sky else None)
+    expected = scene_renderer.render_frame(scene, posed, camera, background="scene" if sky else None)
     for name in ("color", "alpha", "depth", "ids"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
 def test_playing_shows_every_frame_and_draws_what_stands_still_once(scene, made):
-    theatre = stage.Stage(scene)
+    theatre = incremental_renderer.Stage(scene)
     for t in (0.0, 0.1, 0.2, 0.9, 1.4):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
     assert len(made) == 1
 
 
 def test_another_camera_sky_or_selection_starts_again(scene, made):
-    theatre = stage.Stage(scene)
+    theatre = incremental_renderer.Stage(scene)
     for t in (0.0, 0.3, 0.5):
         assert_shows(theatre, scene, group_instances(scene, t), CAMERA)
     assert_shows(theatre, scene, group_instances(scene, 0.5), OTHER)
@@ -65,7 +66,7 @@ def test_another_camera_sky_or_selection_starts_again(scene, made):
 
 
 def test_what_begins_to_move_later_is_taken_out_of_what_stands_still(scene, made):
-    theatre, instances = stage.Stage(scene), group_instances(scene, 0.4)
+    theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
     for moving in ((), (1,), (1, 2), (2,), ()):
         shown = []
         for i, instance in enumerate(instances):
@@ -77,7 +78,7 @@ def test_what_begins_to_move_later_is_taken_out_of_what_stands_still(scene, made
 
 
 def test_where_almost_all_moves_everything_is_drawn(scene, made):
-    theatre = stage.Stage(scene)
+    theatre = incremental_renderer.Stage(scene)
     for shift in (0.0, 0.1, 0.2):
         matrix = np.eye(4)
         matrix[0, 3] = shift
@@ -91,7 +92,7 @@ def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
     above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
     instances = group_instances(flat, 1.0)
     instances = [Instance(one.start, one.count, np.eye(4)) for one in instances]
-    theatre = stage.Stage(flat)
+    theatre = incremental_renderer.Stage(flat)
     for shift in (0.0, 0.1, 0.2):
         shown = []
         for i, instance in enumerate(instances):
@@ -103,7 +104,7 @@ def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
 
 
 def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
-    theatre, instances = stage.Stage(scene), group_instances(scene, 0.4)
+    theatre, instances = incremental_renderer.Stage(scene), group_instances(scene, 0.4)
     theatre.render(instances, CAMERA)
     theatre.render(group_instances(scene, 0.5), CAMERA)
     last = len(instances) - 1
@@ -133,20 +134,20 @@ def together(pair, t, tint=None):
 
 def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
     lit, plain, world = pair
-    theatre = stage.Stage([lit, plain])
+    theatre = incremental_renderer.Stage([lit, plain])
     for t in (0.2, 0.5, 0.8):
         shown = together(pair, t)
-        found = theatre.render(shown, CAMERA, sky=stage.Sky(1, world))
+        found = theatre.render(shown, CAMERA, sky=incremental_renderer.Sky(1, world))
         parts = [
-            scene_render.pose_instances(scene, [dataclasses.replace(one, scene=0) for one in shown if one.scene == k])
+            scene_renderer.pose_instances(scene, [dataclasses.replace(one, scene=0) for one in shown if one.scene == k])
             for k, scene in enumerate((lit, plain))
         ]
-        gaussians = [scene_render.PosedGaussians(posed) for posed in parts]
+        gaussians = [scene_renderer.PosedGaussians(posed) for posed in parts]
         inputs = [torch.cat([getattr(one, name) for one in gaussians]) for name in ("means", "quats", "scales")]
         opacities = torch.cat([one.opacities for one in gaussians])
-        colors = torch.cat([scene_render.tensor(scene_render.colors(posed, CAMERA)) for posed in parts])
+        colors = torch.cat([scene_renderer.tensor(scene_renderer.colors(posed, CAMERA)) for posed in parts])
         eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ world)
-        behind = scene_render.tensor(scene_render.sky(plain, eye))
+        behind = scene_renderer.tensor(scene_renderer.sky(plain, eye))
         settings = RasterSettings(near_plane=0.7 * lit.near_plane)
         expected = rasterize_splats(*inputs, opacities, colors, CAMERA, behind, settings=settings)
         # Other orders of rows, and of the operations behind a padded degree.
@@ -156,9 +157,9 @@ def test_two_scenes_are_sorted_by_depth_in_one_picture(pair, made):
 
 def test_a_light_turns_with_its_world_and_not_with_what_moves_in_it(pair):
     lit, _, world = pair
-    still = scene_render.pose_instances(lit, group_instances(lit, 0.3))
+    still = scene_renderer.pose_instances(lit, group_instances(lit, 0.3))
     turned = [Instance(one.start, one.count, world @ one.matrix, 0, world) for one in group_instances(lit, 0.3)]
-    found = scene_render.pose_instances(lit, turned)
+    found = scene_renderer.pose_instances(lit, turned)
     np.testing.assert_allclose(found.shading_factor, still.shading_factor, atol=1e-6)
     assert np.abs(still.shading_factor - 1).max() > 1e-2
 
@@ -171,19 +172,19 @@ def test_a_tint_is_that_of_the_harmonics(degree):
     sh[:, 0] = (tint * (0.5 + c0 * scene.sh[:, 0]) - 0.5) / c0
     painted = dataclasses.replace(scene, sh=sh.astype(np.float32))
     n = len(scene.means)
-    one = stage.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
-    other = stage.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
+    one = incremental_renderer.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
+    other = incremental_renderer.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
     np.testing.assert_allclose(one.color.numpy(), other.color.numpy(), atol=1e-5)
 
 
 def test_owners_are_the_instances_in_front_whichever_of_them_move(pair, made):
-    theatre = stage.Stage(pair[:2])
+    theatre = incremental_renderer.Stage(pair[:2])
     shown = [*together(pair, 0.4), *together(pair, 0.4, (1.0, 0.2, 0.2))[:2]]
     for t in (0.4, 0.5, 0.6):
         moved = together(pair, t)
         shown = [*moved[:3], *shown[3:]]
         found = theatre.render(shown, CAMERA)
-        anew = stage.Stage(pair[:2]).render(shown, CAMERA)
+        anew = incremental_renderer.Stage(pair[:2]).render(shown, CAMERA)
         assert torch.equal(found.ids, anew.ids) and torch.equal(found.color, anew.color)
     assert len(made) >= 1 and found.ids.max() > 2 and found.ids.min() == -1
 
@@ -191,7 +192,7 @@ def test_owners_are_the_instances_in_front_whichever_of_them_move(pair, made):
 def test_another_tint_or_near_limit_is_another_picture(pair):
     lit = pair[0]
     whole, red = Instance(0, 500, np.eye(4)), Instance(0, 500, np.eye(4), tint=(1.0, 0.0, 0.0))
-    theatre = stage.Stage(lit)
+    theatre = incremental_renderer.Stage(lit)
     for _ in range(2):
         plain = theatre.render([whole], CAMERA)
     tinted = theatre.render([red], CAMERA, sky=None)
@@ -206,14 +207,14 @@ def test_a_sky_turns_with_its_world(pair):
     scene = dataclasses.replace(lit, background_sh=sky)
     rigid = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 1.0)
     eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ rigid)
-    found = stage.Stage(scene).render([], CAMERA, sky=stage.Sky(0, rigid))
-    np.testing.assert_allclose(found.color.numpy(), scene_render.sky(scene, eye), atol=1e-5)
-    scaled = stage.Stage(scene).render([], CAMERA, sky=stage.Sky(0, world))
+    found = incremental_renderer.Stage(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, rigid))
+    np.testing.assert_allclose(found.color.numpy(), scene_renderer.sky(scene, eye), atol=1e-5)
+    scaled = incremental_renderer.Stage(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, world))
     np.testing.assert_allclose(scaled.color.numpy(), found.color.numpy(), atol=1e-5)
 
 
 def test_no_scene_at_all_leaves_black():
-    found = stage.Stage([]).render([], CAMERA, sky=None)
+    found = incremental_renderer.Stage([]).render([], CAMERA, sky=None)
     assert found.color.abs().max() == 0 and found.ids.max() == -1
 
 
@@ -228,7 +229,7 @@ def test_no_scene_at_all_leaves_black():
 )
 def test_impossible_instances_of_several_scenes_are_refused(pair, instance, message):
     with pytest.raises(ValueError, match=f"instance 0: .*{message}"):
-        stage.Stage(pair[:2]).render([instance], CAMERA)
+        incremental_renderer.Stage(pair[:2]).render([instance], CAMERA)
 
 
 def bent_instances(scene, t):
@@ -252,11 +253,11 @@ def bending(request):
 
 @pytest.mark.parametrize("t", [-0.1, 0.13, 0.4, scenes.T_MAX, 0.9])
 def test_what_bends_is_bent_as_in_playback(bending, t):
-    found = stage.Stage(bending).render(bent_instances(bending, t), CAMERA)
-    expected = scene_render.render_frame(bending, playback.frame(bending, t), CAMERA)
+    found = incremental_renderer.Stage(bending).render(bent_instances(bending, t), CAMERA)
+    expected = scene_renderer.render_frame(bending, scene_player.frame(bending, t), CAMERA)
     np.testing.assert_allclose(found.color.numpy(), expected.color.numpy(), atol=5e-3)  # a cut-off may fall differently
     if 0 < t < scenes.T_MAX:
-        stiff = stage.Stage(bending).render(group_instances(bending, t), CAMERA)
+        stiff = incremental_renderer.Stage(bending).render(group_instances(bending, t), CAMERA)
         assert (stiff.color - expected.color).abs().max() > 0.05
 
 
@@ -266,17 +267,17 @@ def test_what_bends_in_a_moved_world_is_the_same_picture(bending):
         Instance(one.start, one.count, world @ one.matrix, 0, world, t=0.2) for one in bent_instances(bending, 0.2)
     ]
     eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ np.linalg.inv(world))
-    found = stage.Stage(bending).render(shown, eye, sky=stage.Sky(0, world))
-    expected = stage.Stage(bending).render(bent_instances(bending, 0.2), CAMERA)
+    found = incremental_renderer.Stage(bending).render(shown, eye, sky=incremental_renderer.Sky(0, world))
+    expected = incremental_renderer.Stage(bending).render(bent_instances(bending, 0.2), CAMERA)
     np.testing.assert_allclose(found.color.numpy(), expected.color.numpy(), atol=5e-3)
 
 
 def test_what_bends_moves_and_the_rest_is_kept(bending, made):
-    theatre = stage.Stage(bending)
+    theatre = incremental_renderer.Stage(bending)
     for t in (0.1, 0.2, 0.3):
         shown = [dataclasses.replace(one, matrix=np.eye(4)) for one in bent_instances(bending, t)]
         found = theatre.render(shown, CAMERA)
-        anew = stage.Stage(bending).render(shown, CAMERA)
+        anew = incremental_renderer.Stage(bending).render(shown, CAMERA)
         assert torch.equal(found.color, anew.color) and torch.equal(found.ids, anew.ids)
 
 
@@ -286,16 +287,16 @@ def test_depths_may_count_from_before_a_far_camera(pair):
     eye = dataclasses.replace(CAMERA, intrinsics=CAMERA.intrinsics @ np.diag([far / 4, far / 4, 1.0]))
     eye = dataclasses.replace(eye, T_cam_world=CAMERA.T_cam_world + np.array([0, 0, 0, far]) * np.eye(4)[2][:, None])
     parts = [Instance(0, 400, np.eye(4)), Instance(400, 100, np.eye(4))]
-    theatre = stage.Stage(lit)
+    theatre = incremental_renderer.Stage(lit)
     for shift in (0.0, 0.1, 0.2):
         parts[1].matrix[0, 3] = shift
         found = theatre.render(parts, eye, distance=far)
-        plain = stage.Stage(lit).render(parts, eye)
+        plain = incremental_renderer.Stage(lit).render(parts, eye)
         assert torch.equal(found.color, plain.color) and torch.equal(found.ids, plain.ids)
         seen = found.alpha > 0
         np.testing.assert_allclose(found.depth[seen], plain.depth[seen] - far, atol=0.02)  # float32 at 1e4
         assert (found.depth[~seen] == 0).all() and seen.any()
-        depths = scene_render.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
+        depths = scene_renderer.pose_instances(lit, parts).means @ CAMERA.T_cam_world[2, :3] + CAMERA.T_cam_world[2, 3]
         assert depths.min() - 1e-4 < found.depth[seen].min() and found.depth[seen].max() < depths.max() + 1e-4
 
 
@@ -304,10 +305,10 @@ def test_many_stretches_are_their_instances(bending, t):
     world = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2))
     starts = [*range(0, 300, 7), *range(20, 100, 5)]
     stretches = [Instance(start, 4, world, 0, world, (0.5, 1.0, 1.0), t) for start in starts]
-    found = scene_render.pose_instances(bending, stretches)
-    parts = [scene_render.pose_instances(bending, [one]) for one in stretches]
+    found = scene_renderer.pose_instances(bending, stretches)
+    parts = [scene_renderer.pose_instances(bending, [one]) for one in stretches]
     for name in ("means", "quats", "log_scales", "shading_factor", "sh", "object_ids"):
         expected = np.concatenate([getattr(part, name) for part in parts])
         np.testing.assert_allclose(getattr(found, name), expected, atol=1e-6, err_msg=name)
-    expected = np.concatenate([scene_render.colors(part, CAMERA) for part in parts])
-    np.testing.assert_allclose(scene_render.colors(found, CAMERA), expected, atol=1e-5)
+    expected = np.concatenate([scene_renderer.colors(part, CAMERA) for part in parts])
+    np.testing.assert_allclose(scene_renderer.colors(found, CAMERA), expected, atol=1e-5)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.report import labels, report_rows, turns
-from r5dgs_core.report.report_rows import Row
+from r5dgs_core.error_vs_time import report_rows, timing
+from r5dgs_core.error_vs_time.report_rows import Row
+from r5dgs_core.evaluation import label_placement
 
 SHAPE = ("task", "mode", "method", "setting", "error_kind", "error", "ms", "pareto")
 
@@ -79,19 +80,19 @@ def test_spread_is_median_quartiles_and_worst():
 
 
 def test_turns_go_forth_and_back_over_all_calls(monkeypatch):
-    monkeypatch.setattr(turns, "SAMPLE_MS", 0.0)
+    monkeypatch.setattr(timing, "SAMPLE_MS", 0.0)
     seen = []
-    times = turns.take({name: lambda name=name: seen.append(name) for name in "abc"}, 3)
+    times = timing.take({name: lambda name=name: seen.append(name) for name in "abc"}, 3)
     assert "".join(seen) == "aabbcc" + "abc" + "cba" + "abc"  # two calls each to compile and to see how long one is
     assert set(times) == set("abc") and all(
         (np.diff(t.wall) >= 0).all() and (t.wall >= 0).all() for t in times.values()
     )
     with pytest.raises(ValueError, match="rounds"):
-        turns.take({}, 0)
+        timing.take({}, 0)
 
 
 def test_times_add_up_and_scale_and_one_clock_is_that_of_the_rows():
-    one, two = (turns.Times(k * np.array([1.0, 2, 3]), k * np.array([4.0, 5, 6])) for k in (1, 2))
+    one, two = (timing.Times(k * np.array([1.0, 2, 3]), k * np.array([4.0, 5, 6])) for k in (1, 2))
     columns = (one + two).scaled(0.5).columns("cpu")
     assert columns == {"ms": 7.5, "ms_low": 6.0, "ms_high": 9.0, "ms_wall": 3.0, "ms_cpu": 7.5}
     assert one.columns()["ms"] == one.ms() == 2.0 and one.ms("cpu") == 5.0
@@ -103,10 +104,13 @@ def test_names_never_overlap_nor_hide_a_point_nor_leave_the_frame(seed, count):
     points, sizes = rng.uniform(20, 380, (count, 2)), rng.uniform([10, 8], [90, 14], (count, 2))
     markers = np.concatenate([points - 3, points + 3], axis=1)
     frame = np.array([0, 0, 400, 400.0])
-    boxes = labels.place(points, sizes, frame, markers)
+    boxes = label_placement.place(points, sizes, frame, markers)
     kept = np.array([box for box in boxes if box is not None]).reshape(-1, 4)
     for i, box in enumerate(kept):
-        assert not labels.overlaps(box, np.delete(kept, i, axis=0)).any() and not labels.overlaps(box, markers).any()
+        assert (
+            not label_placement.overlaps(box, np.delete(kept, i, axis=0)).any()
+            and not label_placement.overlaps(box, markers).any()
+        )
         assert (box[:2] >= frame[:2]).all() and (box[2:] <= frame[2:]).all()
     for box, size in zip(boxes, sizes, strict=True):
         if box is not None:
@@ -115,4 +119,4 @@ def test_names_never_overlap_nor_hide_a_point_nor_leave_the_frame(seed, count):
 
 def test_a_name_that_no_place_is_left_for_is_none():
     point, size = np.array([[10.0, 10.0]]), np.array([[50.0, 10.0]])
-    assert labels.place(point, size, np.array([0, 0, 20, 20.0]), np.zeros((0, 4))) == [None]
+    assert label_placement.place(point, size, np.array([0, 0, 20, 20.0]), np.zeros((0, 4))) == [None]

@@ -8,23 +8,26 @@ import math
 import numpy as np
 import pytest
 
-from r5dgs_core import cli, errors
+from r5dgs_core import errors
+from r5dgs_core.cli import main
+from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
-from r5dgs_core.exit_status import ExitStatus
-from r5dgs_core.motion import candidates, models
-from r5dgs_core.report import (
-    dynamics_rows,
-    error_time,
-    image_rows,
-    pose_rows,
-    raster_rows,
+from r5dgs_core.error_vs_time import (
+    image_task,
+    integrator_task,
+    pose_task,
+    rasterizer_task,
     report_rows,
-    report_table,
-    true_poses,
-    turns,
+    tables,
+    timing,
 )
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.error_vs_time import report as error_vs_time_report
+from r5dgs_core.evaluation import ground_truth_poses
+from r5dgs_core.motion import models
+from r5dgs_core.motion_fit import candidates
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import pictures, scenes
 from tests.command_line import complaint
 
@@ -36,11 +39,11 @@ FAMILY = ("static", "translation, quadratic", "constant twist", "hinge", "ballis
 
 def hurry(patch):
     """One call a turn, few frames, and few motions to choose from: what is fitted how well is for the tests of it."""
-    patch.setattr(turns, "SAMPLE_MS", 0.0)
-    patch.setattr(image_rows, "FRAMES", 1)
-    patch.setattr(raster_rows, "VIEWS", 1)
-    patch.setattr(raster_rows, "SETTINGS", ({}, *({"alpha_min": a} for a in (1 / 1000, 4 / 255, 16 / 255))))
-    patch.setattr(pose_rows, "MODELS", ("static", "hinge"))
+    patch.setattr(timing, "SAMPLE_MS", 0.0)
+    patch.setattr(image_task, "FRAMES", 1)
+    patch.setattr(rasterizer_task, "VIEWS", 1)
+    patch.setattr(rasterizer_task, "SETTINGS", ({}, *({"alpha_min": a} for a in (1 / 1000, 4 / 255, 16 / 255))))
+    patch.setattr(pose_task, "MODELS", ("static", "hinge"))
     patch.setattr(candidates, "FAMILY", tuple(candidates.BY_NAME[name] for name in FAMILY))
 
 
@@ -94,7 +97,7 @@ def test_integrators_show_their_order(scene, method, order):
         scene, 1, kind="world_twist", angular_velocity=[0, 3.0, 1.0], angular_acceleration=[2.0, 0, 0.5]
     )
     alone = dataclasses.replace(turning, groups=(*turning.groups[:2], *static(turning.groups[2:])))
-    rows, _ = dynamics_rows.measure(alone, 1.0, 1)
+    rows, _ = integrator_task.measure(alone, 1.0, 1)
     coarse, fine = (only(rows, method=method, setting=f"{n} steps", error_kind="position").error for n in (16, 32))
     assert math.log2(coarse / fine) == pytest.approx(order, abs=0.15)
 
@@ -104,7 +107,7 @@ def static(groups):
 
 
 def test_what_is_exact_is_exact(scene):
-    rows, _ = dynamics_rows.measure(scene, 0.5, 1)
+    rows, _ = integrator_task.measure(scene, 0.5, 1)
     for kind in ("position", "rotation"):
         closed = only(rows, method="closed form", error_kind=kind)
         assert closed.error_worst < 1e-9 and closed.ms > 0 and closed.count == 4
@@ -114,28 +117,28 @@ def test_what_is_exact_is_exact(scene):
 def test_the_state_of_a_model_is_its_twist():
     v, a, w, e = np.random.default_rng(1).normal(size=(4, 3))
     twist = models.MotionModel("world_twist", v, a, w, e)
-    np.testing.assert_allclose(dynamics_rows.state_of(twist), [v, w, a, e], atol=1e-6)
+    np.testing.assert_allclose(integrator_task.state_of(twist), [v, w, a, e], atol=1e-6)
     screw = models.MotionModel("constant_twist", v, angular_velocity=w)
-    np.testing.assert_allclose(dynamics_rows.state_of(screw), [v, w, 0 * v, 0 * v], atol=1e-6)
+    np.testing.assert_allclose(integrator_task.state_of(screw), [v, w, 0 * v, 0 * v], atol=1e-6)
 
 
 def test_single_gaussians_are_integrated_where_there_are_dynamics(scene, field):
-    rows, absent = dynamics_rows.measure(field, 0.25, 1)
+    rows, absent = integrator_task.measure(field, 0.25, 1)
     steps = only(rows, method="Magnus-4, own dynamics", error_kind="position")
     assert steps.count == int((scene.motion_ids > 0).sum())
     assert steps.error_worst < 1e-3 and not absent
     trace = [only(rows, method="trace_rk2, own dynamics", setting=s, error_kind="position").error for s in TRACE]
     assert trace == sorted(trace, reverse=True) and trace[0] > steps.error
-    _, absent = dynamics_rows.measure(scene, 0.25, 1)
+    _, absent = integrator_task.measure(scene, 0.25, 1)
     assert any("holds none" in text for text in absent)
 
 
-TRACE = [f"{n} step{'s' * (n > 1)}" for n in dynamics_rows.POINT_STEPS]
+TRACE = [f"{n} step{'s' * (n > 1)}" for n in integrator_task.POINT_STEPS]
 
 
 def test_a_scene_at_rest_has_nothing_to_integrate(scene):
     still = dataclasses.replace(scene, groups=tuple(static(scene.groups)))
-    rows, absent = dynamics_rows.measure(still, 0.25, 1)
+    rows, absent = integrator_task.measure(still, 0.25, 1)
     assert rows == [] and any("no group of the scene moves" in text for text in absent)
 
 
@@ -143,11 +146,11 @@ def test_a_scene_at_rest_has_nothing_to_integrate(scene):
 
 
 def test_a_perfect_scene_has_no_pose_error_and_a_wrong_one_has_the_difference(scene, data):
-    rows, _ = pose_rows.measure(scene, data.ground_truth, 1)
+    rows, _ = pose_task.measure(scene, data.ground_truth, 1)
     mine = only(rows, method="group poses", error_kind="position")
     assert mine.error_worst < 1e-6 and mine.count == 4
     moved = changed_group(scene, 2, velocity=np.asarray(scene.groups[2].model.velocity) + [0, 0, 0.6])
-    rows, _ = pose_rows.measure(moved, data.ground_truth, 1)
+    rows, _ = pose_task.measure(moved, data.ground_truth, 1)
     off = only(rows, method="group poses", error_kind="position")
     assert off.error_worst == pytest.approx(0.6 * 0.25 / (2 * scene.groups[2].model.radius), rel=1e-5)
     assert off.error == pytest.approx(0, abs=1e-6)  # the median object is right
@@ -163,7 +166,7 @@ def test_each_motion_model_is_right_about_its_own_motion(scene, data):
     )
     plain = dataclasses.replace(scene, groups=groups)
     truth = truth_of(plain)
-    rows, _ = pose_rows.measure(plain, truth, 1)
+    rows, _ = pose_task.measure(plain, truth, 1)
     chosen = only(rows, method="chosen of the family", error_kind="position")
     assert chosen.error_worst < 0.02 and chosen.ms_once > 0
     assert only(rows, method="static", error_kind="position").error_worst > 0.2
@@ -178,23 +181,23 @@ def truth_of(scene):
         times,
         tuple(g.object_id for g in bodies),
         tuple(scene.object(g.object_id).name for g in bodies),
-        true_poses.motion(scene, bodies, times),
+        ground_truth_poses.motion(scene, bodies, times),
         scene.t_max,
     )
 
 
 def test_modes_of_single_gaussians_have_poses_too(field, data):
-    rows, absent = pose_rows.measure(field, data.ground_truth, 1)
+    rows, absent = pose_task.measure(field, data.ground_truth, 1)
     assert {row.mode for row in rows} >= {"standard", "rigid_paper", "rigid/median", "rigid"}
     assert only(rows, mode="standard", error_kind="position").error > 0.01
     assert any("hybrid" in text for text in absent)
 
 
 def test_poses_without_truth_are_said_to_be_absent(scene, data):
-    assert "no true poses" in pose_rows.measure(scene, None, 1)[1][0]
+    assert "no true poses" in pose_task.measure(scene, None, 1)[1][0]
     truth = data.ground_truth
     early = dataclasses.replace(truth, times=truth.times[:3], matrices=truth.matrices[:, :3])
-    rows, absent = pose_rows.measure(scene, early, 1)
+    rows, absent = pose_task.measure(scene, early, 1)
     assert rows == [] and "past t_max" in absent[0]
 
 
@@ -202,7 +205,7 @@ def test_poses_and_matrices_are_inverse():
     rng = np.random.default_rng(3)
     quat, displacement, pivot = rng.normal(size=4), rng.normal(size=3), rng.normal(size=3)
     quat /= np.copysign(np.linalg.norm(quat), quat[0])
-    back = true_poses.pose(pivot, true_poses.matrix(pivot, quat, displacement))
+    back = ground_truth_poses.pose(pivot, ground_truth_poses.matrix(pivot, quat, displacement))
     np.testing.assert_allclose(back[0] * np.sign(back[0][0]), quat, atol=1e-12)
     np.testing.assert_allclose(back[1], displacement, atol=1e-12)
 
@@ -212,8 +215,8 @@ def test_poses_and_matrices_are_inverse():
 
 def test_true_poses_are_the_oracle_of_a_scene_with_a_wrong_future(scene, data):
     wrong = changed_group(scene, 2, velocity=np.asarray(scene.groups[2].model.velocity) + [0, 0, 2.0])
-    rows, _ = image_rows.measure(wrong, data, ("test",), 1, backend=BACKEND)
-    ours, oracle = (only(rows, method=m, error_kind="psnr") for m in ("playback", image_rows.ORACLE))
+    rows, _ = image_task.measure(wrong, data, ("test",), 1, backend=BACKEND)
+    ours, oracle = (only(rows, method=m, error_kind="psnr") for m in ("playback", image_task.ORACLE))
     assert ours.error < 40 < 55 < oracle.error
     assert ours.ms == pytest.approx(ours.ms_motion + ours.ms_raster)
     assert only(rows, method="playback", error_kind="miou").error < 1
@@ -221,9 +224,9 @@ def test_true_poses_are_the_oracle_of_a_scene_with_a_wrong_future(scene, data):
 
 def test_there_is_no_oracle_without_true_poses_at_the_times_of_the_views(scene, data):
     blind = dataclasses.replace(data, ground_truth=None)
-    rows, absent = image_rows.measure(scene, blind, ("test",), 1, backend=BACKEND)
-    assert not pick(rows, method=image_rows.ORACLE) and any("ground_truth.json" in text for text in absent)
-    move, why = image_rows.true_move(scene, data, [0.8])
+    rows, absent = image_task.measure(scene, blind, ("test",), 1, backend=BACKEND)
+    assert not pick(rows, method=image_task.ORACLE) and any("ground_truth.json" in text for text in absent)
+    move, why = image_task.true_move(scene, data, [0.8])
     assert move is None and "t = 0.8" in why
 
 
@@ -231,7 +234,7 @@ def test_there_is_no_oracle_without_true_poses_at_the_times_of_the_views(scene, 
 
 
 def test_coarser_thresholds_differ_more_from_the_finest_picture(scene, data):
-    rows, _ = raster_rows.measure(scene, data.test, 1, backend=BACKEND)
+    rows, _ = rasterizer_task.measure(scene, data.test, 1, backend=BACKEND)
     settings = ("alpha 0.26/255", "3DGS (alpha 1/255, stop 0.0001)", "alpha 4/255", "alpha 16/255")
     errors_ = [only(rows, setting=s, error_kind="difference").error for s in settings]
     assert errors_ == sorted(errors_) and errors_[0] < errors_[-1]
@@ -239,9 +242,9 @@ def test_coarser_thresholds_differ_more_from_the_finest_picture(scene, data):
 
 
 def test_without_a_data_set_the_cameras_of_the_scene_serve(scene):
-    rows, absent = raster_rows.measure(scene, (), 1, backend=BACKEND)
+    rows, absent = rasterizer_task.measure(scene, (), 1, backend=BACKEND)
     assert {row.error_kind for row in rows} == {"difference"} and "needs a data set" in absent[0]
-    assert raster_rows.measure(dataclasses.replace(scene, cameras=()), (), 1, backend=BACKEND)[0] == []
+    assert rasterizer_task.measure(dataclasses.replace(scene, cameras=()), (), 1, backend=BACKEND)[0] == []
 
 
 # All of it.
@@ -251,11 +254,11 @@ def test_without_a_data_set_the_cameras_of_the_scene_serve(scene):
 def report(field, data):
     with pytest.MonkeyPatch.context() as patch:
         hurry(patch)
-        return error_time.measure(field, data, rounds=1, backend=BACKEND, splits=("test", "val"))
+        return error_vs_time_report.measure(field, data, rounds=1, backend=BACKEND, splits=("test", "val"))
 
 
 def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
-    paths = error_time.write(report, tmp_path / "deep" / "out")
+    paths = error_vs_time_report.write(report, tmp_path / "deep" / "out")
     by_name = {path.name: path for path in paths}
     assert json.loads(by_name["report.json"].read_text()) == report
     table = list(csv.DictReader(by_name["report.csv"].open()))
@@ -277,7 +280,7 @@ def test_the_report_is_written_for_programs_and_people(report, field, tmp_path):
 
 def test_every_mode_is_shown_past_t_max_and_one_before(report, field):
     rows = report_rows.from_dicts(report["rows"])
-    assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(playback.modes(field))
+    assert {row.mode for row in pick(rows, method="playback", error_kind="psnr")} == set(scene_player.modes(field))
     assert {row.mode for row in pick(rows, error_kind="psnr@val")} == {"rigid"}
     assert any("up to t_max all are the same" in text for text in report["absent"])
 
@@ -289,33 +292,33 @@ def test_every_task_has_a_front(report):
 
 
 def test_the_terminal_shows_the_tables_and_what_is_absent(report, capsys):
-    report_table.show(report)
+    tables.show(report)
     text = capsys.readouterr().out
     assert "Dynamics" in text and "Poses along the horizon" in text and "not measured" in text
 
 
 def test_without_data_what_needs_it_is_said_to_be_absent(scene, tmp_path):
-    report = error_time.measure(scene, rounds=1, backend=BACKEND, tasks=("poses", "images", "raster"))
+    report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses", "images", "raster"))
     text = "\n".join(report["absent"])
     assert "poses: no data set" in text and "images: no data set" in text and "dynamics: not asked for" in text
     assert report["horizon"] == {"tau": pytest.approx(0.25), "why": "a third of the observed time"}
-    error_time.write(report, tmp_path)
+    error_vs_time_report.write(report, tmp_path)
 
 
 def test_a_report_without_any_row_is_still_written(scene, tmp_path):
-    nothing = error_time.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
-    assert nothing["rows"] == [] and len(error_time.write(nothing, tmp_path)) == 4
+    nothing = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
+    assert nothing["rows"] == [] and len(error_vs_time_report.write(nothing, tmp_path)) == 4
 
 
 def test_the_command_reports_a_scene_file(scene, data, tmp_path, capsys):
     path = tmp_path / "s.r5dgs"
     scene_file.write(scene, path)
     given = ["report", str(path), str(data.root), "--out", str(tmp_path / "out"), "--repeats", "1"]
-    assert cli.main([*given, "--tasks", "dynamics", "poses", "--progress", "none"]) == 0
+    assert main.main([*given, "--tasks", "dynamics", "poses", "--progress", "none"]) == 0
     assert "written" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"report.json", "report.csv", "report.md", "report.png"}
     alone = ["report", str(path), "--out", str(tmp_path / "alone"), "--tasks", "images"]
-    assert cli.main([*alone, "--progress", "none"]) == 3
+    assert main.main([*alone, "--progress", "none"]) == 3
     assert f"--tasks images: needs the data set: r5dgs report {path} DATA" in capsys.readouterr().err
     assert not (tmp_path / "alone").exists()
 
@@ -335,6 +338,6 @@ def test_a_wrong_call_is_one_line(arguments, words, capsys):
 
 def test_a_report_that_cannot_be_written_says_so(scene, tmp_path):
     (tmp_path / "file").write_text("mine")
-    report = error_time.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
+    report = error_vs_time_report.measure(scene, rounds=1, backend=BACKEND, tasks=("poses",))
     with pytest.raises(errors.ConfigError, match="--out"):
-        error_time.write(report, tmp_path / "file")
+        error_vs_time_report.write(report, tmp_path / "file")

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError, TrainingError
 from r5dgs_core.model import residual_field
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import playback
-from r5dgs_core.train import bake, checkpoint, config, residual, residual_trial, run
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.train import checkpoint, residual_trial, run
+from r5dgs_core.train.representations import residual
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -317,11 +320,13 @@ def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathin
     for view, drawn in list(zip(trainer.dataset.train, trainer.views, strict=True))[::5]:
         with torch.no_grad():
             expected = trainer.render(drawn.camera, drawn.t).numpy().clip(0, 1)
-        shown = scene_render.render_frame(scene, playback.frame(scene, view.t), view.camera).color.numpy().clip(0, 1)
+        shown = (
+            scene_renderer.render_frame(scene, scene_player.frame(scene, view.t), view.camera).color.numpy().clip(0, 1)
+        )
         assert (
             -10 * np.log10(np.mean((shown - expected) ** 2)) > 45
         )  # the noise of a track that does not turn is left out
-    later = playback.frame(scene, scene.t_max + 0.3)
+    later = scene_player.frame(scene, scene.t_max + 0.3)
     rows = scene.motion_ids == BALL
     gaps = [np.linalg.norm(np.diff(m[rows].astype(np.float64), axis=0), axis=1) for m in (scene.means, later.means)]
     np.testing.assert_allclose(gaps[1], gaps[0], atol=1e-5)

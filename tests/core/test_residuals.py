@@ -9,7 +9,8 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.motion import rotations, se3
-from r5dgs_core.scene import group_dynamics, playback, residuals, row_runs, scene_file, scene_info
+from r5dgs_core.playback import group_dynamics, residuals, scene_info, scene_player
+from r5dgs_core.scene import row_runs, scene_file
 from r5dgs_core.scene.scene import Scene
 from tests.scenes import T_MAX, TIMES, make_scene
 
@@ -47,7 +48,7 @@ def twisting(scene: Scene) -> Scene:
 
 @pytest.mark.parametrize("k", [0, 3, 7])
 def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
-    frame, i = playback.frame(bending, float(TIMES[k])), 11
+    frame, i = scene_player.frame(bending, float(TIMES[k])), 11
     row = int(bending.residual_rows[i])
     group = bending.groups[int(bending.motion_ids[row])]
     q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
@@ -60,11 +61,11 @@ def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
 
 def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
     times = np.linspace(0.0, T_MAX, 201)
-    paths = np.stack([playback.frame(bending, t).means for t in times])
+    paths = np.stack([scene_player.frame(bending, t).means for t in times])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
     assert steps.max() < 0.2
-    np.testing.assert_array_equal(playback.frame(bending, T_MAX).means, bending.means)
-    np.testing.assert_array_equal(playback.frame(bending, -1.0).means, playback.frame(bending, 0.0).means)
+    np.testing.assert_array_equal(scene_player.frame(bending, T_MAX).means, bending.means)
+    np.testing.assert_array_equal(scene_player.frame(bending, -1.0).means, scene_player.frame(bending, 0.0).means)
 
 
 def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
@@ -72,13 +73,13 @@ def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
     flipped[:, ::2] *= -1
     other = dataclasses.replace(bending, residual_quats=flipped)
     for t in (0.02, 0.13, 0.5):
-        a, b = playback.frame(bending, t).quats, playback.frame(other, t).quats
+        a, b = scene_player.frame(bending, t).quats, scene_player.frame(other, t).quats
         assert rotations.angle_between(a.astype(float), b.astype(float)).max() < 1e-3
 
 
 def test_equal_twists_move_a_body_rigidly_in_mode_standard():
     scene = twisting(make_scene())
-    frame = playback.frame(scene, 1.0, "standard")
+    frame = scene_player.frame(scene, 1.0, "standard")
     for start, stop, g in row_runs.runs(scene.motion_ids):
         before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
@@ -88,14 +89,14 @@ def test_equal_twists_move_a_body_rigidly_in_mode_standard():
 
 def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
     scene = twisting(make_scene())
-    standard, literal = (playback.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
+    standard, literal = (scene_player.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
     np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
     body = scene.motion_ids == 1
     turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
     canonical = scene.canonical_means.astype(float)
     canonical[body] = rotations.rotate(turn, canonical[body])
     turned = dataclasses.replace(scene, canonical_means=canonical.astype(np.float32))
-    off = playback.frame(turned, 1.0, "rigid_paper").means.astype(float)
+    off = scene_player.frame(turned, 1.0, "rigid_paper").means.astype(float)
     after, before = off[body], scene.means[body].astype(float)
     pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
     assert np.abs(pairs[1] - pairs[0]).max() > 0.05
@@ -106,22 +107,22 @@ def twisted() -> Scene:
     return twisting(make_scene(300, shadows=False))
 
 
-@pytest.mark.parametrize("mode", playback.every())
+@pytest.mark.parametrize("mode", scene_player.every())
 def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
     scene = twisted
-    assert mode in playback.modes(scene)
-    frame, rigid = playback.frame(scene, T_MAX, mode), playback.frame(scene, 0.2)
+    assert mode in scene_player.modes(scene)
+    frame, rigid = scene_player.frame(scene, T_MAX, mode), scene_player.frame(scene, 0.2)
     for name in ("means", "quats"):
         np.testing.assert_array_equal(getattr(frame, name), getattr(scene, name))
-        np.testing.assert_array_equal(getattr(playback.frame(scene, 0.2, mode), name), getattr(rigid, name))
-    np.testing.assert_allclose(playback.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
+        np.testing.assert_array_equal(getattr(scene_player.frame(scene, 0.2, mode), name), getattr(rigid, name))
+    np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
 
 
 @pytest.mark.parametrize("source", group_dynamics.SOURCES[1:])
 def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
     scene = twisted
     for t in (0.8, 1.1):
-        rigid, own = playback.frame(scene, t, f"rigid/{source}"), playback.frame(scene, t, "standard")
+        rigid, own = scene_player.frame(scene, t, f"rigid/{source}"), scene_player.frame(scene, t, "standard")
         np.testing.assert_allclose(rigid.means, own.means, atol=3 * residuals.TOLERANCE * scene.extent)
         assert rotations.angle_between(rigid.quats.astype(float), own.quats.astype(float)).max() < 2e-3
         np.testing.assert_allclose(rigid.shading_factor, own.shading_factor, atol=2e-3)
@@ -129,10 +130,10 @@ def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
         assert rotations.angle_between(since, own.turned_quats).max() < 2e-3
 
 
-@pytest.mark.parametrize("mode", [mode for mode in playback.every() if mode.startswith("rigid/")])
+@pytest.mark.parametrize("mode", [mode for mode in scene_player.every() if mode.startswith("rigid/")])
 def test_sources_move_every_group_rigidly_for_long(twisted, mode):
     scene = twisted
-    player, t = playback.Player(scene, mode), T_MAX + 4.0
+    player, t = scene_player.Player(scene, mode), T_MAX + 4.0
     _, displacements = player.group_poses(t)
     for start, stop, g in row_runs.runs(scene.motion_ids):
         frame = player.frame(t, scene.groups[g].pivot + displacements[g])
@@ -156,12 +157,12 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
     dynamics = twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2)
     dynamics[np.flatnonzero(twisted.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
     scene = dataclasses.replace(twisted, dynamics=dynamics)
-    rigid, own = playback.frame(scene, 1.1, f"rigid{variant}"), playback.frame(scene, 1.1, "standard")
+    rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
     everyone = np.arange(len(scene.means), dtype=np.int32)
     some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
     for rows, size in ((None, 0.0), (everyone, 1e-3), (some, 0.5), (everyone, 0.5)):
         changed = scene if rows is None else loose(scene, rows, size)
-        frame = playback.frame(changed, 1.1, f"hybrid{variant}")
+        frame = scene_player.frame(changed, 1.1, f"hybrid{variant}")
         free = np.zeros(len(scene.means), bool)
         if rows is not None and size > 0.1:
             free[rows] = True
@@ -179,7 +180,7 @@ def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
     dynamics[:, 9:] *= 0.1
     moved = twisted.means + np.float32(0.3) * (twisted.motion_ids[:, None] == 1)
     scene = dataclasses.replace(twisted, dynamics=dynamics, canonical_means=moved.astype(np.float32))
-    literal, rigid = (playback.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
+    literal, rigid = (scene_player.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
     np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
     np.testing.assert_allclose(literal.quats, rigid.quats, atol=1e-4)
 
@@ -189,7 +190,7 @@ def test_an_anchored_background_goes_with_its_representative(twisted):
     dynamics = twisted.dynamics.copy()
     dynamics[still, :3] = [0.3, 0.0, -0.1]
     scene = dataclasses.replace(twisted, dynamics=dynamics)
-    pinned, anchored = (playback.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
+    pinned, anchored = (scene_player.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
     np.testing.assert_array_equal(pinned.means[still], scene.means[still])
     moved = 0.25 * np.array([0.3, 0.0, -0.1])
     np.testing.assert_allclose(anchored.means[still], scene.means[still] + moved, atol=1e-6)
@@ -199,12 +200,12 @@ def test_an_anchored_background_goes_with_its_representative(twisted):
 
 def test_modes_without_canonical_places_lack_the_literal_form():
     scene = dataclasses.replace(twisting(make_scene(60)), canonical_means=None)
-    assert {playback.split(mode)[0] for mode in playback.modes(scene)} == {"rigid", "hybrid", "standard"}
+    assert {scene_player.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
 
 
 def test_a_mode_without_data_is_refused():
     with pytest.raises(ValueError, match="has rigid, not 'standard'"):
-        playback.frame(make_scene(), 1.0, "standard")
+        scene_player.frame(make_scene(), 1.0, "standard")
 
 
 def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
@@ -214,7 +215,7 @@ def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
     for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
         np.testing.assert_array_equal(getattr(exact, name), getattr(scene, name))
         np.testing.assert_allclose(getattr(small, name), getattr(scene, name), atol=2e-3)
-    assert scene_info.info(small)["modes"] == list(playback.modes(scene))
+    assert scene_info.info(small)["modes"] == list(scene_player.modes(scene))
     assert scene_info.info(small)["residuals"] == 30
 
 

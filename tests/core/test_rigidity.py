@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import rigidity
+from r5dgs_core.train.representations import rigidity
 
 
 def cloud(n=60, seed=0, classes=4):

@@ -12,9 +12,9 @@ import sys
 import pytest
 import torch
 
-from r5dgs_core import cli
+from r5dgs_core import atomic_files
+from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError, Interrupted, TrainingError
-from r5dgs_core.scene import files
 from r5dgs_core.train import checkpoint, run
 from tests import datasets as tiny_datasets
 
@@ -62,7 +62,7 @@ def test_a_stopped_run_resumes_to_the_same_bits(tiny, unbroken, tmp_path, capsys
     stop_at(50, number, arguments(tiny, folder), folder)
     with open(folder / checkpoint.LOG_FILE, "a") as stream:
         stream.write('{"event": "step", "itera')  # what a crash of the machine may leave
-    assert cli.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
+    assert main.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
     assert capsys.readouterr().err == ""
     assert_equal_runs(folder, unbroken[0])
     assert log_of(folder) == log_of(unbroken[0])
@@ -97,7 +97,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(tiny, unbroken, t
     folder = tmp_path / "run"
     stop_at(30, signal.SIGKILL, arguments(tiny, folder, "train.checkpoint_every=1000"), folder)
     assert not (folder / checkpoint.CHECKPOINT_FILE).exists() and len(log_of(folder)) >= 3
-    assert cli.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
+    assert main.main(["train", str(tiny.root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
     assert_equal_runs(folder, unbroken[0])
     assert log_of(folder) == log_of(unbroken[0])
 
@@ -123,7 +123,7 @@ def test_a_run_stopped_beside_its_steps_names_the_way_to_go_on(tiny, unbroken, t
         run.train(tiny.root, folder, settings, progress=stop)
     command = shlex.split(str(stopped.value).split("go on with: ")[1])
     assert command == ["r5dgs", "train", str(tiny.root.resolve()), "--out", str(folder), "--resume"]
-    assert cli.main([*command[1:], "--progress", "none"]) == 0
+    assert main.main([*command[1:], "--progress", "none"]) == 0
     assert_equal_runs(folder, unbroken[0])
     assert log_of(folder) == log_of(unbroken[0])
 
@@ -247,14 +247,14 @@ def test_half_written_files_of_a_kill_are_removed(tiny, tmp_path):
 
 @pytest.mark.parametrize("name", [checkpoint.RUN_FILE, checkpoint.LOG_FILE, checkpoint.CHECKPOINT_FILE])
 def test_what_cannot_be_written_is_named(tiny, tmp_path, monkeypatch, name):
-    real = files.replacing
+    real = atomic_files.replacing
 
     def full(path, *previous):
         if path.name == name:
             raise OSError(28, "No space left on device")
         return real(path, *previous)
 
-    monkeypatch.setattr(files, "replacing", full)
+    monkeypatch.setattr(atomic_files, "replacing", full)
     if name == checkpoint.LOG_FILE:
         monkeypatch.setattr(run, "open", full_disk, raising=False)
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")

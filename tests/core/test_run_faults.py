@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core import cli
+from r5dgs_core.bake import bake
+from r5dgs_core.cli import main
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.errors import TrainingError
-from r5dgs_core.train import bake, checkpoint, run
+from r5dgs_core.train import checkpoint, run
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 from tests.command_line import complaint
@@ -27,9 +28,9 @@ OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_e
 # What a process does to itself when it writes its second checkpoint.
 KILLED_WITHIN_A_WRITE = """
 import contextlib, os, signal, sys
-from r5dgs_core import cli
-from r5dgs_core.scene import files
-moment, real, replace, seen = sys.argv[1], files.replacing, os.replace, []
+from r5dgs_core.cli import main as cli
+from r5dgs_core import atomic_files
+moment, real, replace, seen = sys.argv[1], atomic_files.replacing, os.replace, []
 
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
@@ -57,14 +58,14 @@ def rename(source, target):
     if second and moment == "after":
         die()
 
-files.replacing, os.replace = replacing, rename
+atomic_files.replacing, os.replace = replacing, rename
 cli.main(sys.argv[2:])
 """
 # A command on a disk that takes no file larger than so many bytes.
 FULL_DISK = """
 import resource, sys
-from r5dgs_core import cli
-from r5dgs_core.train import warming
+from r5dgs_core.cli import main as cli
+from r5dgs_core.train import warm_up as warming
 warming.warm_up(lambda stage: None)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
 sys.exit(cli.main(sys.argv[2:]))
@@ -87,7 +88,7 @@ def arguments(root, folder):
 
 def resumed(root, folder):
     """The last checkpoint after the run has gone on to its end."""
-    assert cli.main(["train", str(root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
+    assert main.main(["train", str(root), "--out", str(folder), "--resume", "--progress", "none"]) == 0
     return checkpoint.load(folder)
 
 

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core import commands_masks, errors
+from r5dgs_core import errors
+from r5dgs_core.cli import masks as cli_masks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import mask_notes, masks
-from r5dgs_core.semantics import mask_making, sam2, sam2_masks, segments, tracking, videos
+from r5dgs_core.masks import make_masks, sam2_masks, sam2_model, sam2_segments, sam2_tracking, videos
 from tests import datasets as tiny_datasets
 from tests import sam2 as tiny_sam2
 
 # The network is random: it foretells a quality of about a half, and its masks are noise.
-EVERYTHING = segments.SegmentSettings(points=3, score=0.0, stability=0.0, max_area=1.0)
+EVERYTHING = sam2_segments.SegmentSettings(points=3, score=0.0, stability=0.0, max_area=1.0)
 FEW = sam2_masks.TrackSettings(objects=5, together=2)
 
 
@@ -26,7 +27,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(folder):
-    return sam2.Sam2(folder)
+    return sam2_model.Sam2(folder)
 
 
 @pytest.fixture(scope="module")
@@ -51,69 +52,72 @@ def test_images_enter_as_sam2_was_trained(model):
     image[..., 0] = 255
     pixels = model.pixels(image)
     assert pixels.shape == (1, 3, tiny_sam2.SIZE, tiny_sam2.SIZE)
-    expected = (np.array([1.0, 0, 0]) - sam2.MEAN) / sam2.DEVIATION
+    expected = (np.array([1.0, 0, 0]) - sam2_model.MEAN) / sam2_model.DEVIATION
     np.testing.assert_allclose(pixels[0].mean((1, 2)), expected, atol=1e-5)
 
 
 def test_the_segments_of_an_image_are_good_distinct_and_in_order(model, video):
-    found = segments.find(model, video.image(0), EVERYTHING)
+    found = sam2_segments.find(model, video.image(0), EVERYTHING)
     assert len(found) > 3
     assert [s.score for s in found] == sorted((s.score for s in found), reverse=True)
-    overlaps = [segments.iou(a.mask, b.mask) for i, a in enumerate(found) for b in found[:i]]
-    assert max(overlaps) <= segments.SAME
+    overlaps = [sam2_segments.iou(a.mask, b.mask) for i, a in enumerate(found) for b in found[:i]]
+    assert max(overlaps) <= sam2_segments.SAME
     middle = float(np.median([s.score for s in found]))
-    strict = segments.SegmentSettings(points=3, score=middle, stability=0.0, max_area=0.6, min_area=0.2)
-    fewer = segments.find(model, video.image(0), strict)
+    strict = sam2_segments.SegmentSettings(points=3, score=middle, stability=0.0, max_area=0.6, min_area=0.2)
+    fewer = sam2_segments.find(model, video.image(0), strict)
     assert 0 < len(fewer) < len(found)
     assert all(s.score >= middle and 0.2 <= s.mask.mean() <= 0.6 for s in fewer)
-    assert segments.find(model, video.image(0), segments.SegmentSettings(points=3, stability=1.0, score=0.0)) == []
+    assert (
+        sam2_segments.find(model, video.image(0), sam2_segments.SegmentSettings(points=3, stability=1.0, score=0.0))
+        == []
+    )
 
 
 def test_what_is_known_is_not_new():
     def segment(left, right):
         logits = torch.full((8, 8), -1.0)
         logits[:, left:right] = 1.0
-        return segments.Segment(logits, 0.9)
+        return sam2_segments.Segment(logits, 0.9)
 
     known = [segment(0, 4).mask]
     wide, half, other = segment(0, 5), segment(0, 2), segment(4, 8)
-    assert segments.iou(wide.mask, known[0]) == 0.8 and segments.iou(half.mask, known[0]) == 0.5
-    assert segments.new_ones([wide, half, other], known, 0.5) == [other]
-    assert segments.new_ones([wide, half, other], known, 0.6) == [half, other]
-    assert segments.new_ones([wide], [], 0.5) == [wide]
+    assert sam2_segments.iou(wide.mask, known[0]) == 0.8 and sam2_segments.iou(half.mask, known[0]) == 0.5
+    assert sam2_segments.new_ones([wide, half, other], known, 0.5) == [other]
+    assert sam2_segments.new_ones([wide, half, other], known, 0.6) == [half, other]
+    assert sam2_segments.new_ones([wide], [], 0.5) == [wide]
 
 
 def marked_in(model, video, key, count=2):
-    return torch.stack([s.logits for s in segments.find(model, video.image(key), EVERYTHING)[:count]])
+    return torch.stack([s.logits for s in sam2_segments.find(model, video.image(key), EVERYTHING)[:count]])
 
 
 def test_objects_are_followed_to_both_ends_each_image_once(model, video):
-    frames = tracking.Frames(model, video)
+    frames = sam2_tracking.Frames(model, video)
     marked = marked_in(model, video, 2)
-    found = dict(tracking.follow(model, frames, 2, marked))
+    found = dict(sam2_tracking.follow(model, frames, 2, marked))
     assert list(found) == [2, 3, 4, 5, 1, 0]
     side = tiny_sam2.SIZE // 4
     assert all(logits.shape == (2, side, side) and logits.isfinite().all() for logits in found.values())
     assert any((logits > 0).any() and (logits <= 0).any() for index, logits in found.items() if index != 2)
-    kept = segments.full_size(found[2], (64, 64)) > 0  # where it is marked it is as it was marked
-    given = segments.full_size(marked, (64, 64)) > 0
-    assert segments.iou(kept.numpy(), given.numpy()) > 0.75
+    kept = sam2_segments.full_size(found[2], (64, 64)) > 0  # where it is marked it is as it was marked
+    given = sam2_segments.full_size(marked, (64, 64)) > 0
+    assert sam2_segments.iou(kept.numpy(), given.numpy()) > 0.75
 
 
 def test_following_agrees_with_the_librarys_own_loop(model, video):
     """The same video held in memory whole, forwards from its first image, and nothing forgotten."""
     from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
-    frames = tracking.Frames(model, video)
+    frames = sam2_tracking.Frames(model, video)
     marked = marked_in(model, video, 0)
     state = Sam2VideoInferenceSession(video=torch.stack([frames[k] for k in frames]), dtype=torch.float32)
     for k, logits in enumerate(marked):
-        mask = segments.full_size(logits[None], (model.size, model.size)) > 0
+        mask = sam2_segments.full_size(logits[None], (model.size, model.size)) > 0
         state.add_mask_inputs(state.obj_id_to_idx(k), 0, mask[None].float())
     state.obj_with_new_inputs = [0, 1]
     model.video(inference_session=state, frame_idx=0)
     expected = {o.frame_idx: o.pred_masks[:, 0] for o in model.video.propagate_in_video_iterator(state)}
-    for index, logits in tracking.follow(model, frames, 0, marked):
+    for index, logits in sam2_tracking.follow(model, frames, 0, marked):
         torch.testing.assert_close(logits, expected[index], rtol=1e-4, atol=1e-4)
 
 
@@ -121,21 +125,21 @@ def test_memory_does_not_grow_with_the_video(model, video, monkeypatch):
     """What is remembered after forty images is what was remembered after twenty."""
     long = videos.Video("long", video.views * 7)
     sizes = []
-    forget = tracking._forget
+    forget = sam2_tracking._forget
 
     def counted(outputs, index, step, *args):
         forget(outputs, index, step, *args)
         sizes.append(sum(t.numel() for out in outputs.values() for t in out.values() if isinstance(t, torch.Tensor)))
 
-    monkeypatch.setattr(tracking, "_forget", counted)
-    for _ in tracking.follow(model, tracking.Frames(model, long), 0, marked_in(model, video, 0, 1)):
+    monkeypatch.setattr(sam2_tracking, "_forget", counted)
+    for _ in sam2_tracking.follow(model, sam2_tracking.Frames(model, long), 0, marked_in(model, video, 0, 1)):
         pass
     assert len(sizes) == 41
     assert sizes[20] == sizes[40] > 0
 
 
 def test_a_pixel_goes_to_the_object_that_is_surest_of_it(tmp_path):
-    canvas = tracking.Canvas(2, 1, 4, tmp_path)
+    canvas = sam2_tracking.Canvas(2, 1, 4, tmp_path)
     canvas.paint(1, [7, 300], np.array([[[1.0, 2, -1, -1]], [[1.0, 3, 5, -2]]]))
     assert canvas.ids[1].tolist() == [[7, 300, 300, 0]]  # the first of equals; nobody below 0
     canvas.paint(1, [9], np.array([[[0.5, 4, 5, 0.1]]]))
@@ -147,7 +151,7 @@ def test_a_pixel_goes_to_the_object_that_is_surest_of_it(tmp_path):
 
 def test_where_an_object_is_lost_for_some_images_nothing_is_known(tmp_path):
     def painted(rows, gap):
-        canvas = tracking.Canvas(len(rows), 1, 4, tmp_path)
+        canvas = sam2_tracking.Canvas(len(rows), 1, 4, tmp_path)
         for index, row in enumerate(rows):
             for object_id in sorted(set(row) - {0}):
                 canvas.paint(index, [object_id], np.where(np.array(row) == object_id, 1.0, -1.0)[None, None])
@@ -177,19 +181,19 @@ def test_a_video_gets_masks_that_follow_what_was_marked(model, video, tmp_path):
     images = list(backend.label(video, tmp_path, shares.append))
     assert len(images) == 6 and all(ids.shape == (36, 48) and ids.dtype == np.int32 for ids in images)
     assert shares == sorted(shares) and shares[-1] == 1.0
-    first = segments.find(model, video.image(0), EVERYTHING)
+    first = sam2_segments.find(model, video.image(0), EVERYTHING)
     assert set(np.unique(images[0])) - {0} <= set(range(1, 41))
     followed = {}
     for start in range(0, len(first), 3):
         some = torch.stack([s.logits for s in first[start : start + 3]])
-        for index, logits in tracking.follow(model, tracking.Frames(model, video), 0, some):
+        for index, logits in sam2_tracking.follow(model, sam2_tracking.Frames(model, video), 0, some):
             followed.setdefault(index, []).append(logits)
     there = [logits.gt(0).numpy() for part in followed[5] for logits in part]
-    later = segments.new_ones(segments.find(model, video.image(5), EVERYTHING), there, FEW.overlap)
+    later = sam2_segments.new_ones(sam2_segments.find(model, video.image(5), EVERYTHING), there, FEW.overlap)
     assert len(later) > 0
     added = {int(i) for ids in images for i in np.unique(ids)} - set(range(len(first) + 1)) - {masks.UNKNOWN}
     assert added and added <= set(range(len(first) + 1, len(first) + 1 + len(later)))
-    at_end = np.concatenate([segments.full_size(part, (36, 48)).numpy() for part in followed[5]])
+    at_end = np.concatenate([sam2_segments.full_size(part, (36, 48)).numpy() for part in followed[5]])
     old = images[5] <= len(first)  # no gap ends after the last image, so nothing is unknown there
     expected = np.where(at_end.max(0) > 0, at_end.argmax(0) + 1, 0)
     assert (images[5] == expected)[old & (images[5] > 0)].mean() > 0.99  # half floats make ties of near equals
@@ -208,7 +212,7 @@ def test_networks_that_see_the_truth_give_the_truth_and_late_objects_too(model, 
 
     def find(model, image, settings):
         ids = by_image[image.tobytes()]
-        return [segments.Segment(logits(ids, k), 0.9) for k in np.unique(ids[ids > 0]).tolist()]
+        return [sam2_segments.Segment(logits(ids, k), 0.9) for k in np.unique(ids[ids > 0]).tolist()]
 
     def follow(model, frames, key, marked):
         names = [view.name for view in frames._video.views]
@@ -218,9 +222,9 @@ def test_networks_that_see_the_truth_give_the_truth_and_late_objects_too(model, 
         for index in [*range(key, len(names)), *reversed(range(key))]:
             yield index, torch.stack([logits(truth[names[index]], k) for k in wanted])
 
-    monkeypatch.setattr(segments, "find", find)
-    monkeypatch.setattr(tracking, "follow", follow)
-    mask_making.make(views, sam2_masks.Sam2Masks(model), tmp_path / "m")
+    monkeypatch.setattr(sam2_segments, "find", find)
+    monkeypatch.setattr(sam2_tracking, "follow", follow)
+    make_masks.make(views, sam2_masks.Sam2Masks(model), tmp_path / "m")
     assert {key for key, wanted in now if tiny_datasets.BALL in wanted} == {5}  # of 0, 2 and 5; it comes at 3
     for name, video in mask_notes.read(tmp_path / "m").videos.items():
         pairs = set()
@@ -251,11 +255,11 @@ def test_the_command_makes_goes_on_and_says_what_comes_next(tiny, folder, tmp_pa
 
     monkeypatch.setattr(sam2_masks.Sam2Masks, "label", stopped)
     with pytest.raises(errors.Interrupted, match="videos that are done stay"):
-        commands_masks.run_masks(tiny.root, **options)
+        cli_masks.run_masks(tiny.root, **options)
     first = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.png")}
     assert len(first) == 12
     monkeypatch.setattr(sam2_masks.Sam2Masks, "label", label)
-    made = commands_masks.run_masks(tiny.root, **options)
+    made = cli_masks.run_masks(tiny.root, **options)
     assert (made.kept, made.images, made.numbering) == (2, 36, "video") and made.objects > 6
     assert {path: path.stat().st_mtime_ns for path in first} == first
     told = capsys.readouterr().out
@@ -265,13 +269,13 @@ def test_the_command_makes_goes_on_and_says_what_comes_next(tiny, folder, tmp_pa
     with pytest.raises(errors.DatasetError, match="hold within a video only"):
         dataset.require_one_numbering()
     with pytest.raises(errors.DatasetError, match=r"other settings \(points\)"):
-        commands_masks.run_masks(tiny.root, **options | {"points": 3})
+        cli_masks.run_masks(tiny.root, **options | {"points": 3})
 
 
 def test_the_same_model_and_images_give_the_same_masks(model, video, tmp_path):
     views = video.views
     for name in ("a", "b"):
-        mask_making.make(views, sam2_masks.Sam2Masks(model, EVERYTHING, FEW), tmp_path / name)
+        make_masks.make(views, sam2_masks.Sam2Masks(model, EVERYTHING, FEW), tmp_path / name)
     for view in views:
         one, other = (masks.read(tmp_path / name / f"{view.name}.png") for name in ("a", "b"))
         np.testing.assert_array_equal(one, other)
@@ -330,22 +334,22 @@ def widen(folder):
 )
 def test_folders_that_hold_no_whole_sam2_are_one_clear_error(folder, tmp_path, change, message):
     with pytest.raises(errors.BackendError, match=message):
-        sam2.Sam2(broken(folder, tmp_path, change))
+        sam2_model.Sam2(broken(folder, tmp_path, change))
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(errors.BackendError, match="expected a folder of SAM2.*found nothing"):
-        sam2.Sam2(tmp_path / "gone")
+        sam2_model.Sam2(tmp_path / "gone")
 
 
 @pytest.mark.parametrize("package", ["transformers", "safetensors"])
 def test_without_transformers_one_error_names_what_to_install(folder, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(errors.BackendError, match=r"pip install 'r5dgs\[encoders\]'"):
-        sam2.Sam2(folder)
+        sam2_model.Sam2(folder)
 
 
 @pytest.mark.parametrize("device", ["tpu", "meta", "cuda:99" if not torch.cuda.is_available() else "mps"])
 def test_devices_that_are_not_there_are_named(folder, device):
     with pytest.raises(errors.BackendError, match=f"--device {device}: "):
-        sam2.Sam2(folder, device)
+        sam2_model.Sam2(folder, device)

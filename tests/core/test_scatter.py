@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.scene import cameras
-from r5dgs_core.train import config, scatter, sweep
+from r5dgs_core.train.initialization import plane_sweep, scatter
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -25,7 +26,7 @@ RANDOM = (
 
 def test_every_point_is_seen_by_two_cameras(tiny):
     trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings(*RANDOM))
-    scenes = sweep.backdrops(trainer.views)
+    scenes = plane_sweep.backdrops(trainer.views)
     points, colors = scatter.everywhere(scenes, 200, np.random.default_rng(0))
     assert points.shape == colors.shape == (200, 3)
     assert colors.min() >= 0 and colors.max() <= 1

@@ -6,9 +6,10 @@ import zipfile
 import numpy as np
 import pytest
 
-from r5dgs_core import errors
+from r5dgs_core import atomic_files, errors
 from r5dgs_core.motion import rotations
-from r5dgs_core.scene import files, playback, scene_file, scene_info
+from r5dgs_core.playback import scene_info, scene_player
+from r5dgs_core.scene import scene_file
 from tests.scenes import make_scene
 
 # Half a step of the stored fixed point, and half-precision rounding.
@@ -117,7 +118,7 @@ def test_a_scene_without_gaussians_is_a_scene(tmp_path):
 def test_playback_from_the_file_is_within_rounding(scene, path):
     read = scene_file.read(path)
     for t in (0.1, 0.75, 1.3):
-        ours, theirs = playback.frame(scene, t), playback.frame(read, t)
+        ours, theirs = scene_player.frame(scene, t), scene_player.frame(read, t)
         np.testing.assert_array_equal(ours.means, theirs.means)
         turn = rotations.angle_between(ours.quats.astype(float), theirs.quats.astype(float))
         assert turn.max() < 1e-4
@@ -357,7 +358,7 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing(scene, tmp_path, m
         with pytest.raises(errors.SceneFileError, match="No space left"):
             scene_file.write(scene, path)
     with monkeypatch.context() as patch:
-        patch.setattr(files.os, "replace", full_disk)
+        patch.setattr(atomic_files.os, "replace", full_disk)
         with pytest.raises(errors.SceneFileError, match="No space left"):
             scene_file.write(scene, path)
     assert path.read_bytes() == before

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import RasterSettings, rasterize_splats, segment_weights
+from r5dgs_core.raster import RasterSettings, rasterize_splats
+from r5dgs_core.render import segment_weights
 from r5dgs_core.scene import cameras
 
 SIZE = 24

@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from r5dgs_core import errors, serve
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster import scene_render, stage, warming
-from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.semantics import encoder_registry, encoders, lookup_table
+from r5dgs_core import errors
+from r5dgs_core.language import build_table
+from r5dgs_core.language.encoders import encoder_base, registry
+from r5dgs_core.playback import scene_player
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.render import incremental_renderer, scene_renderer, warm_up
+from r5dgs_core.scene import scene_file
+from r5dgs_core.worker import server as worker_server
 from tests import encoder_folders, scenes
 from tests.core.test_scene_render import matrix
 
@@ -39,7 +42,7 @@ def talk(*requests):
     """Answers to requests (bytes are sent as they are): (header, arrays) each."""
     lines = [r if isinstance(r, bytes) else json.dumps({"id": i, **r}).encode() for i, r in enumerate(requests)]
     out = io.BytesIO()
-    serve.serve(io.BytesIO(b"\n".join(lines) + b"\n"), out)
+    worker_server.serve(io.BytesIO(b"\n".join(lines) + b"\n"), out)
     return parse(out.getvalue())
 
 
@@ -63,12 +66,12 @@ def load(path):
 
 def test_hello_says_what_is_missing_and_which_protocol():
     (header, _), *_ = talk({"command": "hello"})
-    assert header["ok"] and header["result"]["protocol"] == serve.PROTOCOL and header["result"]["missing"] == []
+    assert header["ok"] and header["result"]["protocol"] == worker_server.PROTOCOL and header["result"]["missing"] == []
 
 
 def test_a_rendered_time_is_the_cores_picture(path):
     scene = scene_file.read(path)
-    expected = scene_render.render_frame(scene, playback.frame(scene, 0.9, origin=CAMERA.center), CAMERA)
+    expected = scene_renderer.render_frame(scene, scene_player.frame(scene, 0.9, origin=CAMERA.center), CAMERA)
     request = {"command": "render", "camera": CAMERA_JSON, "t": 0.9, "want": ["depth", "alpha", "ids"]}
     _, (header, arrays) = talk(load(path), request)
     assert header["ok"] and header["result"]["gaussians"] == len(scene.means)
@@ -81,8 +84,8 @@ def test_instances_are_moved_and_the_rest_is_not_seen(path):
     body = scene.object(2)
     matrix = np.eye(4)
     matrix[:3, 3] = [0.2, 0, 0.3]
-    posed = scene_render.pose_instances(scene, [scene_render.Instance(body.start, body.count, matrix)])
-    expected = scene_render.render_frame(scene, posed, CAMERA, background=None)
+    posed = scene_renderer.pose_instances(scene, [scene_renderer.Instance(body.start, body.count, matrix)])
+    expected = scene_renderer.render_frame(scene, posed, CAMERA, background=None)
     instances = [{"start": body.start, "count": body.count, "matrix": matrix.tolist()}]
     request = {"command": "render", "camera": CAMERA_JSON, "instances": instances}
     _, (header, arrays) = talk(load(path), request)
@@ -98,10 +101,10 @@ def test_scenes_that_are_loaded_together_are_in_one_picture(path, tmp_path):
     request = {"command": "render", "camera": CAMERA_JSON, "instances": entries, "want": ["depth", "alpha", "owners"]}
     request["sky"] = {"scene": 1, "matrix": world.tolist()}
     both = [scene_file.read(path), scene_file.read(other)]
-    expected = stage.Stage(both).render(
-        [scene_render.Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), scene_render.Instance(0, 200, np.eye(4))],
+    expected = incremental_renderer.Stage(both).render(
+        [scene_renderer.Instance(20, 60, world, 1, world, (0.5, 1.0, 2.0)), scene_renderer.Instance(0, 200, np.eye(4))],
         CAMERA,
-        sky=stage.Sky(1, world),
+        sky=incremental_renderer.Sky(1, world),
     )
     (loaded, _), (header, arrays) = talk({"command": "load", "paths": [str(path), str(other)]}, request)
     assert [entry["gaussians"] for entry in loaded["result"]["scenes"]] == [200, 150]
@@ -142,7 +145,7 @@ def test_what_is_not_named_any_more_is_let_go_and_what_is_stays(path, tmp_path, 
     copy.write_bytes(path.read_bytes())
     read, original = [], scene_file.read
     monkeypatch.setattr(scene_file, "read", lambda place: read.append(place.name) or original(place))
-    server = serve.Server()
+    server = worker_server.Server()
     for paths in ([path], [path, copy], [copy, path, copy], [copy], [path]):
         result, _ = server.answer({"command": "load", "paths": [str(p) for p in paths]})
         assert [one["gaussians"] for one in result["scenes"]] == [200] * len(paths)
@@ -195,9 +198,9 @@ def test_a_failed_load_forgets_the_scene_before(path, tmp_path):
 
 def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(path, tmp_path, monkeypatch):
     path = Path(shutil.copy(path, tmp_path))
-    read, calls = serve.scene_file.read, []
-    monkeypatch.setattr(serve.scene_file, "read", lambda path: calls.append(path) or read(path))
-    whole, server, request = path.read_bytes(), serve.Server(), {"command": "load", "paths": [str(path)]}
+    read, calls = worker_server.scene_file.read, []
+    monkeypatch.setattr(worker_server.scene_file, "read", lambda path: calls.append(path) or read(path))
+    whole, server, request = path.read_bytes(), worker_server.Server(), {"command": "load", "paths": [str(path)]}
     path.write_bytes(whole[:1000])
     said = []
     for _ in range(3):
@@ -212,7 +215,7 @@ def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(path, tmp_path
 def test_a_changed_file_is_read_again(path, tmp_path):
     copy = tmp_path / "scene.r5dgs"
     copy.write_bytes(path.read_bytes())
-    server = serve.Server()
+    server = worker_server.Server()
     assert server.answer(load(copy))[0]["scenes"][0]["gaussians"] == 200
     scene_file.write(scenes.make_scene(n=120), copy)
     assert server.answer(load(copy))[0]["scenes"][0]["gaussians"] == 120
@@ -230,10 +233,10 @@ def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkey
             compilation._watch.tell(compilation.NOTICE)
         raise OSError("no space left")
 
-    monkeypatch.setattr(warming, "warm_up", fail)
+    monkeypatch.setattr(warm_up, "warm_up", fail)
     monkeypatch.setattr(compilation, "compiled", lambda: compiled)
     events = []
-    warm = serve.Warming(events.append)
+    warm = worker_server.Warming(events.append)
     warm.start()
     warm.wait()
     assert not warm.busy and "no space left" in capsys.readouterr().err
@@ -284,8 +287,8 @@ def test_words_find_objects(path):
 
 def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
     folder = encoder_folders.sentences(tmp_path / "tiny")
-    encoder = encoder_registry.open_encoder(folder)
-    made = lookup_table.make(scenes.make_scene(n=120, objects=2), encoder).scene
+    encoder = registry.open_encoder(folder)
+    made = build_table.make(scenes.make_scene(n=120, objects=2), encoder).scene
     file = scene_file.write(made, tmp_path / "words.r5dgs")
     ask = {"encoder": str(folder)}
     _, (embedded, arrays), (found, _), (other, _), (wrong, _), (last, _) = talk(
@@ -297,7 +300,7 @@ def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
         {"command": "embed", "texts": [], **ask},
     )
     assert embedded["result"]["encoder"]["digest"] == made.lookup.encoder.digest
-    np.testing.assert_array_equal(arrays["embeddings"], encoders.embed_phrases(encoder, ["a mug", "zeppelin"]))
+    np.testing.assert_array_equal(arrays["embeddings"], encoder_base.embed_phrases(encoder, ["a mug", "zeppelin"]))
     assert found["result"]["matches"][0]["object_id"] == 1 and found["result"]["matches"][0]["score"] == 1
     assert not other["ok"] and "config.json" in other["error"]["message"]
     assert not wrong["ok"] and "needs texts" in wrong["error"]["message"] and last["ok"]
@@ -306,7 +309,9 @@ def test_phrases_are_embedded_by_an_encoder_and_asked_of_its_table(tmp_path):
 def test_the_process_keeps_its_output_clean_and_ends_with_its_input(path):
     lines = [load(path), {"command": "render", "camera": CAMERA_JSON, "t": 0.3}, {"command": "shutdown"}]
     data = b"".join(json.dumps({"id": i, **line}).encode() + b"\n" for i, line in enumerate(lines))
-    done = subprocess.run([sys.executable, "-m", "r5dgs_core.serve"], input=data, capture_output=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-m", "r5dgs_core.worker.server"], input=data, capture_output=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr.decode()
     (_, _), (rendered, arrays), (ended, _) = parse(done.stdout)
     assert rendered["ok"] and ended["ok"] and arrays["color"].shape == (24, 32, 3)

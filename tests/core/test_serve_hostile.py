@@ -8,8 +8,9 @@ import os
 import numpy as np
 import pytest
 
-from r5dgs_core import errors, serve, serve_requests
+from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
+from r5dgs_core.worker import requests, server
 from tests import scenes
 from tests.core.test_serve import CAMERA_JSON, ROWS, load, parse, talk
 
@@ -146,7 +147,7 @@ def path(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def little_memory(monkeypatch):
     """A machine with so much free memory that no honest request of these tests is refused."""
-    monkeypatch.setattr(serve_requests, "free_memory", lambda: 1 << 30)
+    monkeypatch.setattr(requests, "free_memory", lambda: 1 << 30)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -166,7 +167,7 @@ def test_there_are_more_than_the_trials_had():
 
 
 def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
-    monkeypatch.setattr(serve_requests, "MOST_LINE", 4 << 20)
+    monkeypatch.setattr(requests, "MOST_LINE", 4 << 20)
     most = []
 
     class Stream(io.BytesIO):
@@ -176,7 +177,7 @@ def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
 
     lines = Stream(b"x" * (9 << 20) + b"\n" + json.dumps({"id": 5, "command": "hello"}).encode() + b"\n")
     out = io.BytesIO()
-    serve.serve(lines, out)
+    server.serve(lines, out)
     (refused, _), (answered, _) = parse(out.getvalue())
     assert "more than 4 MiB" in refused["error"]["message"] and answered["ok"] and answered["id"] == 5
     assert all(0 < size <= (4 << 20) + 1 for size in most)
@@ -184,7 +185,7 @@ def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
 
 def test_a_last_line_without_an_end_is_answered():
     out = io.BytesIO()
-    serve.serve(io.BytesIO(b'{"id": 1, "command": "hello"}'), out)
+    server.serve(io.BytesIO(b'{"id": 1, "command": "hello"}'), out)
     ((answered, _),) = parse(out.getvalue())
     assert answered["ok"]
 
@@ -199,7 +200,7 @@ def test_a_fault_of_the_worker_itself_is_an_error_of_ours_too(monkeypatch, capsy
     def fail(*_):
         raise MemoryError("no room")
 
-    monkeypatch.setattr(serve.Server, "answer", fail)
+    monkeypatch.setattr(server.Server, "answer", fail)
     ((answered, _),) = talk({"command": "check"})
     assert answered["error"] == {"kind": "BackendError", "message": "worker: the request failed: MemoryError: no room"}
     assert "Traceback" in capsys.readouterr().err
@@ -207,7 +208,7 @@ def test_a_fault_of_the_worker_itself_is_an_error_of_ours_too(monkeypatch, capsy
 
 def test_the_free_memory_is_that_of_the_machine(monkeypatch):
     monkeypatch.undo()
-    assert 1 << 20 < serve_requests.free_memory() < 1 << 50
+    assert 1 << 20 < requests.free_memory() < 1 << 50
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no pipes with paths")

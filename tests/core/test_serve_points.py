@@ -5,9 +5,10 @@ import base64
 import numpy as np
 import pytest
 
-from r5dgs_core.raster import scene_render
-from r5dgs_core.scene import point_edits, scene_file
-from r5dgs_core.scene.point_edits import PointEdit
+from r5dgs_core.editing import point_edits
+from r5dgs_core.editing.point_edits import PointEdit
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import scene_file
 from tests import scenes
 from tests.core.test_serve import CAMERA, CAMERA_JSON, load, talk
 
@@ -53,8 +54,8 @@ def test_edited_points_are_drawn_beside_untouched_rows(path, scene):
     whole = {"scene": 0, "start": 100, "count": 50, "matrix": EYE}
     extended, (place,) = point_edits.extend(scene, [edit])
     rows = ((100, 50, np.eye(4)), (place.start, place.count, place.matrix))
-    pose = scene_render.pose_instances(extended, [scene_render.Instance(*one) for one in rows])
-    expected = scene_render.render_frame(scene, pose, CAMERA, background=None).color.numpy()
+    pose = scene_renderer.pose_instances(extended, [scene_renderer.Instance(*one) for one in rows])
+    expected = scene_renderer.render_frame(scene, pose, CAMERA, background=None).color.numpy()
     *_, (header, arrays) = talk(load(path), points("a", a=edit), picture(whole, entry("a")))
     assert header["ok"], header
     assert header["result"]["gaussians"] == 85 and set(np.unique(arrays["owners"])) == {-1, 0, 1}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import shading
+from r5dgs_core.train.representations import shading
 
 
 def test_a_new_state_keeps_every_colour_also_of_what_is_unlit_in_it():

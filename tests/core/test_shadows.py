@@ -3,7 +3,8 @@
 import numpy as np
 
 from r5dgs_core.scene import cameras
-from r5dgs_core.train import shadows, sweep, triangulation, views
+from r5dgs_core.train import train_views
+from r5dgs_core.train.initialization import plane_sweep, shadows, triangulation
 from tests import scenes
 
 PLANE = (np.array([0.0, 0, 1]), 0.0)
@@ -25,14 +26,14 @@ def shadowed_views(light, darkness=0.4, radius=0.25):
             inside = np.linalg.norm(np.nan_to_num(hits - fallen, nan=99.0), axis=-1) < radius
             image = np.where(inside[..., None], 180 * (1 - darkness), 180) * np.ones(3)
             mask = np.zeros(image.shape[:2], np.uint16)
-            seen.append(views.TrainView(f"v{k}_{s}", camera, float(t), image.astype(np.uint8), mask, None))
+            seen.append(train_views.TrainView(f"v{k}_{s}", camera, float(t), image.astype(np.uint8), mask, None))
     ones = np.ones((1, 7))
     places = triangulation.Places(np.array([1]), path[None], ones > 0, ones, np.array([radius]), ones)
     return seen, places
 
 
 def find(seen, places):
-    return shadows.find_light(seen, sweep.backdrops(seen), places, TIMES, PLANE, np.random.default_rng(0))
+    return shadows.find_light(seen, plane_sweep.backdrops(seen), places, TIMES, PLANE, np.random.default_rng(0))
 
 
 def test_the_direction_of_the_light_is_found():

@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from r5dgs_core.bake import bake, image_evidence, simplify_motion
+from r5dgs_core.config.config import NeedsSection
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.motion.models import MotionModel
-from r5dgs_core.scene import playback
-from r5dgs_core.train import bake, checkpoint, checkpoint_content, image_evidence, simplify_motion
-from r5dgs_core.train.config import NeedsSection
+from r5dgs_core.playback import scene_player
+from r5dgs_core.train import checkpoint, checkpoint_content
 from tests import datasets as tiny_datasets
 
 BRICK, BALL = tiny_datasets.BRICK, tiny_datasets.BALL
@@ -45,7 +46,7 @@ def evidence_of(scene, data, shown=None):
     evidence = image_evidence.ImageEvidence(scene, image_evidence.sample(data.train), None)
     draw, truths = np.random.default_rng(4), evidence._truths
     if shown is not None:
-        player = playback.Player(shown)
+        player = scene_player.Player(shown)
         truths = [evidence._draw(player, row)[0] for row in range(len(truths))]
     evidence._truths = [(t + 0.01 * draw.standard_normal(t.shape)).astype(np.float32) for t in truths]
     evidence.psnr = evidence._psnr(evidence._scene)
@@ -78,7 +79,7 @@ def test_what_rests_rests_and_what_turns_or_slides_slowly_goes_on_so(given):
     assert decisions["motion"] == ("on" if name == "slide" else "off")
     model = scene.groups[BRICK].model
     for t in (0.0, 0.4, truth.t_max, 2 * truth.t_max):
-        quats, displacements = playback.group_poses(scene, t)
+        quats, displacements = scene_player.group_poses(scene, t)
         expected = [MOTIONS[name].angular_velocity * (t - truth.t_max), MOTIONS[name].velocity * (t - truth.t_max)]
         turn = rotations.quats_to_rotvecs(quats[BRICK])
         np.testing.assert_allclose(turn, expected[0], atol=2e-3 if name == "turn" else 0)
@@ -109,7 +110,7 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     row = rows["rotation"]
     assert row["decision"] == "on" and "serves colours" in row["reason"] and "dB" in row["reason"]
     np.testing.assert_allclose(scene.track_poses[BRICK], poses[BRICK], atol=1e-12)
-    later = playback.group_poses(scene, 2 * truth.t_max)
+    later = scene_player.group_poses(scene, 2 * truth.t_max)
     assert scene.groups[BRICK].model.kind == "static"
     np.testing.assert_array_equal(later[0][BRICK], [1, 0, 0, 0])
     np.testing.assert_array_equal(later[1][BRICK], 0)
@@ -140,7 +141,7 @@ def test_another_bind_state_shows_the_same_and_followers_follow(given):
     np.testing.assert_array_equal(rebound.track_poses[:, -1], [[1, 0, 0, 0, 0, 0, 0]] * 4)
     np.testing.assert_allclose(rebound.groups[BRICK].pivot - truth.groups[BRICK].pivot, [0.003, 0, 0], atol=1e-12)
     np.testing.assert_allclose(rebound.track_poses[3, :, 4:], rebound.track_poses[BRICK, :, 4:] * [1, 1, 0], atol=1e-12)
-    before, after = playback.frame(scene, 0.3), playback.frame(rebound, 0.3)
+    before, after = scene_player.frame(scene, 0.3), scene_player.frame(rebound, 0.3)
     np.testing.assert_allclose(after.means, before.means, atol=1e-6)
 
 

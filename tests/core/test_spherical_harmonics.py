@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.model import spherical_harmonics as harmonics
 from r5dgs_core.motion import rotations
+from r5dgs_core.scene import sh_color as harmonics
 
 
 def sphere_quadrature(n=16):

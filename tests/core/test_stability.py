@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from r5dgs_core import cli, stability_training
-from r5dgs_core.motion import models, poses, rotations, se3
-from r5dgs_core.report import stability
-from r5dgs_core.report.stability import cases as stability_cases
-from r5dgs_core.report.stability import scenes as stability_scenes
+from r5dgs_core import stability
+from r5dgs_core.cli import main
+from r5dgs_core.motion import models, rigid_fit, rotations, se3
 from r5dgs_core.scene import validation
+from r5dgs_core.stability import cases as stability_cases
+from r5dgs_core.stability import scenes as stability_scenes
+from r5dgs_core.stability import training
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_a_fit_that_mirrors_fails_where_points_lie_in_a_plane_or_less(monkeypatc
         residuals = np.linalg.norm(target - moved - (source - center) @ rotmat.T, axis=-1)
         return rotations.rotmats_to_quats(rotmat), center, moved, residuals
 
-    monkeypatch.setattr(poses, "_kabsch", mirrored)
+    monkeypatch.setattr(rigid_fit, "_kabsch", mirrored)
     broken = failed(of("degenerate groups"))
     names = {name for _, name in broken}
     assert {"plane: errors are as large as predicted", "3 points: every point is where it belongs"} <= names
@@ -158,7 +159,7 @@ def test_a_case_that_takes_too_long_fails_and_what_prepares_it_does_not_count(mo
 
 
 def test_short_trainings_on_extreme_data_stay_finite():
-    rows = stability.run(stability_training.CASES)
+    rows = stability.run(training.CASES)
     assert [(row.name, row.measured, row.message) for row in rows if row.measured != 0] == []
 
 
@@ -181,19 +182,19 @@ def test_rows_are_json_whatever_they_measured(tmp_path):
 
 def test_the_exit_code_follows_the_rows(monkeypatch, tmp_path, capsys):
     path = tmp_path / "rows.json"
-    monkeypatch.setattr(stability_training, "CASES", ())
+    monkeypatch.setattr(training, "CASES", ())
     monkeypatch.setattr(stability, "CASES", (case(lambda: 0.5),))
-    assert cli.main(["report", "--stability", "--json", str(path), "--progress", "none"]) == 0
+    assert main.main(["report", "--stability", "--json", str(path), "--progress", "none"]) == 0
     assert "1 of 1 cases pass" in capsys.readouterr().out
     monkeypatch.setattr(stability, "CASES", (case(lambda: 2.0),))
-    assert cli.main(["report", "--stability", "--json", str(path), "--progress", "none"]) == 1
+    assert main.main(["report", "--stability", "--json", str(path), "--progress", "none"]) == 1
     assert "failed: topic: name" in capsys.readouterr().out
     assert json.loads(path.read_text())["failed"] == 1
 
 
 def test_a_place_that_cannot_be_written_is_told_before_the_work(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(stability, "run", lambda *_, **__: pytest.fail("ran"))
-    assert cli.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
+    assert main.main(["report", "--stability", "--json", str(tmp_path / "none" / "rows.json")]) == 3
     assert "make it first" in capsys.readouterr().err
 
 

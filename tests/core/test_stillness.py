@@ -10,10 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import SceneFileError
-from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.train import config, normalization, stillness, views
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
+from r5dgs_core.train import normalization
+from r5dgs_core.train import train_views as training_views
+from r5dgs_core.train.representations import static
 from tests import datasets as tiny_datasets
 
 MOVING_PARTS = (
@@ -23,14 +27,16 @@ MOVING_PARTS = (
 RUN = """
 import json, sys
 from pathlib import Path
-from r5dgs_core.train import bake, run
-from r5dgs_core.scene import playback, scene_file
+from r5dgs_core.bake import bake
+from r5dgs_core.train import run
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
 from tests import datasets as tiny
 data, folder = Path(sys.argv[1]), Path(sys.argv[2])
 run.train(data, folder / "run", tiny.settings("train.iterations=150", *sys.argv[3:]))
 bake.run_bake(folder / "run", folder / "still.r5dgs")
 scene = scene_file.read(folder / "still.r5dgs")
-playback.frame(scene, 2.0)
+scene_player.frame(scene, 2.0)
 print(json.dumps(sorted(name for name in sys.modules if name.startswith("r5dgs_core"))))
 """
 
@@ -42,7 +48,7 @@ def still(tmp_path_factory):
 
 def train_views(data):
     read = datasets.read(data.root)
-    return views.load(read, normalization.from_cameras([v.camera for v in read.train]), None)
+    return training_views.load(read, normalization.from_cameras([v.camera for v in read.train]), None)
 
 
 @pytest.mark.parametrize("representation", ["tracks", "field"])
@@ -66,22 +72,22 @@ def test_a_scene_at_rest_has_nothing_that_moves_in_run_file_and_memory(still, tm
     assert {decisions[name] for name in ("tracks", "rotation", "shading", "shadows", "residuals")} == {"off"}
     assert [o.name for o in scene.objects] == ["background", "brick", "ball"]
     assert all(group.model.is_static for group in scene.groups)
-    np.testing.assert_array_equal(playback.frame(scene, 7.0).means, scene.means)
+    np.testing.assert_array_equal(scene_player.frame(scene, 7.0).means, scene.means)
 
 
 def test_what_moves_a_little_is_seen(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
-    assert stillness.nothing_moves(at_rest) and not stillness.nothing_moves(moving)
+    assert static.nothing_moves(at_rest) and not static.nothing_moves(moving)
     draw = np.random.default_rng(0)
 
     def noisy(view, sigma):
         grain = draw.normal(0, sigma, view.image.shape)
         return dataclasses.replace(view, image=np.clip(view.image + grain, 0, 255).astype(np.uint8))
 
-    assert stillness.nothing_moves([noisy(view, 4.0) for view in at_rest])
+    assert static.nothing_moves([noisy(view, 4.0) for view in at_rest])
     changed = at_rest[-1].image.copy()
     changed[8:16, 8:16] = 255 - changed[8:16, 8:16]
-    assert not stillness.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
+    assert not static.nothing_moves([*at_rest[:-1], dataclasses.replace(at_rest[-1], image=changed)])
 
 
 def test_cameras_that_show_one_time_each_leave_it_open(still):
@@ -91,14 +97,14 @@ def test_cameras_that_show_one_time_each_leave_it_open(still):
         dataclasses.replace(v, camera=dataclasses.replace(v.camera, T_cam_world=v.camera.T_cam_world + 1e-3 * k))
         for k, v in enumerate(one_each)
     ]
-    assert not stillness.nothing_moves(turned)
-    assert stillness.nothing_moves([v for v in seen if v.t == seen[0].t])
+    assert not static.nothing_moves(turned)
+    assert static.nothing_moves([v for v in seen if v.t == seen[0].t])
 
 
 def test_your_word_wins_over_what_the_images_show(still, tiny):
     at_rest, moving = train_views(still), train_views(tiny)
-    assert not stillness.applies(at_rest, config.Config().replace(**{"needs.tracks": "on"}))
-    assert stillness.applies(moving, config.Config().replace(**{"needs.tracks": "off"}))
+    assert not static.applies(at_rest, config.Config().replace(**{"needs.tracks": "on"}))
+    assert static.applies(moving, config.Config().replace(**{"needs.tracks": "off"}))
 
 
 def test_a_file_with_half_of_the_tracks_is_refused(still, tmp_path):

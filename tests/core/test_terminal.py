@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core import cli, progress, terminal
+from r5dgs_core import progress, terminal
+from r5dgs_core.cli import main
 from r5dgs_core.scene import scene_file
 from tests import scenes
 
@@ -45,21 +46,21 @@ def assert_harmless(captured):
 
 @pytest.mark.parametrize("command", [["info"], ["check"], ["objects"], ["query", "mug"]])
 def test_no_command_prints_what_moves_the_cursor(path, capsys, command):
-    cli.main([command[0], str(path), *command[1:]])
+    main.main([command[0], str(path), *command[1:]])
     captured = capsys.readouterr()
     assert "mug" in captured.out + captured.err
     assert_harmless(captured)
 
 
 def test_json_keeps_the_name_exactly(path, capsys):
-    assert cli.main(["info", str(path), "--json"]) == 0
+    assert main.main(["info", str(path), "--json"]) == 0
     captured = capsys.readouterr()
     assert EVIL in {item["name"] for item in json.loads(captured.out)["objects"]}
     assert_harmless(captured)
 
 
 def test_an_error_is_one_line_whatever_the_path_holds(tmp_path, capsys):
-    assert cli.main(["info", str(tmp_path / EVIL)]) != 0
+    assert main.main(["info", str(tmp_path / EVIL)]) != 0
     captured = capsys.readouterr()
     assert_harmless(captured)
     assert captured.err.count("\n") == 1

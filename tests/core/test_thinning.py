@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.train import thinning
+from r5dgs_core.train.initialization import thinning
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 

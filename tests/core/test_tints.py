@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.scene import harmonics, tints
+from r5dgs_core.color import tints
+from r5dgs_core.scene import spherical_harmonics
 
 
 def colors(sh, basis):
@@ -18,7 +19,7 @@ def test_the_colour_is_multiplied_from_every_direction(degree):
     sh = rng.normal(size=(50, count, 3))
     tint = np.array([0.2, 1.0, 3.0])
     for _ in range(8):
-        basis = np.concatenate([[harmonics.C0], rng.normal(size=count - 1)])
+        basis = np.concatenate([[spherical_harmonics.C0], rng.normal(size=count - 1)])
         np.testing.assert_allclose(colors(tints.tint_sh(sh, tint), basis), tint * colors(sh, basis), atol=1e-12)
 
 

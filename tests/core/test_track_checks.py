@@ -7,10 +7,11 @@ import logging
 import numpy as np
 import pytest
 
+from r5dgs_core.bake import bake, track_checks
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.motion import rotations
 from r5dgs_core.scene import validation
-from r5dgs_core.train import bake, checkpoint, track_checks
+from r5dgs_core.train import checkpoint
 from tests import datasets as tiny_datasets
 
 TIMES = np.array([0.0, 0.25, 0.5, 0.75])

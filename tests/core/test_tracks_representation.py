@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import images
 from r5dgs_core.model.gaussians import Gaussians
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import config, evidence, initialization, tracks_representation, triangulation
+from r5dgs_core.train.initialization import evidence, initialize, triangulation
+from r5dgs_core.train.representations import tracks as tracks_representation
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 from tests import scenes
@@ -27,9 +29,7 @@ def truth(t):
 def make(measured, absent=None, first=3, path=None):
     """One body that starts at knot ``first``; its path is known from masks where ``measured``, straight elsewhere."""
     count = len(TIMES)
-    tracks = initialization.FirstTracks(
-        TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3)
-    )
+    tracks = initialize.FirstTracks(TIMES, np.zeros((2, 3)), np.zeros((2, count, 3)), np.array([1]), None, np.zeros(3))
     centers = np.asarray(path if path is not None else [truth(t)[0] for t in TIMES])[None]
     places = triangulation.Places(
         np.array([1]), centers, np.array([measured], bool), np.ones((1, count)), np.ones(1), np.ones((1, count))

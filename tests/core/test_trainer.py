@@ -9,7 +9,8 @@ import torch
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import TrainingError
 from r5dgs_core.motion import rotations
-from r5dgs_core.train import checkpoint, losses, tracks_representation
+from r5dgs_core.train import checkpoint, losses
+from r5dgs_core.train.representations import tracks
 from r5dgs_core.train.trainer import Trainer
 from tests import datasets as tiny_datasets
 
@@ -77,7 +78,7 @@ def test_training_recovers_how_the_objects_move(restored, tiny, body):
 def unbroken(tiny, tmp_path_factory):
     """States of one run of 60 steps: after 9, after 30, at the end; as files, as a kill leaves them."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(tracks_representation, "REBASE_EVERY", 25)
+    patch.setattr(tracks, "REBASE_EVERY", 25)
     trainer = make(tiny)
     folder, start = tmp_path_factory.mktemp("states"), len(trainer.gaussians)
     for k in (9, 30, 60):

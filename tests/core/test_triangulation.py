@@ -8,7 +8,8 @@ from scipy import ndimage
 
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.scene import cameras
-from r5dgs_core.train import normalization, triangulation, views
+from r5dgs_core.train import normalization, train_views
+from r5dgs_core.train.initialization import triangulation
 from tests import datasets as tiny_datasets
 from tests import scenes
 
@@ -25,7 +26,7 @@ def disc_view(camera, t, balls):
         along = rays @ arm
         inside = (arm @ arm - along**2 < radius**2) & (along < nearest)
         mask[inside], nearest[inside] = object_id, along[inside]
-    return views.TrainView("v", camera, t, np.zeros((*mask.shape, 3), np.uint8), mask, None)
+    return train_views.TrainView("v", camera, t, np.zeros((*mask.shape, 3), np.uint8), mask, None)
 
 
 def ring(count=5):
@@ -45,7 +46,7 @@ def test_centres_of_moving_balls_are_found_to_a_fraction_of_a_percent():
 def test_objects_of_the_tiny_set_are_found_from_drawn_masks(tiny):
     dataset = datasets.read(tiny.root)
     norm = normalization.from_cameras([v.camera for v in dataset.train])
-    places = triangulation.locate(views.load(dataset, norm, None), tiny_datasets.OBSERVED, 5e-4)
+    places = triangulation.locate(train_views.load(dataset, norm, None), tiny_datasets.OBSERVED, 5e-4)
     for row, object_id in enumerate((tiny_datasets.BRICK, tiny_datasets.BALL)):
         truth = np.stack([tiny.center(object_id, t) for t in tiny_datasets.OBSERVED])
         found = norm.points_to_world(places.centers[row])

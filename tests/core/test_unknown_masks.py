@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import torch
 
+from r5dgs_core.bake import bake
+from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import masks
+from r5dgs_core.evaluation import evaluate
 from r5dgs_core.model.gaussians import Gaussians
-from r5dgs_core.report import evaluate
-from r5dgs_core.scene import playback
-from r5dgs_core.train import bake, config, hull, identity, normalization, run, scatter, sweep, triangulation, views
-from r5dgs_core.train.posing import Splats
+from r5dgs_core.playback import scene_player
+from r5dgs_core.train import normalization, run, train_views
+from r5dgs_core.train.identity import identity_training
+from r5dgs_core.train.initialization import plane_sweep, scatter, triangulation, visual_hull
+from r5dgs_core.train.representations.fused_posing import Splats
 from tests import datasets as tiny_datasets
 
 CLASSES = {0: 0, tiny_datasets.BRICK: 1, tiny_datasets.BALL: 2}
@@ -22,7 +26,7 @@ CLASSES = {0: 0, tiny_datasets.BRICK: 1, tiny_datasets.BALL: 2}
 def seen(tiny):
     """Training views in the world's own coordinates."""
     dataset = datasets.read(tiny.root)
-    return views.load(dataset, normalization.Normalization(np.zeros(3), 1.0), None)
+    return train_views.load(dataset, normalization.Normalization(np.zeros(3), 1.0), None)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +34,7 @@ def pose(tiny):
     """Splats of the true scene at a view's time."""
 
     def at(view):
-        frame = playback.frame(tiny.truth, view.t)
+        frame = scene_player.frame(tiny.truth, view.t)
         return Splats(
             *(torch.from_numpy(np.asarray(a, np.float32)) for a in (frame.means, frame.quats)),
             torch.from_numpy(np.exp(np.asarray(tiny.truth.log_scales, np.float32))),
@@ -56,7 +60,7 @@ def unmasked(view):
 
 def joint(training: str):
     settings = config.load(None, [f"identity.training={training}", "identity.every=1", "identity.weight=1"])
-    return identity.JointIdentity(CLASSES, settings, torch.Generator().manual_seed(0))
+    return identity_training.JointIdentity(CLASSES, settings, torch.Generator().manual_seed(0))
 
 
 def test_unknown_pixels_have_no_gradient(seen):
@@ -72,9 +76,9 @@ def test_unknown_pixels_have_no_gradient(seen):
 
 def test_a_mask_that_knows_nothing_votes_for_nothing(seen, pose):
     count = len(pose(seen[0]).means)
-    assert not identity.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
-    several = identity.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
-    assert torch.equal(several, identity.votes(seen[:6], pose, CLASSES, count)) and several.any()
+    assert not identity_training.votes([unknown(v) for v in seen], pose, CLASSES, count).any()
+    several = identity_training.votes([*seen[:6], *(unknown(v) for v in seen[6:])], pose, CLASSES, count)
+    assert torch.equal(several, identity_training.votes(seen[:6], pose, CLASSES, count)) and several.any()
 
 
 def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen, pose):
@@ -86,10 +90,10 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
         some = [  # every camera keeps a third of its masks
             v if (k + k // 6) % 3 == 0 else marked(v, v.mask == tiny_datasets.BALL, missed) for k, v in enumerate(seen)
         ]
-        labels = identity.elect(identity.votes(some, pose, CLASSES, len(truth)), fallback)
+        labels = identity_training.elect(identity_training.votes(some, pose, CLASSES, len(truth)), fallback)
         settings = config.load(None, ["identity.iterations=60"])
         means = torch.from_numpy(tiny.truth.means)
-        encodings, weight, bias = identity.train_encodings(
+        encodings, weight, bias = identity_training.train_encodings(
             some, pose, CLASSES, labels, settings, means, torch.Generator().manual_seed(0)
         )
         return labels, (encodings @ weight.T + bias).argmax(1)
@@ -120,8 +124,8 @@ def test_a_hull_is_not_cut_where_a_mask_is_unknown(tiny, seen):
 
     def spread_of(value):
         cut = [marked(then[0], side[None] & (then[0].mask == tiny_datasets.BALL), value), *then[1:]]
-        points, _ = hull.carve(cut, tiny_datasets.BALL, center, 0.5, 400, np.random.default_rng(0))
-        at, _, valid = hull.pixel_indices(then[0], points)
+        points, _ = visual_hull.carve(cut, tiny_datasets.BALL, center, 0.5, 400, np.random.default_rng(0))
+        at, _, valid = visual_hull.pixel_indices(then[0], points)
         return side[at[valid]].mean()
 
     assert spread_of(masks.UNKNOWN) > 0.3
@@ -130,20 +134,22 @@ def test_a_hull_is_not_cut_where_a_mask_is_unknown(tiny, seen):
 
 def test_what_no_mask_knows_is_background_to_the_backdrops(seen):
     for one, other in zip(
-        sweep.backdrops([unknown(v) for v in seen]), sweep.backdrops([unmasked(v) for v in seen]), strict=True
+        plane_sweep.backdrops([unknown(v) for v in seen]),
+        plane_sweep.backdrops([unmasked(v) for v in seen]),
+        strict=True,
     ):
         np.testing.assert_array_equal(one.image, other.image)
         np.testing.assert_array_equal(one.known, other.known)
 
 
 def test_what_some_masks_know_is_taken_from_them_alone(seen):
-    (same,) = sweep.by_camera(seen, 1)
+    (same,) = plane_sweep.by_camera(seen, 1)
     cover = np.zeros(same[0].mask.shape, bool)
     cover[5:15, 5:15] = True
     clean = marked(same[0], True, 0)
     dirty = dataclasses.replace(unknown(same[1]), image=np.full_like(same[1].image, 255))
     hidden = marked(clean, cover, 1)
-    (backdrop,) = sweep.backdrops([hidden, dirty, dirty])
+    (backdrop,) = plane_sweep.backdrops([hidden, dirty, dirty])
     assert not backdrop.known[6:14, 6:14].any()  # an object there; what the others show is perhaps the same one
     np.testing.assert_allclose(backdrop.image[20:], clean.image[20:] / 255, atol=1e-6)
 

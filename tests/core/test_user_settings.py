@@ -5,10 +5,12 @@ import sys
 
 import pytest
 
-from r5dgs_core import cli, user_settings
+from r5dgs_core import user_settings
+from r5dgs_core.cli import main
+from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.config import config, config_keys
 from r5dgs_core.errors import ConfigError
-from r5dgs_core.exit_status import ExitStatus
-from r5dgs_core.train import checkpoint, config, config_keys
+from r5dgs_core.train import checkpoint
 from tests import datasets as tiny_datasets
 from tests.command_line import complaint
 
@@ -23,7 +25,7 @@ def place():
 
 def test_without_a_file_nothing_is_set(place, capsys):
     assert user_settings.read() == {}
-    assert cli.main(["config", "--user"]) == 0
+    assert main.main(["config", "--user"]) == 0
     shown = capsys.readouterr().out
     assert str(place) in shown and "not there yet" in shown
     assert all(f"{key} = (not set)" in shown for key in user_settings.MEANINGS)
@@ -33,14 +35,14 @@ def test_without_a_file_nothing_is_set(place, capsys):
 def test_what_is_set_is_read_again(place, tmp_path, capsys, name):
     folder = tmp_path / name
     folder.mkdir()
-    assert cli.main(["config", "--user", "set", "encoder", str(folder)]) == 0
-    assert cli.main(["config", "--user", "set", "worker_python", sys.executable]) == 0
+    assert main.main(["config", "--user", "set", "encoder", str(folder)]) == 0
+    assert main.main(["config", "--user", "set", "worker_python", sys.executable]) == 0
     assert user_settings.read() == {"encoder": str(folder), "worker_python": sys.executable}
     capsys.readouterr()
-    assert cli.main(["config", "--user", "--json"]) == 0
+    assert main.main(["config", "--user", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown == {"path": str(place), "settings": user_settings.read()}
-    assert cli.main(["config", "--user", "set", "encoder", ""]) == 0
+    assert main.main(["config", "--user", "set", "encoder", ""]) == 0
     assert list(user_settings.read()) == ["worker_python"] and [p.name for p in place.parent.iterdir()] == [place.name]
 
 
@@ -120,7 +122,7 @@ def test_every_key_of_the_configuration_has_a_meaning_and_a_unit():
 
 def test_config_prints_defaults_files_and_runs(tiny, tmp_path, capsys):
     def shown(*target):
-        assert cli.main(["config", *map(str, target), "--json"]) == 0
+        assert main.main(["config", *map(str, target), "--json"]) == 0
         return {row["name"]: row for row in json.loads(capsys.readouterr().out)}
 
     assert all(row["value"] == row["default"] for row in shown().values())
@@ -132,7 +134,7 @@ def test_config_prints_defaults_files_and_runs(tiny, tmp_path, capsys):
 
     checkpoint.create_run(tmp_path / "run", datasets.read(tiny.root), settled)
     assert shown(tmp_path / "run")["train.seed"]["value"] == 5
-    assert cli.main(["config", str(tmp_path / "run")]) == 0
+    assert main.main(["config", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out
     assert "seed = 5  # integer; default 0" in text and "    # Seed of all random draws." in text
     assert max(map(len, text.splitlines())) <= 80

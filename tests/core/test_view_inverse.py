@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r5dgs_core.scene import view_inverse
+from r5dgs_core.color import view_inverse
 
 
 def film(colors):

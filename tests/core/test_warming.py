@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import compile as compilation
-from r5dgs_core.raster import warming
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.render import warm_up
 from r5dgs_core.scene import scene_file
 from tests import datasets as tiny_datasets
 from tests import scenes
@@ -23,21 +23,24 @@ USE_EVERYTHING = """
 import sys
 from pathlib import Path
 import numpy as np
-from r5dgs_core.raster import compile, scene_render, stage
-from r5dgs_core.scene import playback, scene_file
-from r5dgs_core.train import config, run
+from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.render import scene_renderer, incremental_renderer
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
+from r5dgs_core.config import config
+from r5dgs_core.train import run
 
 scene = scene_file.read(Path(sys.argv[1]))
 for t in (0.1, 0.9):
-    scene_render.render_frame(scene, playback.frame(scene, t), scene.cameras[0])
-drawn, body = stage.Stage(scene), scene.object(2)
+    scene_renderer.render_frame(scene, scene_player.frame(scene, t), scene.cameras[0])
+drawn, body = incremental_renderer.Stage(scene), scene.object(2)
 for x in (0.0, 0.1, 0.2, 0.3):
     moved = np.eye(4)
     moved[0, 3] = x
-    whole = scene_render.Instance(0, body.start, np.eye(4))
-    drawn.render([whole, scene_render.Instance(body.start, body.count, moved)], scene.cameras[0])
+    whole = scene_renderer.Instance(0, body.start, np.eye(4))
+    drawn.render([whole, scene_renderer.Instance(body.start, body.count, moved)], scene.cameras[0])
 run.train(Path(sys.argv[2]), Path(sys.argv[3]), config.load(None, sys.argv[4:]))
-print(compile.compiled())
+print(compilation.compiled())
 """
 
 
@@ -92,7 +95,7 @@ def talk(cache, scene_path):
     draw = {"command": "render", "camera": view, "instances": instances, "sky": sky, "near": 0.01, "want": ["owners"]}
     lines = request(0, command="hello") + request(1, command="load", paths=[str(scene_path)])
     lines += request(2, **draw) + request(3, **draw)
-    return list(headers(io.BytesIO(finish(start(cache, "-m", "r5dgs_core.serve"), lines)[0])))
+    return list(headers(io.BytesIO(finish(start(cache, "-m", "r5dgs_core.worker.server"), lines)[0])))
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +147,7 @@ def test_after_it_neither_pictures_nor_training_compile_anything(warm_ups, cache
 
 
 def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
-    process = start(tmp_path / "empty", "-m", "r5dgs_core.serve")
+    process = start(tmp_path / "empty", "-m", "r5dgs_core.worker.server")
     process.stdin.write(request(0, command="hello"))
     process.stdin.flush()
     events = headers(process.stdout)
@@ -157,11 +160,11 @@ def test_a_worker_that_is_left_while_it_compiles_ends_at_once(tmp_path):
 def test_kernels_of_gradients_are_made_ready_inside_inference_too(mode):
     stages = []
     with mode():
-        warming.warm_up(progress=stages.append)
+        warm_up.warm_up(progress=stages.append)
     assert stages[-1] == "gradients of colors"
 
 
 def test_importing_the_rasterizer_needs_neither_numba_nor_its_time():
-    script = "import sys, r5dgs_core.raster, r5dgs_core.raster.scene_render; print('numba' in sys.modules)"
+    script = "import sys, r5dgs_core.raster, r5dgs_core.render.scene_renderer; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

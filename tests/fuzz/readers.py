@@ -18,14 +18,19 @@ import torch
 import torch._dynamo  # noqa: F401  the first picture imports it, which takes longer than an input may
 
 from r5dgs_core import errors
+from r5dgs_core.config import config
 from r5dgs_core.data import colmap, dataset, images, mask_notes, masks
+from r5dgs_core.formats import ply
 from r5dgs_core.importing import importer, weights
-from r5dgs_core.raster import rasterize, scene_render
-from r5dgs_core.scene import cameras, lookup, meanings, playback, ply, quality, scene_file, scene_info
+from r5dgs_core.language.encoders import encoder_base
+from r5dgs_core.playback import scene_info, scene_player
+from r5dgs_core.raster import rasterize
+from r5dgs_core.render import scene_renderer
+from r5dgs_core.scene import cameras, quality, scene_file
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
-from r5dgs_core.semantics import encoders
-from r5dgs_core.train import checkpoint, config
+from r5dgs_core.search import embedding_search, object_search
+from r5dgs_core.train import checkpoint
 from tests import colmap_files, foreign_runs, scenes
 from tests.fuzz import mutations
 from tests.fuzz.campaign import Files, Reader
@@ -136,8 +141,8 @@ def use_scene(scene: Scene, path: Path) -> None:
         first, last = float(scene.track_times[0]), scene.t_max
         later = last + max(0.3 * (last - first), 1 / scene.frames_per_unit)
         frames = []
-        for mode in ("rigid", *playback.modes(scene)[-1:]):
-            player = playback.Player(scene, mode)
+        for mode in ("rigid", *scene_player.modes(scene)[-1:]):
+            player = scene_player.Player(scene, mode)
             frames += [player.frame(t) for t in (first - 1, 0.7 * first + 0.3 * last, last, later)]
         for frame in frames:
             for name in ("means", "quats", "log_scales", "group_quats", "group_displacements"):
@@ -145,14 +150,14 @@ def use_scene(scene: Scene, path: Path) -> None:
         for frame, camera in zip((frames[1], frames[-1]), (*scene.cameras[:2], None, None), strict=False):
             if camera is not None and len(scene.means):
                 small = cameras.crop(camera, (camera.width - SIDE) // 2, (camera.height - SIDE) // 2, SIDE, SIDE)
-                output = scene_render.render_frame(scene, frame, small, backend="reference")
+                output = scene_renderer.render_frame(scene, frame, small, backend="reference")
                 assert torch.isfinite(output.color).all() and torch.isfinite(output.alpha).all(), (
                     "picture is not finite"
                 )
-        stored = meanings.Meanings.of(scene)
+        stored = embedding_search.Meanings.of(scene)
         if stored is not None:
-            meanings.ask(stored, stored.vocabulary_embeddings[0] if len(stored.vocabulary) else np.zeros(0))
-        lookup.search(scene, "mug")
+            embedding_search.ask(stored, stored.vocabulary_embeddings[0] if len(stored.vocabulary) else np.zeros(0))
+        object_search.search(scene, "mug")
         json.dumps(scene_info.info(scene), allow_nan=False).encode()
         again = scene_file.read(scene_file.write(scene, path))
         assert len(again.means) == len(scene.means) and again.objects == scene.objects
@@ -603,7 +608,7 @@ def notes_reader() -> Reader:
         (folder / "scene.r5dgs").touch()
         (folder / "evaluation.json").touch()
         assert quality.of(scene, folder / "scene.r5dgs").text()
-        encoders.read_json(folder / "config.json")
+        encoder_base.read_json(folder / "config.json")
 
     return Reader(
         "notes", lambda random: {name: mutations.tree(random, content) for name, content in base.items()}, read

@@ -1,0 +1,143 @@
+"""Give the segments of each image to objects, each object once, by what the other images say.
+
+Notation: S segments of all images, s of one image, K objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from . import leave_one_out, segment_stack
+
+PASSES = 3
+STAY = 1.5  # factor on the score of the object that a segment had before
+LOWEST = 0.3  # share of an object's usual score below which a segment is not it
+PART = 0.6  # share of a segment, relative to what is usual, that lies in an object where it is a part of it
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """Objects of segments.
+
+    Attributes:
+        labels: Object of each, 0 = background, -1 = none. [S]
+        scores: Leave-one-out IoU with it and that of its run, in shares of what is usual for it, with the bonus of
+            those that stay; 0 where none. [S]
+        plain: The same without run and bonus. [S]
+        margins: Score over the sum of it and that of the next best object: 0.5 is a draw. [S]
+        agreement: Mean leave-one-out IoU of the objects' pixels: what to compare assignments by.
+        usual_iou: Median leave-one-out IoU of the segments that had an object before.
+    """
+
+    labels: np.ndarray
+    scores: np.ndarray
+    plain: np.ndarray
+    margins: np.ndarray
+    agreement: float
+    usual_iou: float
+
+
+def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
+    """Ask again for every image until nothing changes, `PASSES` times at most.
+
+    Args:
+        stack: The segments.
+        runs: Run of each, -1 for background. [S]
+        labels: Objects to begin with. [S]
+        count: Number of objects.
+    """
+    found = assign(stack, runs, labels, count)
+    for _ in range(PASSES - 1):
+        if (found.labels == labels).all():
+            break
+        labels = found.labels
+        found = assign(stack, runs, labels, count)
+    return found
+
+
+def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
+    """Give every segment an object by the votes of ``labels``; arguments as of `refine`."""
+    found = list(leave_one_out.overlaps(stack, labels, count))
+    ious = np.concatenate([overlap.ious for overlap in found])
+    shares = np.concatenate([overlap.shares for overlap in found])
+    objects = np.flatnonzero(stack.ids > 0)
+    own = objects[labels[objects] > 0]
+    usual = np.full(count + 1, np.median(ious[own, labels[own]]) if len(own) else 1.0)
+    usual_share = float(np.median(shares[own, labels[own]])) if len(own) else 1.0
+    for k in range(1, count + 1):
+        mine = ious[own[labels[own] == k], k]
+        usual[k] = (mine.sum() + 2 * usual[0]) / (len(mine) + 2)
+    plain = ious / np.maximum(usual, 1e-6)
+    # The worse segments agree with what the other images say, the more the whole run is asked.
+    scores = usual[0] * plain + (1 - usual[0]) * _run_means(plain, runs, stack.pixels)
+    scores[own, labels[own]] *= STAY
+    scores[:, 0] = 0.0
+    result = np.where(stack.ids > 0, -1, 0)
+    reached, margins = np.zeros(len(result)), np.full(len(result), 0.5)
+    ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
+    for start, stop, overlap in zip(ends, ends[1:], found, strict=False):
+        rows = objects[(objects >= start) & (objects < stop)]
+        if not len(rows) or not count:
+            continue
+        table = scores[rows]
+        at, to = optimize.linear_sum_assignment(np.where(table >= LOWEST, table, 0.0), maximize=True)
+        good = table[at, to] >= LOWEST
+        result[rows[at[good]]] = to[good]
+        _add_parts(result, rows, start, overlap, usual_share)
+        for row in rows[result[rows] > 0]:
+            k = result[row]
+            reached[row] = scores[row, k]
+            others = np.delete(scores[row], k).max(initial=0.0)
+            margins[row] = reached[row] / max(reached[row] + others, 1e-9)
+    own = np.where(result > 0, np.take_along_axis(plain, np.maximum(result, 0)[:, None], axis=1)[:, 0], 0.0)
+    return Assignment(result, reached, own, margins, _agreement(stack, ious, labels), float(usual[0]))
+
+
+def measure(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Assignment:
+    """How well the images agree with each other on labels as they are; arguments as of `refine`."""
+    ious = np.concatenate([overlap.ious for overlap in leave_one_out.overlaps(stack, labels, count)])
+    own = np.flatnonzero(labels > 0)
+    scores = np.zeros(len(labels))
+    scores[own] = ious[own, labels[own]]
+    usual = float(np.median(scores[own])) if len(own) else 0.0
+    plain = scores / max(usual, 1e-6)
+    margins = np.full(len(labels), 0.5)
+    return Assignment(labels, plain, plain, margins, _agreement(stack, ious, labels), usual)
+
+
+def _agreement(stack: segment_stack.Stack, ious: np.ndarray, labels: np.ndarray) -> float:
+    rows = np.flatnonzero(stack.ids > 0)
+    kept = np.where(labels[rows] > 0, ious[rows, np.maximum(labels[rows], 0)], 0.0)
+    return float((kept * stack.pixels[rows]).sum() / max(stack.pixels[rows].sum(), 1))
+
+
+def _add_parts(result: np.ndarray, rows: np.ndarray, start: int, overlap: leave_one_out.Overlaps, usual: float) -> None:
+    """Let what is left join an object that lies over it, where the object is better explained by both together."""
+    for row in sorted(rows[result[rows] < 0], key=lambda r: -overlap.segments[r - start]):
+        k = int(overlap.shares[row - start, 1:].argmax()) + 1
+        if overlap.shares[row - start, k] < PART * usual:
+            continue
+        mine = rows[result[rows] == k] - start
+        before, after = (_joint_iou(overlap, m, k) for m in (mine, np.append(mine, row - start)))
+        if after > before:
+            result[row] = k
+
+
+def _joint_iou(overlap: leave_one_out.Overlaps, rows: np.ndarray, k: int) -> float:
+    common = overlap.common[rows, k].sum()
+    return common / max(overlap.segments[rows].sum() + overlap.objects[k] - common, 1e-9)
+
+
+def _run_means(scores: np.ndarray, runs: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Mean over the segments of the same run, weighted by their sizes. [S, K + 1]"""
+    out = np.zeros_like(scores)
+    rows = np.flatnonzero(runs >= 0)
+    if len(rows):
+        sums = np.zeros((runs.max() + 1, scores.shape[1]))
+        np.add.at(sums, runs[rows], scores[rows] * pixels[rows, None])
+        sums /= np.bincount(runs[rows], pixels[rows])[:, None]
+        out[rows] = sums[runs[rows]]
+    return out

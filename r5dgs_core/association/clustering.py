@@ -1,0 +1,209 @@
+"""Which runs of segments are one object: best pairs first, and what stands side by side in an image stays apart.
+
+How well two views of one object agree depends on how far the geometry is off and on how much of it both see, so no
+fixed threshold tells same from different. What agreement can be had between two views is measured first: the usual
+IoU of runs that are each other's best match. Everything after is relative to that. In the same way the incoming ids
+count as far as they are found to be worth something: where runs of one object usually have one id, and others have not.
+
+Notation: T runs, I images, V views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from . import segment_stack
+
+SAME = 0.3  # share of the usual agreement at which two groups of runs are one object
+SIDE_BY_SIDE = 0.08  # share of the shorter group's images in which both may be seen apart
+PRIOR = 5.0  # pairs of runs that the usual agreement of all views counts for in that of two views
+PART = 0.6  # share of the usual agreement of an object with itself that lies in a larger one where it is a part of that
+HINT = 4.0  # most that a common id counts for, as a factor on agreement, and that different ids count against
+THIN = 0.1  # share of the smaller run's pixels below which common evidence is weak
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What runs have in common, summed over the pairs of their images.
+
+    Attributes:
+        common: Weight of Gaussians in both. [T, T]
+        seen: Weight of a run (row) that the other's images (column) see. [T, T]
+        together: Images that show both. [T, T]
+        lengths: Images that show each. [T]
+        pixels: Mean size of each. [T]
+        views: View of each. [T]
+        ids: Incoming id of each. [T]
+    """
+
+    common: np.ndarray
+    seen: np.ndarray
+    together: np.ndarray
+    lengths: np.ndarray
+    pixels: np.ndarray
+    views: np.ndarray
+    ids: np.ndarray
+
+    @property
+    def union(self) -> np.ndarray:
+        """Weight in either that the other's images see. [T, T]"""
+        return self.seen + self.seen.T - self.common
+
+
+def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
+    """Sum the evidence of segments up to that of their runs."""
+    rows = np.flatnonzero(runs >= 0)
+    count = int(runs.max(initial=-1)) + 1
+    member = sparse.csr_matrix((np.ones(len(rows), np.float32), (runs[rows], rows)), (count, len(runs)))
+    shared = member @ stack.shared
+    images = sparse.csr_matrix(
+        (np.ones(len(rows), np.float32), (runs[rows], stack.images[rows])), (count, len(stack.views))
+    )
+    lengths = np.bincount(runs[rows], minlength=count)
+    first = rows[np.unique(runs[rows], return_index=True)[1]]
+    return Evidence(
+        common=sparse.csr_matrix(shared @ shared.T).toarray().astype(float),
+        seen=sparse.csr_matrix(shared @ stack.seen.T @ images.T).toarray().astype(float),
+        together=(images @ images.T).toarray(),
+        lengths=lengths,
+        pixels=np.bincount(runs[rows], stack.pixels[rows], minlength=count) / np.maximum(lengths, 1),
+        views=stack.views[stack.images[first]],
+        ids=stack.ids[first],
+    )
+
+
+def cluster(evidence: Evidence) -> np.ndarray:
+    """Join runs to objects.
+
+    Returns:
+        Object of each run, numbered by falling number of images times pixels. [T]
+    """
+    count = len(evidence.lengths)
+    if not count:
+        return np.zeros(0, int)
+    mutual = _mutual(evidence)
+    level = _usual(evidence, mutual)
+    pairs = np.outer(evidence.lengths, evidence.lengths)
+    thin = THIN * np.minimum(evidence.pixels[:, None], evidence.pixels[None]) * pairs
+    labels = _join(evidence.common * _hints(evidence, mutual), level * (evidence.union + thin), evidence)
+    labels = _absorb(evidence, labels)
+    size = np.bincount(labels, evidence.lengths * evidence.pixels, minlength=count)
+    rank = np.empty(count, int)
+    rank[np.argsort(-size, kind="stable")] = np.arange(count)
+    return rank[labels]
+
+
+def _mutual(evidence: Evidence) -> np.ndarray:
+    """Whether runs of different images are each other's best match in the views of both. [T, T] bool"""
+    ious = np.where(evidence.together > 0, 0.0, evidence.common / np.maximum(evidence.union, 1e-9))
+    views, at = np.unique(evidence.views, return_inverse=True)
+    best = np.stack([ious[:, at == v].max(axis=1) for v in range(len(views))], axis=1)  # of each run in each view
+    return (ious > 0) & (ious >= best[:, at]) & (ious >= best[:, at].T)
+
+
+def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
+    """IoU that runs of one object usually have between the views of any two runs. [T, T]"""
+    views, at = np.unique(evidence.views, return_inverse=True)
+    rows, columns = np.nonzero(mutual)
+    if not len(rows):
+        return np.ones_like(evidence.common)
+    weight = np.minimum(evidence.lengths[rows], evidence.lengths[columns]).astype(float)
+    found = evidence.common[rows, columns] / np.maximum(evidence.union[rows, columns], 1e-9)
+    everywhere = _median(found, weight)
+    table = np.full((len(views), len(views)), everywhere)
+    pair = at[rows] * len(views) + at[columns]
+    order = np.argsort(pair, kind="stable")
+    for chunk in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1):
+        here = _median(found[chunk], weight[chunk])
+        table[at[rows[chunk[0]]], at[columns[chunk[0]]]] = (here * len(chunk) + everywhere * PRIOR) / (
+            len(chunk) + PRIOR
+        )
+    return table[at[:, None], at[None, :]]
+
+
+def _hints(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
+    """What equal and different ids are worth, within a view and between views, as factors. [T, T]"""
+    equal = evidence.ids[:, None] == evidence.ids[None]
+    within = evidence.views[:, None] == evidence.views[None]
+    weight = np.minimum(evidence.lengths[:, None], evidence.lengths[None]) * (evidence.together == 0)
+    factors = np.ones_like(evidence.common)
+    for scope in (within, ~within):
+        likely = float((weight * (scope & mutual)).sum())
+        if not likely:
+            continue
+        trust = float((weight * (scope & mutual & equal)).sum()) / likely
+        chance = float((weight * (scope & equal)).sum()) / float((weight * scope).sum())
+        if trust <= chance:
+            continue
+        alike, unlike = (np.sqrt((a + 0.05) / (b + 0.05)) for a, b in ((trust, chance), (1 - trust, 1 - chance)))
+        factors[scope & equal] = min(alike, HINT)
+        factors[scope & ~equal] = max(unlike, 1 / HINT)
+    return factors
+
+
+def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Join the best pair as long as it is good enough and its groups do not stand side by side. [T]"""
+    count = len(common)
+    common, expected, together = common.copy(), expected.copy(), evidence.together.copy()
+    lengths = evidence.lengths.astype(float)
+    labels, alive = np.arange(count), np.ones(count, bool)
+
+    def affinity(row: int) -> np.ndarray:
+        allowed = alive & (together[row] <= SIDE_BY_SIDE * np.minimum(lengths[row], lengths))
+        allowed[row] = False
+        return np.where(allowed, common[row] / np.maximum(expected[row], 1e-9), -1.0)
+
+    table = np.stack([affinity(row) for row in range(count)])
+    best = table.argmax(axis=1)
+    value = table[np.arange(count), best]
+    while True:
+        a = int(value.argmax())
+        if value[a] < SAME:
+            return labels
+        b = int(best[a])
+        for matrix in (common, expected, together):
+            matrix[a] += matrix[b]
+            matrix[:, a] += matrix[:, b]
+        lengths[a] += lengths[b]
+        alive[b], labels[labels == b] = False, a
+        value[b] = -1.0
+        table[a] = affinity(a)
+        table[:, a], table[b], table[:, b] = table[a], -1.0, -1.0
+        stale = np.flatnonzero(alive & ((best == a) | (best == b) | (table[:, a] > value)))
+        for row in {a, *stale.tolist()}:
+            best[row] = table[row].argmax()
+            value[row] = table[row, best[row]]
+
+
+def _absorb(evidence: Evidence, labels: np.ndarray) -> np.ndarray:
+    """Let parts vote for the whole: groups that lie in a larger one, where that is seen whole more often than apart.
+
+    Trackers split an object now and then. Two objects that are joined now and then are the other way round: they are
+    seen apart more often.
+    """
+    groups, at = np.unique(labels, return_inverse=True)
+    member = sparse.csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))))
+    common, seen, together = (member @ m @ member.T for m in (evidence.common, evidence.seen, evidence.together))
+    lengths = np.bincount(at, evidence.lengths)
+    inside = common / np.maximum(seen, 1e-9)
+    usual = _median(np.diag(inside), lengths)
+    images = lengths.astype(float)
+    target = np.arange(len(groups))
+    for part in np.argsort(images, kind="stable"):
+        whole = np.where((images > 2 * images[part]) & (target == np.arange(len(groups))), inside[part], 0.0)
+        whole[part] = 0.0
+        best = int(whole.argmax())
+        if whole[best] >= PART * usual and together[part, best] < 0.5 * images[best]:
+            target[part] = best
+    while (target[target] != target).any():
+        target = target[target]
+    return groups[target[at]]
+
+
+def _median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(below, below[-1] / 2)]])

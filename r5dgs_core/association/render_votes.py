@@ -1,0 +1,61 @@
+"""What the other images say of a view's pixels, drawn, and the view's mask mended by it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+
+from ..data import dataset as datasets
+from ..playback import scene_player
+from ..raster import RasterSettings, rasterize_splats
+from ..render import scene_renderer
+from ..scene.scene import Scene
+from . import associate, mending, segment_stack
+
+
+def mend(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    masks: Sequence[np.ndarray],
+    images: Sequence[segment_stack.ImageBags],
+    found: associate.Association,
+    *,
+    backend: str = "auto",
+) -> Iterator[np.ndarray]:
+    """Mend the masks of views one by one.
+
+    Args:
+        scene: The scene that the bags were drawn from.
+        views: Its views.
+        masks: Their incoming ids. Of [H, W]
+        images: Their bags.
+        found: What became of them.
+        backend: Rasterizer.
+
+    Yields:
+        New ids of the next view, see `mending.mend`. [H, W] int32
+    """
+    if not mending.trusts(found):
+        for image, (mask, bag) in enumerate(zip(masks, images, strict=True)):
+            yield mending.relabel(mask, bag.ids, found.ids[image])
+        return
+    shares = mending.shares(images, found)
+    for image, (view, mask, (seen, part)) in enumerate(zip(views, masks, shares, strict=True)):
+        if not mending.lacks(found, image):
+            yield mending.relabel(mask, images[image].ids, found.ids[image])
+            continue
+        posed = scene_renderer.PosedGaussians(scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t)))
+        shown = torch.from_numpy(seen)  # what the image does not show covers nothing of it either
+        drawn = rasterize_splats(
+            posed.means[shown],
+            posed.quats[shown],
+            posed.scales[shown],
+            posed.opacities[shown],
+            torch.from_numpy(part),
+            view.camera,
+            settings=RasterSettings(near_plane=scene.near_plane),
+            backend=backend,
+        ).image
+        yield mending.mend(mask, images[image].ids, drawn.numpy(), found, image)

@@ -1,0 +1,70 @@
+"""Runs of segments that one tracker and the geometry agree to be one object.
+
+Inside a view an incoming id is followed from image to image as long as the Gaussians say the same. Where they do not,
+the run ends and a new one begins: so a switch of ids costs a cut, not a wrong run.
+
+Notation: S segments, T runs (tracklets), I images.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import segment_stack
+
+FAINTEST = 0.02  # IoU below which two segments have nothing in common
+
+
+def link(stack: segment_stack.Stack) -> np.ndarray:
+    """Number the runs.
+
+    A segment continues the last one of its id in its view where each is the other's best match among the objects of
+    both images. Images between the two may lack the id.
+
+    Returns:
+        Run of each segment, -1 for background. [S]
+    """
+    runs = np.full(len(stack.ids), -1)
+    count = 0
+    rows_of = _rows_of(stack)
+    for view in np.unique(stack.views):
+        images = np.flatnonzero(stack.views == view)
+        last: dict[int, int] = {}  # row of the last segment of each id
+        for image in images[np.argsort(stack.times[images], kind="stable")]:
+            rows = rows_of[image]
+            before: dict[int, list[int]] = {}
+            for row in rows:
+                if int(stack.ids[row]) in last:
+                    before.setdefault(int(stack.images[last[int(stack.ids[row])]]), []).append(row)
+            for earlier, continued in before.items():
+                table = ious(stack, rows_of[earlier], rows)
+                for row in continued:
+                    at = (
+                        int(np.searchsorted(rows_of[earlier], last[int(stack.ids[row])])),
+                        int(np.searchsorted(rows, row)),
+                    )
+                    if table[at] >= max(table[at[0]].max(), table[:, at[1]].max(), FAINTEST):
+                        runs[row] = runs[rows_of[earlier][at[0]]]
+            for row in rows:
+                if runs[row] < 0:
+                    runs[row], count = count, count + 1
+                last[int(stack.ids[row])] = row
+    return runs
+
+
+def ious(stack: segment_stack.Stack, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """IoU over what two images both see of segments of one with segments of the other. [s], [t] -> [s, t]"""
+    if not len(rows) or not len(others):
+        return np.zeros((len(rows), len(others)))
+    a, b = stack.shared[rows], stack.shared[others]
+    common = (a @ b.T).toarray().astype(float)
+    seen_a = (a @ stack.seen[stack.images[others[0]]].T).toarray()
+    seen_b = (b @ stack.seen[stack.images[rows[0]]].T).toarray()
+    return common / np.maximum(seen_a + seen_b.T - common, 1e-9)
+
+
+def _rows_of(stack: segment_stack.Stack) -> list[np.ndarray]:
+    """Segments of each image, background left out."""
+    objects = np.flatnonzero(stack.ids > 0)
+    ends = np.searchsorted(stack.images[objects], np.arange(len(stack.views) + 1))
+    return [objects[a:b] for a, b in zip(ends, ends[1:], strict=False)]

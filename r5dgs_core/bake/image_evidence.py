@@ -1,0 +1,229 @@
+"""Evidence of the training images on the motion of a scene's groups: picture errors, significance of a change.
+
+Notation: a group's poses change along d from what they are (0) to a simpler motion (1). To first order the picture of
+view v at l is I_v + l D_v. With the residual r_v = I_v - truth, each cluster c of views (a camera, or some of its
+times) has the information q_c = sum D^2 and the score g_c = -sum r D, so that the images like l = sum g / sum q best.
+Errors of the pictures are alike at neighbouring pixels and times, and what changes the look of a surface, such as a
+passing shadow, is alike in all cameras. So the noise is not counted in pixels: it is the variance of sum (g - l q) over
+clusters of views and over patches of the body's surface (the sandwich estimate, clustered both ways).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..motion import rotations
+from ..playback import scene_player
+from ..render import scene_renderer
+from ..scene.scene import Scene
+from ..train.train_views import spread
+
+PIXELS = 700_000  # of all sampled views together
+FEWEST, MOST = 20, 40  # sampled views, whatever their size
+CLUSTERS = 8  # cameras are split in time until there are so many
+PATCHES = 8  # of a body: its octants
+STEP = 0.02  # rad or radii by which poses are changed to see what the images do
+
+
+@dataclass(frozen=True)
+class Support:
+    """Support of the images for a change from one motion of a group to a simpler one.
+
+    Attributes:
+        sigmas: Distance of the simpler motion from what the images like best, in standard deviations; negative if they
+            like it better than the motion that was trained.
+        clusters: Independent parts that the deviation was taken from.
+        level: Root mean square of the change of the pixels that show the group, colours in [0, 1].
+        shape: Share of the change of the pictures that shape and texture make; colours that turn with the group make
+            the rest.
+    """
+
+    sigmas: float
+    clusters: int
+    level: float
+    shape: float
+
+
+class ImageEvidence:
+    """Some training views and what a scene shows in them.
+
+    Args:
+        scene: The scene with the motion that was trained; groups stay within the observed time.
+        views: Views, as from `sample`.
+        behind: Colour behind transparent pixels; None if the images are opaque. [3]
+
+    Raises:
+        DatasetError: An image is missing or cannot be read.
+    """
+
+    def __init__(self, scene: Scene, views: Sequence[datasets.View], behind: np.ndarray | None):
+        # Without an end of the observed time poses are those of the track at t_max too, where a model would start.
+        self._scene = dataclasses.replace(scene, t_max=math.inf)
+        self._views = views
+        self._truths = [datasets.load_image(view, behind) for view in views]
+        self._clusters = _clusters(views)
+        self.psnr = self._psnr(self._scene)
+
+    def loss(self, poses: np.ndarray) -> float:
+        """Mean PSNR that the sampled views lose with other poses of the groups, dB. [G, S, 7]"""
+        return self.psnr - self._psnr(self._with(poses))
+
+    def support(
+        self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
+    ) -> Support:
+        """Significance of the change of shape and place from some poses to others, both in the colours of the others.
+
+        Args:
+            group: The group.
+            before: Poses of all groups that were trained. [G, S, 7]
+            after: Poses of all groups with the simpler motion. [G, S, 7]
+            size: Largest change, rad or radii.
+            rows: Indices of the views to use; None for all.
+        """
+        rows = range(len(self._views)) if rows is None else rows
+        step = min(1.0, STEP / max(size, 1e-12))
+        simpler = scene_player.Player(self._with(after))
+        here, plus, minus = (
+            scene_player.Player(self._with(_between(before, after, share))) for share in (0.0, step, -step)
+        )
+        colored = self._scene.shading is not None and not np.array_equal(before[..., :4], after[..., :4])
+        octants = self._octants(group)
+        scores, information = np.zeros((2, int(self._clusters.max()) + 1, PATCHES + 1))
+        pixels, changed = 0, 0.0
+        for row in rows:
+            factor = simpler.frame(self._views[row].t).shading_factor
+            picture, patches = self._draw(here, row, factor, octants)
+            slope = (self._draw(plus, row, factor)[0] - self._draw(minus, row, factor)[0]).astype(np.float64)
+            slope /= 2 * step
+            pixels += int((patches < PATCHES).sum())
+            cluster, error = self._clusters[row], (picture - self._truths[row]) * slope
+            scores[cluster] -= np.bincount(patches.ravel(), error.sum(-1).ravel(), PATCHES + 1)
+            information[cluster] += np.bincount(patches.ravel(), (slope**2).sum(-1).ravel(), PATCHES + 1)
+            if colored:
+                changed += float(((self._draw(simpler, row)[0] - self._draw(here, row)[0]) ** 2).sum())
+        return _support(scores, information, pixels, changed)
+
+    def _with(self, poses: np.ndarray) -> Scene:
+        return dataclasses.replace(self._scene, track_poses=poses)
+
+    def _octants(self, group: int) -> np.ndarray:
+        """Patch of each Gaussian: its octant about the group's pivot, `PATCHES` if it is no member. [N] int32"""
+        scene = self._scene
+        octants = ((scene.means > scene.groups[group].pivot) @ np.array([1, 2, 4])).astype(np.int32)
+        return np.where(scene.motion_ids == group, octants, np.int32(PATCHES))
+
+    def glance(self, changes: np.ndarray) -> list[int]:
+        """One view of each cluster, that with the largest change at the knot nearest to its time. [S]"""
+        knots = np.abs(self._scene.track_times[:, None] - [view.t for view in self._views]).argmin(0)
+        clusters = range(int(self._clusters.max()) + 1)
+        mine = (np.flatnonzero(self._clusters == cluster) for cluster in clusters)
+        return [int(rows[np.argmax(changes[knots[rows]])]) for rows in mine]
+
+    def _draw(
+        self, player: scene_player.Player, row: int, factor: np.ndarray | None = None, octants: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Picture of a view, sRGB in [0, 1] [H, W, 3], and the patch that each pixel shows [H, W].
+
+        Args:
+            player: Of the poses.
+            row: The view.
+            factor: Shading to draw with instead of that of the poses. [N]
+            octants: Patch of each Gaussian; without it the patches mean nothing. [N]
+        """
+        view = self._views[row]
+        frame = player.frame(view.t)
+        if factor is not None:
+            frame = dataclasses.replace(frame, shading_factor=factor)
+        if octants is not None:
+            frame = dataclasses.replace(frame, object_ids=octants)
+        output = scene_renderer.render_frame(self._scene, frame, view.camera)
+        ids = scene_renderer.to_numpy(output.ids, np.int32)
+        color = scene_renderer.to_numpy(output.color, np.float32)
+        return np.clip(color, 0, 1), np.where(ids < 0, PATCHES, ids)
+
+    def _psnr(self, scene: Scene) -> float:
+        player = scene_player.Player(scene)
+        errors = [float(np.mean((self._draw(player, row)[0] - truth) ** 2)) for row, truth in enumerate(self._truths)]
+        return float(np.mean([-10 * math.log10(max(error, 1e-10)) for error in errors]))
+
+
+def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:
+    """Return the support from the scores and the information of each cluster and patch. [C, PATCHES + 1] each
+
+    The variance is that over clusters and over patches, less that over both, which is in each of them.
+    """
+    total = float(information.sum())
+    if total <= 0:
+        return Support(0.0, 1, 0.0, 1.0)
+    best = float(scores.sum()) / total
+    left = scores - best * information
+    counts = [int((information.sum(axis) > 0).sum()) for axis in (0, 1)]
+    ways = [float((left.sum(axis) ** 2).sum()) * n / max(n - 1, 1) for axis, n in enumerate(counts)]
+    variance = max(sum(ways) - float((left**2).sum()), *ways, 1e-12 * total)
+    return Support(
+        (1 - best) * total / math.sqrt(variance),
+        min(counts),
+        math.sqrt(total / (3 * max(pixels, 1))),
+        min(1.0, total / changed) if changed > 0 else 1.0,
+    )
+
+
+def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
+    """Return a function that renders the scene at a view. [H, W, 3]"""
+    player = scene_player.Player(scene)
+
+    def draw(view: datasets.View) -> np.ndarray:
+        output = scene_renderer.render_frame(scene, player.frame(view.t), view.camera)
+        return scene_renderer.to_numpy(output.color, np.float32)
+
+    return draw
+
+
+def sample(views: Sequence[datasets.View]) -> list[datasets.View]:
+    """Some views, evenly over the times of each camera, as many as `PIXELS` allows."""
+    size = float(np.median([view.camera.width * view.camera.height for view in views]))
+    limit = int(np.clip(PIXELS / size, FEWEST, MOST))
+    cameras = _by_camera(views)
+    if 2 * len(cameras) > limit:
+        return spread(sorted(views, key=lambda view: (view.t, view.name)), limit)
+    return [view for group in cameras.values() for view in spread(group, limit // len(cameras))]
+
+
+def _by_camera(views: Sequence[datasets.View]) -> dict[str, list[datasets.View]]:
+    cameras: dict[str, list[datasets.View]] = {}
+    for view in sorted(views, key=lambda view: view.t):
+        cameras.setdefault(view.camera.name, []).append(view)
+    return cameras
+
+
+def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
+    """Cluster of each view: its camera, or a stretch of its camera's times where cameras are few. [V]"""
+    cameras = _by_camera(views)
+    parts = -(-CLUSTERS // len(cameras))
+    found: dict[int, int] = {}
+    count = 0
+    for group in cameras.values():
+        for part in np.array_split(np.arange(len(group)), min(parts, len(group))):
+            found |= {id(group[i]): count for i in part}
+            count += 1
+    if count > 2 * CLUSTERS and all(len(group) == 1 for group in cameras.values()):  # a camera that moves
+        order = np.argsort([view.t for view in views], kind="stable")
+        result = np.zeros(len(views), int)
+        for cluster, part in enumerate(np.array_split(order, CLUSTERS)):
+            result[part] = cluster
+        return result
+    return np.array([found[id(view)] for view in views])
+
+
+def _between(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
+    """Poses a share of the way from some to others, beyond either too. [G, S, 7]"""
+    turn = rotations.multiply(after[..., :4], rotations.conjugate(before[..., :4]))
+    turn = rotations.rotvecs_to_quats(share * rotations.quats_to_rotvecs(turn))
+    quats = rotations.normalize(rotations.multiply(turn, before[..., :4]))
+    return np.concatenate([quats, before[..., 4:] + share * (after[..., 4:] - before[..., 4:])], axis=-1)

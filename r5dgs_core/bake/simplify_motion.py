@@ -1,0 +1,355 @@
+"""The motion of a scene's bodies without what neither the training images nor the poses need.
+
+A body's motion has two parts, its turn and its path. The turn may be dropped, and the path may be replaced by one place
+or by a straight line. Each of these is done if and only if
+
+- the poses do not change by more than their noise: the training images do not tell the simpler motion from the trained
+  one (`image_evidence`), by an F test at `LEVEL`; or the body's pixels change by less than 8 bits show; or a turn
+  serves colours rather than shape (`SHAPE`); and
+- the training views lose no more than `LOSS` dB by all simplifications of the scene together.
+
+A part that only the colours of the images need, such as a turn by which shading imitates a shadow, is kept in the
+observed time, but nothing follows from it for the time after: the motion past t_max is fitted without it.
+
+Notation: G groups, S poses. Poses are relative to the bind state that the scene was given with until `_finish`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from ..config.sections import NeedsSection
+from ..motion import free_top, rotations
+from ..motion_fit import model_selection, shared_gravity
+from ..playback import visibility
+from ..scene import sh_color
+from ..scene.scene import Scene
+from ..train.representations import shading
+from . import falling_bodies, needs, track_checks
+from .image_evidence import ImageEvidence
+
+log = logging.getLogger(__name__)
+
+LEVEL = 0.01  # probability with which noise alone passes for motion
+LOSS = 0.03  # dB of the training views that all simplifications together may take
+SHAPE = 0.5  # share of a turn's effect on the pictures below which it serves colours, as of a shadow that passes
+CLEARLY = 3.0  # times the noise that may be: seen at a glance, in one view of each cluster
+LARGEST = 0.05  # spread of turns in rad, of paths in diameters, that is motion without a look at the images
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A simplification of one body's motion.
+
+    Attributes:
+        group: The body.
+        name: Row of the needs table that it decides: "rotation" (the body does not turn), "motion" (it stays in its
+            place) or "curved_path" (its path is straight).
+        poses: The body's poses with it. [S, 7]
+        spread: Root mean square per component of what is dropped: rad, or world units.
+        value: The same, rad or diameters.
+        change: The same in units of its noise.
+        allowed: Largest change that counts as noise.
+        why: What the noise was judged by, in words.
+        kept: True if the user keeps the part.
+        seen: True if the noise was measured in the images.
+    """
+
+    group: int
+    name: str
+    poses: np.ndarray
+    spread: float
+    value: float
+    change: float
+    allowed: float
+    why: str
+    kept: bool
+    seen: bool
+
+    @property
+    def noise(self) -> bool:
+        """True if the poses change by no more than their noise."""
+        return self.change <= self.allowed and not self.kept
+
+
+@dataclass(frozen=True)
+class Simplified:
+    """A scene with the motion that it needs.
+
+    Attributes:
+        scene: The scene, with another bind state for bodies whose last pose was off the simpler motion.
+        rows: What was measured and decided for each body, as rows of the needs table.
+    """
+
+    scene: Scene
+    rows: tuple[dict[str, Any], ...]
+
+
+def simplify(
+    scene: Scene, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection | None = None
+) -> Simplified:
+    """Drop turns, paths and bends that are noise, and fit the motion past t_max.
+
+    Args:
+        scene: The scene with the poses that were trained and static models of the groups' radii.
+        observed: Knots at which each group was placed. [G, S] bool
+        evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and
+            `needs.TURN` is dropped.
+        wanted: The user's overrides; parts that are "on" are kept.
+
+    Returns:
+        The simplified scene. Groups that follow a body follow its simplified motion.
+    """
+    wanted = wanted or NeedsSection()
+    names = {item.id: item.name for item in scene.objects}
+    bodies = [g for g in scene.groups if g.role == "body" and np.any(scene.track_poses[g.id, :, 1:] != 0)]
+    parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
+    dropped, losses = _unseen(scene, [part for part in parts if part.noise], evidence)
+    bound = _rebound(scene, _with_parts(scene, dropped))
+    rows: list[dict[str, Any]] = []
+    fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]] = {}
+    for g in bodies:
+        mine = [part for part in parts if part.group == g.id]
+        future = _future(bound.track_poses[g.id], mine)
+        if np.any(future[:, 1:] != 0):
+            track_checks.warn_of_aliasing(names[g.object_id], scene.track_times, future)
+            fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine)
+        said = _said(fits[g.id][1] if g.id in fits else None)
+        travel = float(np.linalg.norm(bound.track_poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
+        found = [_row(part, part in dropped, losses.get(id(part)), said, travel) for part in mine]
+        rows += [{"object": names[g.object_id], **row} for row in found]
+    models = falling_bodies.share_gravity(fits, scene.world_convention)
+    groups = list(bound.groups)
+    for part in parts:  # what follows no noise starts at the bind state
+        if part.noise and part.group in models:
+            offset = "offset_rotvec" if part.name == "rotation" else "offset_displacement"
+            models[part.group] = dataclasses.replace(models[part.group], **{offset: np.zeros(3)})
+    for index, model in models.items():
+        groups[index] = dataclasses.replace(groups[index], model=model)
+    return Simplified(dataclasses.replace(bound, groups=tuple(groups)), tuple(rows))
+
+
+def _parts(
+    scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
+) -> list[_Part]:
+    """Simplifications of one body: of its turn, and of its path to a place, or else to a line."""
+    poses, weights = scene.track_poses[group], observed.astype(np.float64)
+    weights = weights if weights.any() else np.ones(len(poses))
+    mean = rotations.normalize(weights @ rotations.make_continuous(poses[:, :4]))
+    upright = poses.copy()
+    upright[:, :4] = mean
+    turns = rotations.quats_to_rotvecs(rotations.multiply(poses[:, :4], rotations.conjugate(mean)))
+    result = [_judged(scene, group, "rotation", upright, turns, weights, evidence, wanted.rotation == "on")]
+    tau = scene.track_times - scene.track_times[-1]
+    for name, degree in (("motion", 0), ("curved_path", 1)):
+        columns = tau[:, None] ** np.arange(degree + 1)
+        root = np.sqrt(weights)[:, None]
+        plain = poses.copy()
+        plain[:, 4:] = columns @ np.linalg.lstsq(columns * root, poses[:, 4:] * root, rcond=None)[0]
+        dropped = poses[:, 4:] - plain[:, 4:]
+        result.append(_judged(scene, group, name, plain, dropped, weights, evidence, wanted.tracks == "on"))
+        if result[-1].noise:
+            break
+    return result
+
+
+def _judged(
+    scene: Scene,
+    group: int,
+    name: str,
+    poses: np.ndarray,
+    dropped: np.ndarray,
+    weights: np.ndarray,
+    evidence: ImageEvidence | None,
+    kept: bool,
+) -> _Part:
+    """A part, with what it drops [S, 3] in rad or world units measured by its noise."""
+    unit = 1.0 if name == "rotation" else 2 * scene.groups[group].model.radius
+    spread = float(np.sqrt(np.average((dropped**2).mean(1), weights=weights)))
+    if evidence is None:
+        limit = needs.TURN if name == "rotation" else needs.STILL
+        change, allowed, seen = float(np.linalg.norm(dropped, axis=1).max()) / unit / limit, 1.0, False
+        why = "the images are missing"
+    elif spread > LARGEST * unit:
+        change, allowed, seen, why = spread / unit / LARGEST, 1.0, False, "too large for noise"
+    else:
+        after = scene.track_poses.copy()
+        after[group] = poses
+        largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (unit if name != "rotation" else 2.0)
+        free, seen = 3 * _independent(dropped[weights > 0]), True
+        for rows in (evidence.glance(np.linalg.norm(dropped, axis=1)), None):
+            support = evidence.support(group, scene.track_poses, _followed(scene, after), largest, rows)
+            change = max(support.sigmas, 0.0) / np.sqrt(free)
+            allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))
+            if change > CLEARLY * allowed:
+                break
+        why = f"{change:.2g} times its noise, of which {allowed:.2g} may be"
+        if support.level <= needs.SHADING_LEVEL:
+            allowed, why = max(allowed, change), f"the images do not show it ({255 * support.level:.2g} levels of 255)"
+        elif support.shape < SHAPE:
+            allowed, why = max(allowed, change), f"it serves colours (shape is {support.shape:.0%} of its effect)"
+    return _Part(group, name, poses, spread, spread / unit, float(change), allowed, why, kept, seen)
+
+
+def _independent(series: np.ndarray) -> float:
+    """Number of independent values in a series that is correlated in time, from its first lag. [S, 3]"""
+    energy = float((series**2).sum())
+    lag = float((series[1:] * series[:-1]).sum()) / energy if energy > 0 else 0.0
+    lag = min(max(lag, 0.0), 1.0)
+    return max(1.0, len(series) * (1 - lag) / (1 + lag))
+
+
+def _unseen(
+    scene: Scene, parts: Sequence[_Part], evidence: ImageEvidence | None
+) -> tuple[list[_Part], dict[int, float]]:
+    """Return the parts that the images do not need, cheapest first, and the cost of each part by its `id`, dB."""
+    if evidence is None or not parts:
+        return list(parts), {}
+    losses = {id(part): evidence.loss(_with_parts(scene, [part])) for part in parts}
+    chosen, total = [], 0.0
+    for part in sorted(parts, key=lambda part: losses[id(part)]):
+        total += losses[id(part)]
+        if total > LOSS:
+            break
+        chosen.append(part)
+    while len(chosen) > 1 and evidence.loss(_with_parts(scene, chosen)) > LOSS:
+        chosen.pop()
+    return chosen, losses
+
+
+def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
+    """Poses of all groups with some simplifications. [G, S, 7]"""
+    poses = scene.track_poses.copy()
+    for part in parts:
+        columns = slice(0, 4) if part.name == "rotation" else slice(4, 7)
+        poses[part.group, :, columns] = part.poses[:, columns]
+    return _followed(scene, poses)
+
+
+def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
+    """Poses of all groups, those of followers brought to what their leaders do now, in place. [G, S, 7]"""
+    change = poses[..., 4:] - scene.track_poses[..., 4:]
+    for g in scene.groups:
+        if g.follows is not None and g.follow_matrix is not None:
+            poses[g.id, :, 4:] = scene.track_poses[g.id, :, 4:] + change[g.follows] @ g.follow_matrix.T
+    return poses
+
+
+def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
+    """Return the scene with other poses [G, S, 7], bound in the last pose of each group."""
+    if np.array_equal(poses, scene.track_poses):
+        return scene
+    arrays = {name: getattr(scene, name) for name in _BOUND}
+    arrays = {name: array.copy() for name, array in arrays.items() if array is not None}
+    if "shading" in arrays:
+        arrays.setdefault("shading_rest", np.ones(len(scene.means), np.float32))
+    groups, poses = list(scene.groups), poses.copy()
+    for g in scene.groups:
+        track = poses[g.id]
+        q, d = track[-1, :4].copy(), track[-1, 4:].copy()
+        if (track[:, :4] == q).all():
+            track[:, :4] = rotations.identity()
+        else:
+            track[:, :4] = rotations.normalize(rotations.multiply(track[:, :4], rotations.conjugate(q)))
+        track[:, 4:] -= d
+        track[-1, :4] = rotations.identity()
+        if np.any(q[1:] != 0) or np.any(d != 0):
+            _bind(scene, arrays, np.flatnonzero(scene.motion_ids == g.id), g.pivot, q, d)
+            groups[g.id] = dataclasses.replace(g, pivot=g.pivot + d)
+    if "shading_rest" in arrays and scene.shading_rest is None and (arrays["shading_rest"] == 1).all():
+        del arrays["shading_rest"]
+    return dataclasses.replace(scene, track_poses=poses, groups=tuple(groups), **arrays)
+
+
+_BOUND = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")
+
+
+def _bind(
+    scene: Scene, arrays: dict[str, np.ndarray], rows: np.ndarray, pivot: np.ndarray, q: np.ndarray, d: np.ndarray
+) -> None:
+    """Move Gaussians to another bind state, in place: turned by q [4] about the pivot [3], and shifted by d [3]."""
+    means = arrays["means"][rows].astype(np.float64)
+    arrays["means"][rows] = pivot + rotations.rotate(q, means - pivot) + d
+    if not np.any(q[1:] != 0):
+        return
+    arrays["quats"][rows] = rotations.normalize(rotations.multiply(q, arrays["quats"][rows].astype(np.float64)))
+    sh = sh_color.rotate(arrays["sh"][rows].astype(np.float64), q)
+    if "shading" in arrays and scene.light_direction is not None:
+        vectors, rest = (arrays[name][rows].astype(np.float64) for name in ("shading", "shading_rest"))
+        sh, arrays["shading"][rows], arrays["shading_rest"][rows] = shading.rebind(
+            sh, vectors, rest, q, scene.light_direction
+        )
+    arrays["sh"][rows] = sh
+    if scene.residual_rows is not None:
+        own = np.isin(scene.residual_rows, rows)
+        arrays["residual_offsets"][own] = rotations.rotate(q, arrays["residual_offsets"][own].astype(np.float64))
+        turns = rotations.multiply(q, arrays["residual_quats"][own].astype(np.float64))
+        arrays["residual_quats"][own] = rotations.normalize(rotations.multiply(turns, rotations.conjugate(q)))
+
+
+def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
+    """Poses that the future motion is fitted to: without noise, even if the images need it. [S, 7] relative to t_max"""
+    result = poses.copy()
+    for part in parts:
+        if part.noise and part.name == "rotation":
+            result[:, :4] = rotations.identity()
+        elif part.noise:
+            result[:, 4:] = part.poses[:, 4:] - part.poses[-1, 4:]
+    return result
+
+
+def _fit(
+    scene: Scene, group: int, observed: np.ndarray, poses: np.ndarray, parts: Sequence[_Part]
+) -> tuple[shared_gravity.Track, model_selection.Fit]:
+    """Fit a body's future motion; return the fitted track, too. The noise is at least that measured in the images."""
+    members = scene.motion_ids == group
+    opacities = 1 / (1 + np.exp(-scene.opacity_logits[members].astype(np.float64)))
+    body = free_top.inertia(scene.means[members][visibility.seen(opacities)].astype(np.float64))
+    track = shared_gravity.Track(scene.track_times, poses[:, :4], poses[:, 4:], observed.astype(np.float64))
+    noise = {part.name == "rotation": part.spread / part.change for part in parts if part.seen and part.change > 0}
+    fit = model_selection.fit(
+        track.times,
+        track.quats,
+        track.displacements,
+        radius=scene.groups[group].model.radius,
+        weights=track.weights,
+        inertia=body,
+        least_noise=(noise.get(False, 0.0), noise.get(True, 0.0)),
+    )
+    return track, fit
+
+
+def _said(fit: model_selection.Fit | None) -> str:
+    """Description of a body's motion past t_max."""
+    if fit is None:
+        return "static"
+    return f"came to rest, {fit.chosen}" if fit.rested else fit.chosen
+
+
+_SPREADS = {
+    "rotation": "spread of its turns, rad",
+    "motion": "spread of its places, diameters",
+    "curved_path": "distance from a straight path, diameters",
+}
+
+
+def _row(part: _Part, dropped: bool, loss: float | None, said: str, travel: float) -> dict[str, Any]:
+    """Row of the needs table of a part: the threshold is the spread that would be noise."""
+    threshold = part.value * part.allowed / part.change if part.change > 0 else LARGEST
+    why = part.why
+    if loss is not None:
+        why += f"; without it the training views lose {loss:.3f} dB"
+        why += "" if dropped else f", more than is left of {LOSS:g}; it ends at t_max"
+    if part.kept:
+        why = f"set on by you; {why}"
+    text = f"{_SPREADS[part.name]}: {why}"
+    if part.name == "motion":
+        text += f"; goes {travel:.3g} diameters; past t_max: {said}"
+    return needs.row(part.name, part.value, threshold, not dropped, text)

@@ -1,0 +1,56 @@
+"""What is wrong with the track of one group is told by its name, and stays with that group."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import numpy as np
+
+from ..motion import rigid_fit, rotations
+from ..train.observed_motion import GroupTrack
+
+log = logging.getLogger(__name__)
+
+
+def sound(group: GroupTrack, name: str) -> GroupTrack:
+    """The group, at rest in its place if its track holds values that are not finite; then with a warning.
+
+    Args:
+        group: A motion group.
+        name: Of its object, for the warning.
+    """
+    track = np.concatenate([group.quats, group.displacements], axis=1)
+    bad = np.asarray(~np.isfinite(track).all(1))
+    if not bad.any():
+        return group
+    if group.role == "body":  # its shadow follows it
+        log.warning(
+            "%s: %d of %d poses are not finite; it stays where it is, the others are as they were. Remedy: train again",
+            name,
+            int(bad.sum()),
+            len(bad),
+        )
+    still = np.zeros_like(group.displacements)
+    return dataclasses.replace(group, quats=rotations.identity(len(bad)), displacements=still)
+
+
+def warn_of_aliasing(name: str, times: np.ndarray, track: np.ndarray) -> None:
+    """Warn if an object turns by more than 120 degrees between two observed times: it may turn the other way.
+
+    Args:
+        name: Of the object.
+        times: Observed times. [S]
+        track: Its poses, rotation wxyz first. [S, 7]
+    """
+    found = rigid_fit.aliased_step(times, track[:, :4])
+    if found is not None:
+        angle, first, second = found
+        log.warning(
+            "%s turns by %.0f degrees between t = %g and %g: it may turn the other way in truth, and go on so past the "
+            "last observed time. Remedy: frames at more times",
+            name,
+            np.degrees(angle),
+            first,
+            second,
+        )

@@ -1,0 +1,78 @@
+"""How fast a scene plays: whole frames along its test views, one after the other, as a player would draw them."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..data.dataset import View
+from ..playback import scene_player
+from ..render import scene_renderer
+from ..scene.scene import Scene
+
+LEAST_FRAMES = 60
+PATIENCE_S = 20.0  # per mode, after which what was measured is enough
+
+
+def measure(
+    scene: Scene, views: Sequence[View], modes: Sequence[str], *, backend: str = "auto"
+) -> dict[str, dict[str, Any]]:
+    """Time frames of a scene, from the time t to the picture on the host: colours alone, no identity encodings.
+
+    The views are played camera by camera in the order of their times, again and again until there are enough frames.
+    The modes take turns, a round each, so that what else the machine does meets all of them alike. A first round of
+    each does not count: it loads kernels and fills what the mode computes once.
+
+    Args:
+        scene: The scene.
+        views: Cameras and times.
+        modes: Of `scene_player.modes`.
+        backend: Rasterizer.
+
+    Returns:
+        By mode ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,
+        ``ms_cpu`` (processor time of a frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
+        percentile), ``frames``; all but the last None without views.
+    """
+    ordered = sorted(views, key=lambda view: (view.camera.name, view.t))
+    times: dict[str, list[tuple[float, float, float]]] = {mode: [] for mode in modes}
+    if not ordered:
+        return {mode: _summary(found) for mode, found in times.items()}
+    players = {mode: scene_player.Player(scene, mode) for mode in modes}
+    for player in players.values():
+        for view in ordered:
+            _draw(player, view, backend)
+    began = time.monotonic()
+    for taken in itertools.count():
+        patient = time.monotonic() - began < PATIENCE_S * len(modes)
+        if taken * len(ordered) >= LEAST_FRAMES or (taken and not patient):
+            break
+        for mode, found in times.items():
+            found += [_draw(players[mode], view, backend) for view in ordered]
+    return {mode: _summary(found) for mode, found in times.items()}
+
+
+def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    """What `measure` says of a mode, from the motion, rasterization and processor time of its frames."""
+    names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_cpu", "ms_frame_low", "ms_frame_high")
+    if not times:
+        return {**dict.fromkeys(names), "frames": 0}
+    motion, raster, cpu = np.array(times).T
+    low, middle, high = np.percentile(motion + raster, (10, 50, 90))
+    medians = (np.median(motion), np.median(raster), np.median(cpu))
+    values = (1e3 / middle, middle, *medians, low, high)
+    return {**dict(zip(names, map(float, values), strict=True)), "frames": len(times)}
+
+
+def _draw(player: scene_player.Player, view: View, backend: str) -> tuple[float, float, float]:
+    """Milliseconds of motion, of rasterization, and of processor time of one frame."""
+    cpu, start = time.process_time(), time.perf_counter()
+    frame = player.frame(view.t, view.camera.center)
+    moved = time.perf_counter()
+    output = scene_renderer.render_frame(player.scene, frame, view.camera, backend=backend)
+    scene_renderer.to_numpy(output.color, np.float32)  # waits for a GPU, too
+    return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)

@@ -1,0 +1,108 @@
+"""What ``r5dgs associate`` does: one numbering for masks that a tracker numbered wrongly, or video by video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .. import errors, folder_lock, input_paths
+from . import runs
+
+if TYPE_CHECKING:
+    from ..association.mask_repair import Repair
+
+SHOWN = 12  # changes that are printed
+
+
+@folder_lock.writes("out", "target")
+def run_associate(
+    target: Path,
+    data: Path | None = None,
+    *,
+    masks: Path | None = None,
+    out: Path | None = None,
+    threads: int | None = None,
+    progress_kind: str = "none",
+) -> Path:
+    """Write masks with the ids that geometry and motion give to the segments of the incoming ones.
+
+    Args:
+        target: A run folder, or a ``.r5dgs`` file with ``data`` and ``out``: what shows which segments are one object.
+        data: The data set; by default that of the run.
+        masks: Folder of the incoming masks; by default those that the run was trained with, or ``DATA/object_mask``
+            where it was trained without.
+        out: Folder to write; ``RUN/object_mask`` if None.
+        threads: Threads of the kernels; see `runs.use_threads`.
+        progress_kind: How progress is shown (`progress.make`).
+
+    Returns:
+        The folder.
+
+    Raises:
+        ConfigError, DatasetError, CheckpointError, SceneFileError: As their messages say.
+    """
+    runs.check_target(target, data)
+    if target.is_file() and (data is None or out is None):
+        raise errors.UsageError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
+    if out is not None:
+        input_paths.check_output_folder("--out", out)
+    from ..association import mask_repair
+    from ..data import dataset as datasets
+    from ..progress import make
+
+    runs.use_threads(threads)
+    with make(progress_kind) as progress:
+        progress({"event": "prepare", "text": "the scene"})
+        scene, dataset = runs.open_target(target, data)
+        assert dataset is not None
+        folder = (Path(out) if out is not None else target / datasets.MASKS).resolve()
+        if masks is not None or dataset.mask_folder is None:
+            dataset = datasets.read(dataset.root, datasets.MASKS if masks is None else str(Path(masks).resolve()), 0.0)
+            dataset = dataset.relative_to(scene.origin)
+        assert dataset.mask_folder is not None
+        if folder == dataset.mask_folder.resolve():
+            raise errors.ConfigError(f"--out {folder}: holds the incoming masks; name another folder")
+        mask_repair.check_place(folder, dataset.train)
+        done = mask_repair.repair(scene, dataset, progress=progress)
+        names = {} if done.own_ids else dataset.object_names if dataset.own_ids else None
+        made_with = {"scene": str(target.resolve()), "masks": str(dataset.mask_folder.resolve())}
+        unmasked = [view for view in dataset.train if view.mask_path is None]
+        summary = mask_repair.write(done, folder, names, made_with, unmasked)
+        if progress_kind == "json":
+            progress({"event": "associated", "path": str(folder), **summary})
+    if progress_kind != "json":
+        _tell(done, summary, folder, dataset.root)
+    return folder
+
+
+def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
+    """What was done, in words, and what to do next."""
+    from ..association import mask_repair
+
+    counted = ("segments", "images", "relabelled", "unknown", "kept")
+    segments, images, relabelled, unknown, kept = (summary[key] for key in counted)
+    print(
+        f"{segments} segments in {images} images: {relabelled} relabelled, {unknown} unknown, {kept} kept; "
+        f"{len(summary['objects'])} objects"
+    )
+    if summary["mended"]:
+        print(f"in {summary['mended']} images objects that had no segment got pixels, as the other images show them")
+    print(
+        f"segments agree with what other images show of their objects to {summary['agreement']:.2f} (IoU); "
+        f"with the incoming ids to {summary['agreement_before']:.2f}"
+    )
+    if summary["fallback"]:
+        print("the incoming ids stay: too little is certain, or nothing would be better")
+    changed = mask_repair.switches(done)
+    for row in changed[:SHOWN]:
+        said = "unknown here" if row.done == "unknown" else f"object {row.new_id} here"
+        usual = f", mostly object {row.usual_id} in its video" if row.usual_id > 0 else ""
+        figures = f"{row.pixels} pixels, score {row.score:.2f}"
+        print(f"  {done.views[row.image].name}: id {row.old_id} is {said}{usual} ({figures})")
+    if len(changed) > SHOWN:
+        print(f"  and {len(changed) - SHOWN} more in {folder / mask_repair.SEGMENTS}")
+    print(f"written: {folder}")
+    if done.numbering == "scene":
+        print(f"Next: r5dgs train {root} --masks {folder} --out RUN")
+    else:
+        print("ids still hold within single videos, which is nothing to train with: try a run of more steps or images")

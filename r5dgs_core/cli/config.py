@@ -1,0 +1,85 @@
+"""The command ``r5dgs config``: all training keys, and the user's settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import textwrap
+from pathlib import Path
+
+from .. import errors, input_paths, strict_json, user_settings
+from ..config import config as configs
+from ..config import config_keys
+
+WIDTH = 80  # columns
+
+
+def run_config(target: Path | None, *, as_json: bool = False) -> configs.Config:
+    """Print every training key with its meaning, unit, default and value in force.
+
+    Args:
+        target: A run folder, a TOML file, or None for the defaults.
+        as_json: Print JSON.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        CheckpointError, ConfigError: The run or the file cannot be read.
+    """
+    config = _of_run(target) if target is not None and target.is_dir() else configs.load(target)
+    keys = config_keys.keys(config)
+    if as_json:
+        print(json.dumps([dataclasses.asdict(key) for key in keys], indent=1))
+        return config
+    section = ""
+    for key in keys:
+        if key.name.partition(".")[0] != section:
+            section = key.name.partition(".")[0]
+            print(f"\n[{section}]")
+        changed = "" if key.value == key.default else f"; default {_toml(key.default)}"
+        print(f"{key.name.partition('.')[2]} = {_toml(key.value)}  # {key.unit}{changed}")
+        print(textwrap.fill(key.meaning, WIDTH, initial_indent="    # ", subsequent_indent="    # "))
+    return config
+
+
+def _of_run(folder: Path) -> configs.Config:
+    input_paths.check_run(folder)
+    path = folder / input_paths.RUN_FILE
+    content = strict_json.read(path, errors.CheckpointError, "train again with --overwrite")
+    if not isinstance(content, dict) or not isinstance(content.get("config"), dict):
+        raise errors.CheckpointError(f"{path}: expected the configuration of a run, found none")
+    return configs.from_dict(content["config"])
+
+
+def run_user_config(arguments: list[str], *, as_json: bool = False) -> dict[str, str]:
+    """Print the user's settings, or change one of them.
+
+    Args:
+        arguments: Nothing, or "set", key and value; an empty value removes the key.
+        as_json: Print JSON.
+
+    Returns:
+        The settings.
+
+    Raises:
+        UsageError: The arguments are others.
+        ConfigError: The settings cannot be read or written.
+    """
+    if arguments:
+        if len(arguments) != 3 or arguments[0] != "set":
+            raise errors.UsageError(f"--user {' '.join(arguments)}: expected nothing, or 'set KEY VALUE'")
+        user_settings.write(*arguments[1:])
+    settings, place = user_settings.read(), user_settings.path()
+    if as_json:
+        print(json.dumps({"path": str(place), "settings": settings}, indent=1))
+        return settings
+    print(f"{place}{'' if place.exists() else ' (not there yet)'}")
+    for key, meaning in user_settings.MEANINGS.items():
+        print(f"{key} = {_toml(settings[key]) if key in settings else '(not set)'}")
+        print(textwrap.fill(meaning, WIDTH, initial_indent="    # ", subsequent_indent="    # "))
+    return settings
+
+
+def _toml(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)

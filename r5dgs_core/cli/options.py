@@ -1,0 +1,110 @@
+"""Options that several sub-commands of ``r5dgs`` share, and converters of their values."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from ..playback import modes
+
+_KEYS = {  # options that stand for one key of the configuration
+    "iterations": "train.iterations",
+    "seed": "train.seed",
+    "max_gaussians": "densify.max_gaussians",
+}
+
+
+def add_training(p: argparse.ArgumentParser) -> None:
+    """Add the options of commands that train one run."""
+    p.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random draws; train.seed (default: 0)")
+    add_settings(p)
+    again = p.add_mutually_exclusive_group()
+    again.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+    again.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
+
+
+def add_settings(p: argparse.ArgumentParser) -> None:
+    """Add the options that configure training."""
+    named = "fast (a first look), cpu or paper (the deformation field); --config and --set override it"
+    p.add_argument("--preset", metavar="NAME", help=named)
+    p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; 'r5dgs config' lists all keys")
+    add_overrides(p, "SECTION.KEY=VALUE", "override a key")
+    steps = "optimisation steps; train.iterations (default: 6000)"
+    p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)
+    p.add_argument(
+        "--max-gaussians", type=at_least(0), metavar="N", help="cap from the first step on; densify.max_gaussians"
+    )
+    add_threads(p)
+    add_progress(p)
+
+
+def add_overrides(p: argparse.ArgumentParser, form: str, meaning: str) -> None:
+    """Add ``--set``."""
+    p.add_argument("--set", action="append", default=[], metavar=form, help=f"{meaning}; may be repeated")
+
+
+def add_threads(p: argparse.ArgumentParser) -> None:
+    """Add ``--threads``."""
+    shown = "threads of the kernels (default: NUMBA_NUM_THREADS, or all cores); results do not depend on it"
+    p.add_argument("--threads", type=at_least(1), metavar="N", help=shown)
+
+
+def add_progress(p: argparse.ArgumentParser) -> None:
+    """Add ``--progress``."""
+    shown = "how progress is shown (default: auto, bars in a terminal and lines elsewhere)"
+    p.add_argument("--progress", choices=("auto", "json", "none"), default="auto", help=shown)
+
+
+def add_picture(p: argparse.ArgumentParser) -> None:
+    """Add the options of a picture of the scene."""
+    p.add_argument("--camera", metavar="N", help="name or number of the picture's camera (default: the best)")
+    p.add_argument("--time", type=float, metavar="T", help="scene time of the picture, past t_max too")
+    kinds = f"playback mode (default: rigid), of {', '.join(modes.every())}"
+    p.add_argument("--mode", default="rigid", metavar="MODE", help=kinds)
+    p.add_argument("--size", type=int, metavar="PIXELS", help="longer side of the picture")
+    add_threads(p)
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return a converter of arguments to integers that are not smaller than ``least``."""
+
+    def integer(text: str) -> int:
+        if not (text.strip().isdecimal() and least <= int(text) < 2**31):
+            raise argparse.ArgumentTypeError(f"expected an integer of at least {least}, got {text!r}")
+        return int(text)
+
+    return integer
+
+
+def positive(text: str) -> float:
+    """Convert an argument to a finite number above 0."""
+    return _number(text, lambda value: value > 0, "more than 0")
+
+
+def not_negative(text: str) -> float:
+    """Convert an argument to a finite number of at least 0."""
+    return _number(text, lambda value: value >= 0, "0 or more")
+
+
+def _number(text: str, good: Callable[[float], bool], expected: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and good(value)):
+        raise argparse.ArgumentTypeError(f"expected a number, {expected}, got {text!r}")
+    return value
+
+
+def overrides(args: argparse.Namespace) -> Sequence[str]:
+    """Return ``section.key=value`` of ``--set`` and of the options that stand for one key; the latter win."""
+    found = list(getattr(args, "set", []))
+    for option, key in _KEYS.items():
+        value = getattr(args, option, None)
+        if value is not None:
+            found.append(f"{key}={value}")
+    if args.command == "train" and args.masks is not None:
+        found.append(f"data.masks={args.masks if args.masks == 'none' else str(Path(args.masks).resolve())}")
+    return found

@@ -1,0 +1,1 @@
+"""Colour transforms of Gaussians: tints and the inverse of a view transform."""

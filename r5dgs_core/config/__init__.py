@@ -1,0 +1,1 @@
+"""Configuration: sections, presets, TOML files, overrides and the user's settings."""

@@ -1,0 +1,1 @@
+"""Turn a `Scene` that was edited in Blender into a `Scene` that can be saved or drawn."""

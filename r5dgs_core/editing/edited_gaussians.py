@@ -1,0 +1,131 @@
+"""The Gaussians of an edited scene: rows of the file in a new order, some of them put elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..color import tints
+from ..motion import rotations
+from ..playback import affine_transform, posing
+from ..scene.scene import Scene
+from .edited_motion import Cluster
+
+TOLERANCE = 1e-5  # of the scene's size: what was moved by less was not moved
+
+
+def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[str, Any], bool]:
+    """What becomes of the Gaussians of the file.
+
+    Args:
+        scene: The scene that was edited.
+        clusters: What is left of it.
+
+    Returns:
+        Rows of the file in the new order, the arrays of the new scene, and whether all stayed where they were.
+    """
+    ordered = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
+    ordered.sort(key=lambda entry: entry[:3])
+    last, kept, untouched = len(scene.track_times) - 1, [], True
+    names = ("means", "quats", "log_scales", "sh", "shading", "shading_rest")
+    columns: dict[str, list[np.ndarray]] = {name: [getattr(scene, name)[:0]] for name in names if _has(scene, name)}
+    if scene.shading is not None and scene.shading_rest is None:
+        columns["shading_rest"] = [np.empty(0, np.float32)]
+    residuals: list[tuple[np.ndarray, ...]] = []
+    object_ids, motion_ids, filled = [], [], 0
+    for object_id, motion_id, start, piece in ordered:
+        rows = slice(start, start + piece.count)
+        bind = np.asarray(piece.matrices[last], np.float64)
+        moved = _displacement(scene, rows, bind) > TOLERANCE * scene.extent
+        untouched &= not moved
+        values = placed(scene, rows, bind if moved else None)
+        if piece.tint is not None:
+            values["sh"] = tints.tint_sh(values["sh"], piece.tint)
+        for name, parts in columns.items():
+            parts.append(values[name])
+        residuals.append(_residuals(scene, rows, filled - start, affine_transform.affine(bind)[0] if moved else None))
+        kept.append(np.arange(rows.start, rows.stop))
+        object_ids.append(np.full(piece.count, object_id, np.int32))
+        motion_ids.append(np.full(piece.count, motion_id, np.int32))
+        filled += piece.count
+    order = np.concatenate([np.empty(0, np.int64), *kept])
+    arrays: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
+    if scene.shading_rest is None and "shading_rest" in arrays and (arrays["shading_rest"] == 1).all():
+        del arrays["shading_rest"]
+    for name in ("opacity_logits", "identities", "dynamics", "canonical_means"):
+        if _has(scene, name):
+            arrays[name] = getattr(scene, name)[order]
+    arrays["object_ids"] = np.concatenate([np.empty(0, np.int32), *object_ids])
+    arrays["motion_ids"] = np.concatenate([np.empty(0, np.int32), *motion_ids])
+    if scene.residual_rows is not None:
+        members = ("residual_rows", "residual_offsets", "residual_quats", "residual_log_scales")
+        for number, name in enumerate(members):
+            whole = getattr(scene, name)
+            arrays[name] = np.concatenate([whole[:0], *(part[number] for part in residuals)]).astype(whole.dtype)
+    return order, arrays, untouched
+
+
+def _has(scene: Scene, name: str) -> bool:
+    return getattr(scene, name) is not None
+
+
+def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
+    """How far a map moves Gaussians, at most, turning and scaling counted at their size."""
+    linear = bind[:3, :3] - np.eye(3)
+    means = scene.means[rows].astype(np.float64)
+    size = float(np.exp(scene.log_scales[rows].max()))
+    moved = np.linalg.norm(means @ linear.T + bind[:3, 3], axis=-1).max()
+    return float(moved + size * np.linalg.norm(linear))
+
+
+def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return the arrays of rows that an affine map of the bind state carries.
+
+    Args:
+        scene: The scene.
+        rows: The rows. [n]
+        bind: The map; None leaves the arrays as they are. [4, 4]
+
+    Returns:
+        ``means quats log_scales sh``, and ``shading shading_rest`` if the scene has shading. [n, ...] each
+    """
+    shading = None if scene.shading is None else scene.shading[rows]
+    rest = posing.rest_factors(scene)[rows]
+    splats = affine_transform.bind_state(scene, rows)
+    if bind is not None:
+        splats = affine_transform.carry(splats, bind)
+        if shading is not None and scene.light_direction is not None:
+            turn = affine_transform.nearest_rotation(bind[:3, :3])
+            light = np.asarray(scene.light_direction, np.float64)
+            rest = (rest + shading @ posing.light_change(light, turn)).astype(np.float32)
+            shading = (shading @ turn.T).astype(np.float32)
+    values = {"means": splats.means, "quats": splats.quats, "log_scales": splats.log_scales, "sh": splats.sh}
+    if shading is not None:
+        values |= {"shading": shading, "shading_rest": rest}
+    return values
+
+
+def _residuals(scene: Scene, rows: slice, shift: int, linear: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    """Residuals of rows of the file: rows in the new scene, offsets, rotations, growths; turned with the bind state."""
+    if scene.residual_rows is None:
+        return ()
+    assert scene.residual_offsets is not None and scene.residual_quats is not None
+    assert scene.residual_log_scales is not None
+    inside = (scene.residual_rows >= rows.start) & (scene.residual_rows < rows.stop)
+    offsets, quats = scene.residual_offsets[inside], scene.residual_quats[inside]
+    if linear is not None:
+        offsets, quats = turned_residuals(offsets, quats, linear)
+    return scene.residual_rows[inside] + shift, offsets, quats, scene.residual_log_scales[inside]
+
+
+def turned_residuals(
+    offsets: np.ndarray,  # [n, S, 3]
+    quats: np.ndarray,  # [n, S, 4]
+    linear: np.ndarray,  # [3, 3]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the offsets and rotations of residuals in a bind state that a linear map has carried. Shapes as given."""
+    turn = rotations.rotmats_to_quats(affine_transform.nearest_rotation(linear))
+    turned = rotations.multiply(rotations.multiply(turn, quats.astype(np.float64)), rotations.conjugate(turn))
+    return offsets @ linear.T, turned

@@ -1,0 +1,397 @@
+"""What an edited motion group is in a scene file: its track to t_max, and the model that goes on after it.
+
+Notation: M(t) is the map from the file's bind state to the file's world that Blender shows, B = M(t_max) that of the
+new bind state, and P(t) = M(t) B^-1 the motion since then. A parent that moves all of a learned motion P0 by a
+similarity X makes it P = X P0 X^-1: what the file knows is then taken from there, sharper than Blender's numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..motion import fit_drawn_curve, models, rotations
+from ..motion.models import MotionModel
+from ..playback import affine_transform, scene_player
+from ..scene.scene import MotionGroup, Scene
+
+RIGID_TOLERANCE = 1e-3  # how far the linear part of a motion may be from a rotation
+_LENGTHS = ("velocity", "acceleration", "center_offset", "offset_displacement")
+_ANGLES = ("angular_velocity", "angular_acceleration", "offset_rotvec")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Gaussians of one object and one motion group as they were left.
+
+    Attributes:
+        name: For notes.
+        object_id: Object that they belong to.
+        motion_id: Motion group in the file that they came from.
+        start: First row in the file.
+        count: Number of rows.
+        mover: What they move with: pieces of one mover and one motion group stay together.
+        matrices: From the bind state of the file to its world, at the observed times and the later ones. [T, 4, 4]
+        pivot: Point that they turn about, at t_max; None for the group's, carried. [3]
+        parent: Linear part of what moves all of their learned motion. [3, 3]
+        model: Their motion past t_max before ``parent``, or None for the file's.
+        allowed: Difference of positions that counts as none, world units.
+        tint: Factor on their display-referred colour. [3]
+    """
+
+    name: str
+    object_id: int
+    motion_id: int
+    start: int
+    count: int
+    mover: str
+    matrices: np.ndarray
+    pivot: np.ndarray | None = None
+    parent: np.ndarray | None = None
+    model: MotionModel | None = None
+    allowed: float = 0.0
+    tint: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rigid motion at some times, since t_max.
+
+    Attributes:
+        quats: Unit wxyz. [T, 4]
+        linears: The linear parts, which are rotations where the motion is rigid. [T, 3, 3]
+        shifts: The translations. [T, 3]
+    """
+
+    quats: np.ndarray
+    linears: np.ndarray
+    shifts: np.ndarray
+
+    def moves(self, pivot: np.ndarray) -> np.ndarray:
+        """Displacements of a pivot at t_max. [3] -> [T, 3]"""
+        return self.linears @ pivot + self.shifts - pivot
+
+    @property
+    def bent(self) -> float:
+        """How far the linear parts are from rotations: 0 for a rigid motion."""
+        return float(np.abs(self.linears - rotations.quats_to_rotmats(self.quats)).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Pieces that move alike: what becomes a motion group.
+
+    Attributes:
+        pieces: Its members; none for a group that had none before.
+        source: The group of the file that they come from.
+        motion: What Blender shows.
+        id: Of the new group.
+    """
+
+    pieces: list[Piece]
+    source: MotionGroup
+    motion: Motion
+    id: int = 0
+
+    @property
+    def first(self) -> Piece:
+        """Its largest member, which speaks for all."""
+        return max(self.pieces, key=lambda piece: piece.count)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moved(Cluster):
+    """A cluster as the motion group that it has become.
+
+    Attributes:
+        group: The new group.
+        poses: Of it at the observed times. [S, 7]
+        same: Whether it moves as in the file.
+    """
+
+    group: MotionGroup
+    poses: np.ndarray
+    same: bool
+
+
+@dataclass(frozen=True)
+class _Course:
+    """How a cluster moves while it is observed.
+
+    Attributes:
+        poses: Of the new group. [S, 7]
+        pivot: At t_max. [3]
+        parent: Linear part of what moves all of the learned motion. [3, 3]
+        reach: Largest distance of a member from the pivot.
+        allowed: Difference of positions that counts as none.
+        same: Whether that is as in the file.
+    """
+
+    poses: np.ndarray
+    pivot: np.ndarray
+    parent: np.ndarray
+    reach: float = 0.0
+    allowed: float = 0.0
+    same: bool = True
+
+
+def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
+    """The motion P of maps M. [T, 4, 4] and the index of t_max"""
+    maps = matrices @ np.linalg.inv(matrices[bind])
+    quats = rotations.rotmats_to_quats(affine_transform.nearest_rotation(maps[:, :3, :3]))
+    quats[bind] = (1.0, 0, 0, 0)
+    maps[bind] = np.eye(4)
+    return Motion(quats, maps[:, :3, :3], maps[:, :3, 3])
+
+
+def _turned(quats: np.ndarray, moves: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses X P0 X^-1 of a motion under a parent that is a similarity. [T, 4], [T, 3] and X [3, 3]"""
+    if (parent == np.eye(3)).all():
+        return quats, moves
+    turn = rotations.rotmats_to_quats(_turn_of(parent)[0])
+    return rotations.multiply(rotations.multiply(turn, quats), rotations.conjugate(turn)), moves @ parent.T
+
+
+def _turn_of(parent: np.ndarray) -> tuple[np.ndarray, float]:
+    """What axes are turned and lengths are scaled by: below 0 for a mirror, which is a turn with all axes reversed.
+
+    Places go through the mirror, axes of rotations through the turn alone. [3, 3] -> [3, 3] and a factor
+    """
+    scale = float(np.cbrt(np.linalg.det(parent)))
+    return affine_transform.nearest_rotation(np.sign(scale) * parent), scale
+
+
+def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
+    """The model of `_turned`, its covariance included."""
+    if (parent == np.eye(3)).all():
+        return model
+    turn, scale = _turn_of(parent)
+    maps = {name: scale * turn for name in _LENGTHS} | {name: turn for name in _ANGLES}
+    values = {name: linear @ getattr(model, name) for name, linear in maps.items()}
+    if model.inertia is not None:
+        inertia = turn @ model.inertia @ turn.T
+        values["inertia"] = 0.5 * (inertia + inertia.T)
+    if model.covariance is not None:
+        change = _change(model.covariance_names, maps)
+        values["covariance"] = change @ model.covariance @ change.T
+    return replace(model, radius=abs(scale) * model.radius, **values)
+
+
+def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
+    """The change of basis of rates by name, such as "velocity.x". [P, P]"""
+    change = np.eye(len(names))
+    parts = [name.partition(".") for name in names]
+    for i, (field, _, axis) in enumerate(parts):
+        for j, (other, _, other_axis) in enumerate(parts):
+            if axis and field == other and field in maps:
+                change[i, j] = maps[field]["xyz".index(axis), "xyz".index(other_axis)]
+    return change
+
+
+def _track(
+    sampled: Motion, pivot: np.ndarray, known: np.ndarray, reach: float, allowed: float
+) -> tuple[np.ndarray, bool]:
+    """Poses of a group at the knots, relative to the new bind state.
+
+    Args:
+        sampled: What Blender shows, at the S knots and later.
+        pivot: Of the group, at t_max. [3]
+        known: What the file has, turned: taken where Blender shows the same. [S, 7]
+        reach: Largest distance of a member from the pivot.
+        allowed: Difference that counts as none, world units.
+
+    Returns:
+        The poses [S, 7], and whether they are the known ones.
+    """
+    quats, moves = sampled.quats[: len(known)], sampled.moves(pivot)[: len(known)]
+    if (fit_drawn_curve.pose_errors(known[:, :4], known[:, 4:], quats, moves, reach) <= allowed).all():
+        return known, True
+    poses = np.concatenate([rotations.make_continuous(quats[::-1])[::-1], moves], axis=-1)
+    poses[-1] = (1.0, 0, 0, 0, 0, 0, 0)
+    return poses, False
+
+
+def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cluster]:
+    """Groups of the new scene in order: the pinned one, then those of the file, then what moves otherwise now.
+
+    Args:
+        scene: The scene that was edited.
+        pieces: What is left of it.
+        notes: Gets what cannot be kept.
+    """
+    last = len(scene.track_times) - 1
+    pinned = scene.groups[0]
+    still = Motion(rotations.identity(1), np.eye(3)[None], np.zeros((1, 3)))
+    found: list[Cluster] = [Cluster([], pinned, still)]
+    for piece in pieces:
+        source = scene.groups[piece.motion_id] if 0 < piece.motion_id < len(scene.groups) else pinned
+        motion = _since_bind(np.asarray(piece.matrices, np.float64), last)
+        if motion.bent > RIGID_TOLERANCE:
+            notes.append(f"{piece.name}: its scale changes with time, which a scene file cannot hold")
+        reach = _reach(scene, piece, np.zeros(3))
+        if source is pinned and (_apart(motion, still, reach) <= piece.allowed).all():
+            found[0].pieces.append(piece)
+            continue
+        for cluster in found[1:]:
+            first = cluster.pieces[0]
+            alike = cluster.source is source and first.mover == piece.mover
+            if alike and (_apart(motion, cluster.motion, reach) <= piece.allowed).all():
+                cluster.pieces.append(piece)
+                break
+        else:
+            found.append(Cluster([piece], source, motion))
+    used = {cluster.source.id for cluster in found}
+    members = set(np.unique(scene.motion_ids).tolist())
+    for group in scene.groups[1:]:  # those without members were there before, so they stay
+        if group.id not in used and group.id not in members:
+            found.append(Cluster([], group, still))
+    firsts: set[int] = set()
+
+    def order(cluster: Cluster) -> tuple[bool, int]:
+        again = cluster.source.id in firsts or (cluster.source is pinned and cluster is not found[0])
+        firsts.add(cluster.source.id)
+        return (again, cluster.source.id)
+
+    found = [cluster for _, cluster in sorted(((order(c), c) for c in found), key=lambda entry: entry[0])]
+    return [replace(cluster, id=number) for number, cluster in enumerate(found)]
+
+
+def _apart(motion: Motion, other: Motion, reach: float) -> np.ndarray:
+    """How far two motions bring points apart, at most, that lie within ``reach`` of the origin. [T]"""
+    turned = np.linalg.norm(motion.linears - other.linears, axis=(-2, -1))
+    return np.linalg.norm(motion.shifts - other.shifts, axis=-1) + reach * turned
+
+
+def _reach(scene: Scene, piece: Piece, point: np.ndarray) -> float:
+    """Largest distance of a piece's Gaussians from a point in the new bind state. [3]"""
+    bind = piece.matrices[len(scene.track_times) - 1]
+    means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
+    return float(np.linalg.norm(means @ bind[:3, :3].T + bind[:3, 3] - point, axis=-1).max())
+
+
+def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[Moved]:
+    """Find track and model of every cluster.
+
+    Args:
+        scene: The scene that was edited.
+        found: What `clusters` gave.
+        times: The observed times and later ones. [T]
+        notes: Gets what cannot be kept.
+
+    Returns:
+        The clusters in the same order.
+    """
+    quats, moves = scene_player.knots(scene)
+    known = np.concatenate([quats, moves], axis=-1)
+    courses = [_course(scene, cluster, known) for cluster in found]
+    later = np.asarray(times[len(scene.track_times) :], np.float64) - scene.t_max
+    groups: dict[int, tuple[MotionGroup, bool]] = {}
+    for follows in (False, True):  # those that follow another come last
+        for cluster, course in zip(found, courses, strict=True):
+            if cluster.id == 0 or not cluster.pieces:
+                groups[cluster.id] = replace(cluster.source, id=cluster.id), True
+            elif (cluster.source.follows is not None) == follows:
+                leaders = [
+                    (courses[other.id], *groups[other.id])
+                    for other in found[1:]
+                    if other.source.id == cluster.source.follows and other.id in groups
+                ]
+                groups[cluster.id] = _go_on(scene, cluster, course, leaders, later, notes)
+    return [
+        Moved(
+            cluster.pieces,
+            cluster.source,
+            cluster.motion,
+            cluster.id,
+            group=groups[cluster.id][0],
+            poses=course.poses,
+            same=groups[cluster.id][1],
+        )
+        for cluster, course in zip(found, courses, strict=True)
+    ]
+
+
+def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
+    """How a cluster moves to t_max, by the file's own poses [G, S, 7] where Blender shows those."""
+    source, count = cluster.source, len(scene.track_times)
+    if not cluster.pieces or cluster.id == 0:
+        return _Course(scene.track_poses[source.id], np.asarray(source.pivot, np.float64), np.eye(3))
+    first = cluster.first
+    allowed = max(piece.allowed for piece in cluster.pieces)
+    parent = np.eye(3) if first.parent is None else first.parent
+    pivot = _pivot(scene, cluster, allowed)
+    reach = max(1e-9 * scene.extent, *(_reach(scene, piece, pivot) for piece in cluster.pieces))
+    if source.id == 0:
+        before = np.tile([1.0, 0, 0, 0, 0, 0, 0], (count, 1))
+    else:
+        before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], parent), axis=-1)
+    poses, observed = _track(cluster.motion, pivot, before, reach, allowed)
+    if observed and (before == known[source.id]).all() and source.id:
+        poses = scene.track_poses[source.id].copy()  # signs included
+    return _Course(poses, pivot, parent, reach, allowed, observed and bool((parent == np.eye(3)).all()))
+
+
+def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
+    """Where the pivot is at t_max; the file's own where that is it."""
+    first = cluster.first
+    own = np.asarray(cluster.source.pivot, np.float64)
+    bind = first.matrices[len(scene.track_times) - 1]
+    if cluster.source.id == 0:
+        own = np.median(scene.means[first.start : first.start + first.count].astype(np.float64), axis=0)
+    pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
+    return own if np.linalg.norm(pivot - own) <= allowed else pivot
+
+
+def _go_on(
+    scene: Scene,
+    cluster: Cluster,
+    course: _Course,
+    leaders: Sequence[tuple[_Course, MotionGroup, bool]],
+    later: np.ndarray,
+    notes: list[str],
+) -> tuple[MotionGroup, bool]:
+    """The new group of a cluster, with the motion model that it had or was given where Blender shows that, else one
+    that is fitted; and whether it moves as in the file, to t_max and after it.
+
+    Args:
+        scene: The scene that was edited.
+        cluster: The cluster.
+        course: How it moves while it is observed.
+        leaders: What has become of the group that its own follows: course, new group, whether it moves as before.
+        later: Times since t_max. [L]
+        notes: Gets what cannot be kept.
+    """
+    source, first = cluster.source, cluster.first
+    rows = slice(len(scene.track_times), None)
+    quats, moves = cluster.motion.quats[rows], cluster.motion.moves(course.pivot)[rows]
+    scale = float(abs(np.linalg.det(course.parent)) ** (1 / 3))
+    known = {"pivot": course.pivot, "id": cluster.id, "seen": source.seen}
+    known |= {"rigid_rms": scale * source.rigid_rms, "rigid_max": scale * source.rigid_max}
+    if source.id == 0:
+        known |= {"role": "body", "object_id": first.object_id, "rigid_rms": 0.0, "rigid_max": 0.0}
+
+    def shown(q: np.ndarray, d: np.ndarray) -> bool:
+        return bool((fit_drawn_curve.pose_errors(q, d, quats, moves, course.reach) <= course.allowed).all())
+
+    if source.follows is not None and source.follow_matrix is not None:
+        for leading, leader, as_before in leaders:
+            matrix = course.parent @ source.follow_matrix @ np.linalg.inv(leading.parent)
+            _, led = models.evaluate(leader.model, later)
+            if shown(rotations.identity(len(later)), led @ matrix.T):
+                group = replace(source, **known, follows=leader.id, follow_matrix=matrix)
+                return group, course.same and as_before
+    else:
+        given = [] if first.model is None else [first.model]
+        for model in (*given, source.model):
+            turned = _turned_model(model, course.parent)
+            if shown(*models.evaluate(turned, later)):
+                return replace(source, **known, model=turned), course.same and turned == source.model
+    model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
+    if error > 10 * course.allowed:
+        notes.append(
+            f"{first.name}: no motion model goes on past t_max as its curves do; the nearest one is up to "
+            f"{error:.3g} away from them"
+        )
+    return replace(source, **known, model=model, follows=None, follow_matrix=None), False

@@ -1,0 +1,150 @@
+"""A scene as somebody has edited it: the Gaussians that are left, where they were put, and how they move now.
+
+What was not touched keeps the numbers of the file, to the bit; what was, is taken from the places that were sampled at
+the observed times and after them (`edited_motion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..playback import group_dynamics
+from ..scene.scene import MotionGroup, Scene, SceneObject
+from . import edited_gaussians, edited_motion
+from .edited_motion import Moved, Piece
+
+__all__ = ("Piece", "edit")
+
+
+def edit(
+    scene: Scene, pieces: Sequence[Piece], times: np.ndarray, table: Mapping[int, SceneObject]
+) -> tuple[Scene, list[str]]:
+    """Write edits into a scene.
+
+    Args:
+        scene: The scene that was edited.
+        pieces: What is left of it, or several times in it. Rows that no piece has are deleted.
+        times: The observed times and later ones, at which ``matrices`` of the pieces are. [T]
+        table: Names, aliases, captions and colours by object id; rows are not looked at. Objects of the scene that
+            pieces have and the table lacks keep theirs.
+
+    Returns:
+        The edited scene, and what it cannot hold or holds less exactly, as sentences.
+
+    Raises:
+        ValueError: A piece leaves the scene or flattens space.
+    """
+    notes: list[str] = []
+    pieces = [piece for piece in pieces if piece.count > 0]
+    for piece in pieces:
+        if not 0 <= piece.start <= piece.start + piece.count <= len(scene.means):
+            raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.means)} Gaussians")
+    clusters = edited_motion.move(scene, edited_motion.clusters(scene, pieces, notes), times, notes)
+    kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
+    objects = _objects(scene, table, arrays["object_ids"])
+    groups = _groups(clusters, scene, objects, kept, arrays["motion_ids"])
+    if not (untouched and all(cluster.same for cluster in clusters)):
+        for name in ("dynamics", "canonical_means"):
+            if arrays.get(name) is not None:
+                arrays[name] = None
+                notes.append(f"'{name}' of single Gaussians hold for the unedited scene only and are left out")
+    result = replace(
+        scene,
+        **arrays,
+        track_poses=np.stack([cluster.poses for cluster in clusters]),
+        objects=objects,
+        groups=groups,
+        **_meanings(scene, objects, kept, arrays["object_ids"]),
+    )
+    return _with_representatives(result), notes
+
+
+def _objects(scene: Scene, table: Mapping[int, SceneObject], object_ids: np.ndarray) -> tuple[SceneObject, ...]:
+    """The table of objects: those that have Gaussians, those that had none before, and the background."""
+    old = {item.id: item for item in scene.objects}
+    empty = {item.id for item in scene.objects if item.count == 0}
+    wanted = sorted({0, *empty, *np.unique(object_ids).tolist()})
+    result: list[SceneObject] = []
+    names: set[str] = set()
+    for object_id in wanted:
+        item = table.get(object_id) or old.get(object_id)
+        if item is None:
+            item = SceneObject(object_id, f"object {object_id}", (), "", (0.5, 0.5, 0.5), 0, 0)
+        name, number = item.name, 2
+        while name in names:
+            name, number = f"{item.name} {number}", number + 1
+        names.add(name)
+        start = int(np.searchsorted(object_ids, object_id))
+        count = int(np.searchsorted(object_ids, object_id, side="right")) - start
+        result.append(replace(item, id=object_id, name=name, start=start, count=count))
+    return tuple(result)
+
+
+def _groups(
+    clusters: Sequence[Moved],
+    scene: Scene,
+    objects: tuple[SceneObject, ...],
+    kept: np.ndarray,
+    motion_ids: np.ndarray,
+) -> tuple[MotionGroup, ...]:
+    """The motion groups, with objects that are left and representatives at their new rows, -1 where they are gone."""
+    ids = {item.id for item in objects}
+    new_ids = {cluster.source.id: cluster.id for cluster in reversed(clusters) if cluster.source.id or not cluster.id}
+    groups = []
+    for cluster in clusters:
+        group = cluster.group
+        rows = np.flatnonzero((kept == group.anchor_index) & (motion_ids == cluster.id))
+        if cluster.id == 0 and not len(rows):
+            rows = np.flatnonzero(kept == group.anchor_index)
+        object_id = group.object_id
+        if cluster.pieces and cluster.id and group.role == "body":
+            own = [piece.object_id for piece in cluster.pieces]
+            object_id = object_id if object_id in own else max(set(own), key=own.count)
+        if not cluster.pieces and group.follows is not None:
+            leader = new_ids.get(group.follows)
+            group = replace(group, follows=leader, follow_matrix=None if leader is None else group.follow_matrix)
+        groups.append(
+            replace(
+                group,
+                id=cluster.id,
+                object_id=object_id if object_id in ids else 0,
+                anchor_index=int(rows[0]) if len(rows) else -1,
+            )
+        )
+    return tuple(groups)
+
+
+def _meanings(
+    scene: Scene, objects: tuple[SceneObject, ...], kept: np.ndarray, object_ids: np.ndarray
+) -> dict[str, Any]:
+    """Rows of the classifier and of the embeddings for the new table; a new object has those of what it was made of."""
+    rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
+    for item in objects:
+        if item.id not in rows:
+            source = int(scene.object_ids[kept[item.start]]) if item.count else 0
+            rows[item.id] = rows.get(source, rows[0])
+    offset = sum(item.id < 0 for item in scene.objects)
+    named = [rows[item.id] - offset for item in objects if item.id >= 0]
+    weight, bias, embeddings = scene.classifier_weight, scene.classifier_bias, scene.embeddings
+    views, mine = scene.view_embeddings, [rows[item.id] for item in objects]
+    return {
+        "classifier_weight": None if weight is None else weight[named],
+        "classifier_bias": None if bias is None else bias[named],
+        "embeddings": None if embeddings is None else embeddings[mine],
+        "view_embeddings": None if views is None else views[mine],
+        "lookup": None if scene.lookup is None else scene.lookup.select(mine),
+    }
+
+
+def _with_representatives(scene: Scene) -> Scene:
+    """The scene with a representative for each group that has lost its own."""
+    groups = list(scene.groups)
+    for number, group in enumerate(groups):
+        rows = np.flatnonzero(scene.motion_ids == number)
+        if group.anchor_index < 0 and len(rows):
+            groups[number] = replace(group, anchor_index=group_dynamics.representative(scene, rows))
+    return replace(scene, groups=tuple(groups))

@@ -1,0 +1,170 @@
+"""Pictures of a scene in each playback mode against true images, with true future poses as the oracle of motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..data.dataset import Dataset, View
+from ..evaluation import evaluate, ground_truth_poses
+from ..playback import scene_player
+from ..render import scene_renderer
+from ..scene.scene import Scene
+from . import timing
+from .report_rows import Row
+
+KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")
+FRAMES = 6  # of the views that are timed
+ORACLE = "true poses"
+_SAME = 1e-6
+Move = Callable[[float], scene_player.Frame]
+
+
+def measure(
+    scene: Scene,
+    dataset: Dataset,
+    splits: Sequence[str],
+    rounds: int,
+    *,
+    clock: str = "wall",
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[Row], list[str]]:
+    """Rows of the task "images".
+
+    Args:
+        scene: The scene.
+        dataset: Its data set.
+        splits: Splits to measure; kinds of error of all but the first one carry "@" and their name.
+        rounds: Rounds of timing.
+        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        backend: Rasterizer.
+        progress: Called with images measured and their number.
+
+    Returns:
+        The rows, and what is absent and why.
+    """
+    rows, absent = [], []
+    players = {mode: scene_player.Player(scene, mode) for mode in scene_player.modes(scene)}
+    if len(players) == 1:
+        absent.append("images of other modes than rigid: the scene holds no dynamics of its Gaussians")
+    moves: dict[str, Move] = {mode: player.frame for mode, player in players.items()}
+    oracle, why = true_move(scene, dataset, [view.t for split in splits for view in dataset.views(split)])
+    if oracle is None:
+        absent.append(f"images with true poses: {why}")
+    else:
+        moves[ORACLE] = oracle
+    plans = {}
+    for split in splits:
+        past = any(view.t > scene.t_max for view in dataset.views(split))
+        plans[split] = moves if past else {k: m for k, m in moves.items() if k in ("rigid", ORACLE)}
+        if not dataset.views(split):
+            absent.append(f"images of {split}: the data set has none")
+        elif not past and len(moves) > len(plans[split]):
+            absent.append(f"images of {split} in other modes than rigid: up to t_max all are the same")
+    total = sum(len(dataset.views(split)) * len(plan) for split, plan in plans.items())
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    missing: dict[str, None] = {}
+    for number, (split, plan) in enumerate(plans.items()):
+        views = dataset.views(split)
+        if not views:
+            continue
+        motion, raster = _times(scene, views, {k: m for k, m in plan.items() if k != ORACLE}, rounds, backend)
+        for mode, move in plan.items():
+            found = evaluate.measure(scene, views, move, backend=backend, measured=count)
+            label: dict[str, Any] = {"mode": mode, "method": "playback"}
+            if mode == ORACLE:  # nothing that could be chosen, so it is not timed and on no front
+                label = {"mode": "rigid", "method": ORACLE, "note": "motion is given, not predicted"}
+                times: dict[str, Any] = {}
+            else:
+                times = {"ms_motion": motion[mode].ms(clock), "ms_raster": raster[mode].ms(clock)}
+                times |= (motion[mode] + raster[mode]).columns(clock)
+            for kind in KINDS:
+                if found[kind] is None:
+                    missing[kind] = None
+                    continue
+                row = Row(
+                    task="images",
+                    setting=split,
+                    error_kind=kind if number == 0 else f"{kind}@{split}",
+                    error=float(found[kind]),
+                    count=found["images"],
+                    **label,
+                    **times,
+                )
+                rows.append(row)
+    if missing:
+        absent.append(f"images: not computed: {', '.join(missing)} (docs/evaluation.md says what each needs)")
+    return rows, absent
+
+
+def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[Move | None, str]:
+    """Playback with every body in its true pose past t_max.
+
+    A body whose rotation the images do not tell, as of a ball without texture, wears what it looks like in a rotation
+    of its own: it goes to its true place and turns as the scene has it.
+
+    Args:
+        scene: The scene.
+        dataset: Its data set.
+        times: Times that will be asked for.
+
+    Returns:
+        What gives the frame at one of the times, or None and why there is no such thing.
+    """
+    if dataset.ground_truth is None:
+        return None, "the data set has no true poses (ground_truth.json)"
+    bodies = ground_truth_poses.bodies(scene, dataset.ground_truth, every=True)
+    if not bodies:
+        return None, "none of the objects with true poses is one of the scene, or none of the poses was observed"
+    known = bodies[0].times
+    lost = [t for t in times if np.abs(known - t).min() > _SAME]
+    if lost:
+        return None, f"the data set has no true poses at t = {lost[0]:g}"
+    player = scene_player.Player(scene)
+
+    def move(t: float) -> scene_player.Frame:
+        quats, displacements = (x.copy() for x in player.group_poses(t))
+        if t <= scene.t_max:
+            return player.frame(t)
+        k = int(np.abs(known - t).argmin())
+        for body in bodies:
+            if body.group.role == "body" and not body.turn_seen:
+                displacements[body.group.id] = body.path[k] - body.group.pivot
+            elif body.group.role == "body":
+                q, d = ground_truth_poses.pose(body.group.pivot, body.motion[k])
+                quats[body.group.id], displacements[body.group.id] = q, d
+        for group in scene.groups:
+            if group.follows is not None and group.follow_matrix is not None:
+                displacements[group.id] = group.follow_matrix @ displacements[group.follows]
+        return scene_player.pose(scene, quats, displacements, t)
+
+    return move, ""
+
+
+def _times(
+    scene: Scene, views: Sequence[View], moves: dict[str, Move], rounds: int, backend: str
+) -> tuple[dict[str, timing.Times], dict[str, timing.Times]]:
+    """Time of a frame by mode: motion, and rasterization of colours alone."""
+    some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).round().astype(int))]
+    calls: dict[tuple[str, str], Callable[[], object]] = {}
+    for mode, move in moves.items():
+        frames = [move(view.t) for view in some]
+        calls[mode, "motion"] = lambda move=move: [move(view.t) for view in some]
+        calls[mode, "raster"] = lambda frames=frames: [
+            scene_renderer.to_numpy(
+                scene_renderer.render_frame(scene, frame, view.camera, backend=backend).color, np.float32
+            )
+            for frame, view in zip(frames, some, strict=True)
+        ]
+    times = {key: found.scaled(1 / len(some)) for key, found in timing.take(calls, rounds).items()}
+    return {m: times[m, "motion"] for m in moves}, {m: times[m, "raster"] for m in moves}

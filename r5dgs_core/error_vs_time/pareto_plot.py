@@ -1,0 +1,237 @@
+"""The report "error against run time" as one picture: a panel per task, the front drawn, the points named."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..evaluation import label_placement
+from . import image_task, report_rows, tables
+from .report_rows import Row
+
+# A panel's kind of error, its label, and the factor on the numbers.
+_SHOWN = {
+    "dynamics": ("position", "position error, % of the object's size", 100.0),
+    "poses": ("position", "position error, % of the object's size", 100.0),
+    "images": ("psnr", "error of pixels, 8-bit levels (rms)", 1.0),
+    "raster": ("difference", "difference to the finest picture, 8-bit levels (rms)", 1.0),
+}
+_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "images": 1e-3, "raster": 1e-4}  # what is smaller is drawn there
+# Colours that people with any colour vision tell apart (Okabe and Ito 2008).
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
+_FRONT = "#B00020"
+_DPI = 110
+LEAST_SPAN = 2.0  # of the times that an axis shows
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A row in a panel: place, name and colour, and whether it is on the front."""
+
+    x: float
+    y: float
+    row: Row
+    name: str
+    color: str
+
+
+def png(report: dict[str, Any]) -> bytes:
+    """The picture as a PNG.
+
+    Args:
+        report: What `report.measure` gives; tasks without rows that have a time get no panel.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    groups = report_rows.by_task(report_rows.from_dicts(report["rows"]))
+    panels = {task: found for task, rows in groups.items() if (found := _points(task, rows))}
+    oracle = {
+        row.task: _pixel_error(row.error)
+        for row in groups.get("images", [])
+        if row.method == image_task.ORACLE and row.error_kind == "psnr"
+    }
+    columns = min(2, max(1, len(panels)))
+    lines = max(1, math.ceil(len(panels) / 2))
+    figure = Figure(figsize=(9.2 * columns, 6.9 * lines), dpi=_DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    figure.suptitle(
+        f"{report['scene']}: error against run time. {report['gaussians']} Gaussians, {report['groups']} motion "
+        f"groups, {report['machine']['raster_threads']} threads.\n"
+        "Down and left is better; red: the front, where nothing better is as fast."
+    )
+    if not panels:
+        figure.text(0.5, 0.5, "nothing could be timed", ha="center")
+    grid = figure.subplots(lines, columns, squeeze=False).ravel() if panels else []
+    drawn = []
+    for axes, (task, points) in zip(grid, panels.items(), strict=False):
+        _draw(axes, task, points, report)
+        if task in oracle:
+            axes.axhline(oracle[task], color="0.35", linestyle="--", linewidth=1, zorder=0)
+        drawn.append((axes, task, points))
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    canvas.draw()  # lays the panels out, so that pixels are known
+    figure.set_layout_engine("none")
+    for axes, task, points in drawn:
+        _name(axes, canvas.get_renderer(), task, points, oracle.get(task))
+    buffer = io.BytesIO()
+    canvas.print_png(buffer)
+    return buffer.getvalue()
+
+
+def _points(task: str, rows: Sequence[Row]) -> list[_Point]:
+    kind, _, factor = _SHOWN[task]
+    shown = [row for row in rows if row.error_kind == kind and math.isfinite(row.ms) and math.isfinite(row.error)]
+    series = list(dict.fromkeys(_series(row) for row in shown))
+    points = []
+    for row in shown:
+        y = _pixel_error(row.error) if kind == "psnr" else factor * row.error
+        color = _COLORS[series.index(_series(row)) % len(_COLORS)]
+        points.append(_Point(row.ms, max(y, _FLOOR[task]), row, _name_of(row), color))
+    return points
+
+
+def _pixel_error(psnr: float) -> float:
+    """Root mean square in 8-bit levels."""
+    return 255 * 10 ** (-psnr / 20)
+
+
+def _series(row: Row) -> tuple[str, str]:
+    """What has one colour: in "dynamics" a method with its steps, else the base of the mode."""
+    if row.task == "dynamics":
+        return row.mode, row.method
+    if row.task == "raster":
+        return row.mode, row.setting.split()[0]
+    base = row.mode.split("/")[0]
+    return base, "models" if row.mode == "rigid/fitted" else ""
+
+
+def _name_of(row: Row) -> str:
+    if row.task == "raster":
+        return row.setting
+    if row.task == "images":
+        return row.mode
+    if row.task == "poses":
+        return row.method if row.mode == "rigid/fitted" else f"mode {row.mode}"
+    return row.setting.removesuffix(" steps").removesuffix(" step")
+
+
+def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]) -> None:
+    kind, label, _ = _SHOWN[task]
+    axes.set(xscale="log", yscale="log", xlabel=f"{tables.CLOCKS[report['clock']]} per frame, ms", ylabel=label)
+    first = points[0].row
+    tau = report["horizon"]["tau"]
+    titles = {
+        "dynamics": f"Integrating {first.count} groups to {tau:.3g} past t_max: error against a fine reference "
+        "(numbers: steps)",
+        "poses": f"Predicted poses of {first.count} objects at the last time: median error against the truth",
+        "images": f"Modes on {first.count} images of {first.setting}: motion + rasterization",
+        "raster": f"Thresholds of the rasterizer ({first.count} pictures)",
+    }
+    axes.set_title(titles[task], fontsize=11, loc="left")
+    if task == "dynamics":
+        for series in dict.fromkeys(_series(p.row) for p in points):
+            some = [p for p in points if _series(p.row) == series and p.row.setting.endswith(("step", "steps"))]
+            axes.plot(
+                [p.x for p in some],
+                [p.y for p in some],
+                "-",
+                color=next(iter(some), points[0]).color,
+                alpha=0.5,
+                linewidth=1,
+            )
+    for p in points:
+        axes.plot([p.row.ms_low, p.row.ms_high], [p.y, p.y], "-", color=p.color, alpha=0.3, linewidth=2)
+        marker = {"markeredgecolor": _FRONT, "markeredgewidth": 1.6} if p.row.pareto else {"markeredgewidth": 0}
+        axes.plot(p.x, p.y, "o", color=p.color, markersize=6.5, **marker)
+    front = sorted((p for p in points if p.row.pareto), key=lambda p: p.x)
+    if front:
+        axes.step([p.x for p in front], [p.y for p in front], where="post", color=_FRONT, linewidth=1.2, zorder=1)
+    axes.margins(x=0.16, y=0.12)
+    low, high = axes.get_xlim()
+    if high < LEAST_SPAN * low:  # else noise would look like a difference
+        middle = math.sqrt(low * high)
+        axes.set_xlim(middle / math.sqrt(LEAST_SPAN), middle * math.sqrt(LEAST_SPAN))
+    axes.grid(alpha=0.25, which="major")
+    _ticks(axes)
+    if kind == "psnr":
+        right = axes.secondary_yaxis(
+            "right", functions=(lambda y: -20 * np.log10(np.maximum(y, 1e-9) / 255), lambda dB: 255 * 10 ** (-dB / 20))
+        )
+        right.set_ylabel("PSNR, dB")
+        from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
+
+        right.yaxis.set_major_locator(MaxNLocator(8))
+        right.yaxis.set_major_formatter(ScalarFormatter())
+        right.yaxis.set_minor_formatter(NullFormatter())
+    if any(p.y == _FLOOR[task] for p in points):
+        axes.text(
+            0.99, 0.01, f"lowest line: {_FLOOR[task]:g} or less", transform=axes.transAxes, ha="right", fontsize=8
+        )
+
+
+def _ticks(axes: Any) -> None:
+    """Plain numbers where an axis spans little, so that it has some."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        decades = math.log10(high / low)
+        if decades < 5:
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        if decades < 2:
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if decades > 0.9 else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point], oracle: float | None) -> None:
+    """Write the names: those of lines first, then of points of the front, then of the others while there is room."""
+    frame = axes.get_window_extent(renderer)
+    places = axes.transData.transform([(p.x, p.y) for p in points])
+    markers = np.concatenate([places - 4, places + 4], axis=1)
+    texts: list[tuple[np.ndarray, str, str, bool, float]] = []  # place, text, colour, on the front, size
+    if oracle is not None:
+        height = axes.transData.transform((points[0].x, oracle))[1]
+        texts.append((np.array([frame.x1 - 60, height]), "with true poses", "0.35", False, 8.5))
+    if task == "dynamics":
+        for series in dict.fromkeys(_series(p.row) for p in points):
+            last = max(i for i, p in enumerate(points) if _series(p.row) == series)
+            mode, method = series
+            name = f"{method}, fitted model" if mode == "rigid/fitted" else method
+            texts.append((places[last], name, points[last].color, False, 9.5))
+    for i in sorted(range(len(points)), key=lambda i: not points[i].row.pareto):
+        p = points[i]
+        texts.append(
+            (places[i], p.name, _FRONT if p.row.pareto else p.color, p.row.pareto, 7 if task == "dynamics" else 8.5)
+        )
+    sizes = []
+    for _, text, _, bold, size in texts:
+        probe = axes.text(0, 0, text, fontsize=size, fontweight="bold" if bold else "normal")
+        box = probe.get_window_extent(renderer)
+        sizes.append((box.width, box.height))
+        probe.remove()
+    bounds = np.array([frame.x0 + 2, frame.y0 + 2, frame.x1 - 2, frame.y1 - 2])
+    boxes = label_placement.place(np.array([t[0] for t in texts]), np.array(sizes), bounds, markers)
+    unnamed = 0
+    for (place, text, color, bold, size), box in zip(texts, boxes, strict=True):
+        if box is None:
+            unnamed += 1
+            continue
+        middle = 0.5 * (box[:2] + box[2:])
+        nearest = np.clip(place, box[:2], box[2:])
+        if np.linalg.norm(nearest - place) > 12:
+            ends = axes.transData.inverted().transform([place, nearest])
+            axes.plot(ends[:, 0], ends[:, 1], "-", color=color, alpha=0.4, linewidth=0.7, zorder=1)
+        at = axes.transData.inverted().transform(middle)
+        style = {"fontsize": size, "fontweight": "bold" if bold else "normal", "ha": "center", "va": "center"}
+        veil = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.3}
+        axes.text(*at, text, color=color, bbox=veil, **style)
+    if unnamed:
+        axes.text(
+            0.01, 0.01, f"{unnamed} points without room for a name: see the table", transform=axes.transAxes, fontsize=8
+        )

@@ -1,0 +1,257 @@
+"""Predicted poses of objects against true ones: sources of group motion, motion models one by one, confidence band."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..data.dataset import GroundTruth
+from ..evaluation import ground_truth_poses, metrics
+from ..motion import free_top, models, rigid_fit
+from ..motion_fit import candidates, model_selection
+from ..playback import group_dynamics, scene_player
+from ..scene.scene import MotionGroup, Scene
+from . import timing
+from .report_rows import Row, spread
+
+MODELS = tuple(candidates.BY_NAME)  # tried one by one
+STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # what a swing is where nothing swings
+_SAME = 1e-9
+_LEAST_MOMENT = 1e-6  # share of the largest: members on a line have none about it, where a top needs some
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """One model for every body.
+
+    Attributes:
+        fits: By body; None for an object at rest that has no track of its own.
+        ms: Processor time of fitting them.
+    """
+
+    fits: tuple[model_selection.Fit | None, ...]
+    ms: float
+
+
+def measure(
+    scene: Scene, ground_truth: GroundTruth | None, rounds: int, clock: str = "wall"
+) -> tuple[list[Row], list[str]]:
+    """Rows of the task "poses": at the last time of the truth, and along the horizon.
+
+    Args:
+        scene: The scene.
+        ground_truth: True poses, where the data set has them.
+        rounds: Rounds of timing.
+        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+
+    Returns:
+        The rows, and what is absent and why.
+    """
+    if ground_truth is None:
+        return [], ["poses: no true poses are known (a data set has them in ground_truth.json), so no pose error"]
+    bodies = ground_truth_poses.bodies(scene, ground_truth)
+    later = ground_truth.times > scene.t_max + _SAME
+    if not bodies or not later.any():
+        why = "none of them lies past t_max" if bodies else "none of them was observed, or of no object of the scene"
+        return [], [f"poses: the data set has true poses, but {why}"]
+    rows, absent = _of_modes(scene, bodies, later, rounds, clock)
+    some, missing = _of_models(scene, bodies, later, rounds, clock)
+    return rows + some, absent + missing
+
+
+def _of_modes(
+    scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
+) -> tuple[list[Row], list[str]]:
+    """Each playback mode. Bodies of hybrid are those of rigid; where Gaussians part, their best rigid motion counts."""
+    times = bodies[0].times[later]
+    last = float(times[-1])
+    players = {
+        mode: scene_player.Player(scene, mode) for mode in scene_player.modes(scene) if not mode.startswith("hybrid")
+    }
+    calls: dict[str, Callable[[], object]] = {}
+    for mode, player in players.items():
+        by_groups = scene_player.split(mode)[0] == "rigid"
+        calls[mode] = (lambda p=player: p.group_poses(last)) if by_groups else (lambda p=player: p.frame(last))
+    timed = timing.take(calls, rounds)
+    rows = []
+    for mode, player in players.items():
+        if scene_player.split(mode)[0] == "rigid":
+            predicted, method, note = _group_motion(player, bodies, times), "group poses", ""
+        else:
+            predicted, method = _member_motion(scene, player, bodies, times), "rigid fit to moved Gaussians"
+            note = "time is that of all Gaussians"
+        label = {"task": "poses", "mode": mode, "method": method, "setting": "as baked", "note": note}
+        rows += _errors(bodies, later, predicted, {**label, **timed[mode].columns(clock)})
+    absent = []
+    if len(players) == 1:
+        absent.append("poses of rigid/representative, median, least_squares, kabsch, standard, rigid_paper: the scene "
+                      "holds no dynamics of its Gaussians; a `field` run has them")  # fmt: skip
+    else:
+        absent.append("poses of hybrid: its bodies move as those of rigid")
+    return rows, absent
+
+
+def _of_models(
+    scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
+) -> tuple[list[Row], list[str]]:
+    """Each motion model alone, the one that is chosen of all, and its confidence band."""
+    times = bodies[0].times[later]
+    taus = times - scene.t_max
+    fitted = {name: _fit(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
+    chosen = _fit(scene, bodies, None)
+    counts = {name: sum(fit is not None and fit.chosen == name for fit in chosen.fits) for name in MODELS}
+    found = {**fitted, "chosen of the family": chosen}
+    sets = {
+        name: [_model(body, fit) for body, fit in zip(bodies, some.fits, strict=True)] for name, some in found.items()
+    }
+    stacks = {name: models.Stack(some) for name, some in sets.items()}
+    timed = timing.take({name: lambda s=stack: s.poses(float(taus[-1])) for name, stack in stacks.items()}, rounds)
+    rows = []
+    for name, some in found.items():
+        predicted = np.stack([_model_motion(b, m, taus) for b, m in zip(bodies, sets[name], strict=True)])
+        count = counts.get(name)
+        setting = "held-out error, rest test" if count is None else f"chosen for {count} of {len(bodies)}"
+        rested = sum(fit is not None and fit.rested for fit in some.fits)
+        notes = [f"{rested} found at rest"] if rested else []
+        notes += [f"{STEADY[name]} where nothing swings"] if name in STEADY else []
+        label = {"task": "poses", "mode": "rigid/fitted", "method": name, "setting": setting, "note": "; ".join(notes)}
+        rows += _errors(bodies, later, predicted, {**label, **timed[name].columns(clock), "ms_once": some.ms})
+    band, absent = _band(bodies, chosen, times, taus)
+    return rows + band, absent
+
+
+def _fit(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> _Fitted:
+    """Fit the tracks of the bodies as baking does, with one family of motions or several."""
+    started = time.process_time()
+    fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
+    return _Fitted(fits, 1e3 * (time.process_time() - started))
+
+
+def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -> model_selection.Fit:
+    """Fit the track of a body as baking does.
+
+    Args:
+        scene: The scene.
+        group: Of role "body".
+        names: Motion models to choose from, of `MODELS`; all where None.
+    """
+    track = scene.track_poses[group.id]
+    first, last = group.seen or (-np.inf, np.inf)
+    rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
+    # A free top is told by its shape, and offered by it where all motions are.
+    shape = None
+    if names is None or names == (candidates.FREE_TOP.name,):
+        shape = free_top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
+    seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
+    return model_selection.fit(
+        scene.track_times,
+        track[:, :4],
+        track[:, 4:],
+        radius=group.model.radius,
+        weights=seen.astype(np.float64),
+        candidates=names,
+        inertia=shape,
+    )
+
+
+def _model(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> models.MotionModel:
+    return models.MotionModel(radius=body.size / 2) if fit is None else fit.model
+
+
+def _model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus: np.ndarray) -> np.ndarray:
+    """[H, 4, 4]"""
+    quats, displacements = models.evaluate(model, taus)
+    return np.stack(
+        [ground_truth_poses.matrix(body.group.pivot, q, d) for q, d in zip(quats, displacements, strict=True)]
+    )
+
+
+def _group_motion(
+    player: scene_player.Player, bodies: tuple[ground_truth_poses.Body, ...], times: np.ndarray
+) -> np.ndarray:
+    """How a mode moves the groups of bodies. [B, H, 4, 4]"""
+    found = [player.group_poses(float(t)) for t in times]
+    groups = [body.group for body in bodies]
+    return np.stack(
+        [np.stack([ground_truth_poses.matrix(g.pivot, q[g.id], d[g.id]) for q, d in found]) for g in groups]
+    )
+
+
+def _member_motion(
+    scene: Scene, player: scene_player.Player, bodies: tuple[ground_truth_poses.Body, ...], times: np.ndarray
+) -> np.ndarray:
+    """The rigid motions that best carry the Gaussians of bodies where a mode brings them. [B, H, 4, 4]"""
+    members = []
+    for body in bodies:
+        own = (scene.object_ids == body.object_id) & (scene.motion_ids == body.group.id)
+        members.append(group_dynamics.voters(scene, np.flatnonzero(own)))
+    result = np.empty((len(bodies), len(times), 4, 4))
+    for k, t in enumerate(times):
+        means = player.frame(float(t)).means.astype(np.float64)
+        for i, (body, (rows, weights)) in enumerate(zip(bodies, members, strict=True)):
+            fit = rigid_fit.fit_rigid(scene.means[rows].astype(np.float64), means[rows], weights)
+            result[i, k] = ground_truth_poses.matrix(body.group.pivot, fit.quat, fit.displacement_at(body.group.pivot))
+    return result
+
+
+def _errors(
+    bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, predicted: np.ndarray, shared: dict
+) -> list[Row]:
+    """Rows of a prediction [B, H, 4, 4] at the last time, and at the others past t_max."""
+    pairs = [
+        metrics.pose_errors(some, body.motion[later], body.group.pivot)
+        for body, some in zip(bodies, predicted, strict=True)
+    ]
+    positions = np.stack([distance / body.size for body, (distance, _) in zip(bodies, pairs, strict=True)])  # [B, H]
+    angles = np.stack([angle for _, angle in pairs])
+    times = bodies[0].times[later]
+    rows = []
+    for k in reversed(range(len(times))):
+        at = "" if k == len(times) - 1 else f"@t={times[k]:.4g}"
+        rows += [
+            Row(error_kind=f"position{at}", **spread(positions[:, k]), count=len(bodies), **shared),
+            Row(error_kind=f"rotation{at}", **spread(angles[:, k]), count=len(bodies), **shared),
+        ]
+    return rows
+
+
+def _band(
+    bodies: tuple[ground_truth_poses.Body, ...], chosen: _Fitted, times: np.ndarray, taus: np.ndarray
+) -> tuple[list[Row], list[str]]:
+    """Share of true errors that lie outside two standard deviations, over bodies and times that the band reaches.
+
+    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2; of one
+    whose rotation the images do not tell, that of its place.
+    """
+    inside, count, widths = 0, 0, []
+    for body, fit in zip(bodies, chosen.fits, strict=True):
+        if fit is None or len(fit.band_tau) == 0:
+            continue
+        reached = taus <= fit.band_tau[-1] + _SAME
+        truth = body.motion[np.isin(body.times, times)]
+        distances, angles = metrics.pose_errors(_model_motion(body, fit.model, taus), truth, body.group.pivot)
+        if not body.turn_seen:  # its rotation says nothing, and so not how the scene's pivot lies in the true body
+            places = body.group.pivot + models.evaluate(fit.model, taus)[1]
+            distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
+        errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * fit.model.radius) ** 2)
+        band = np.interp(taus, fit.band_tau, fit.band)
+        inside += int((errors <= band)[reached].sum())
+        count += int(reached.sum())
+        widths.append(float(band[reached][-1]) / body.size if reached.any() else np.nan)
+    if count == 0:
+        return [], ["poses: no body has a confidence band that reaches the times of the truth"]
+    width = f"; median half width at the last time {np.nanmedian(widths):.3g} of the size"
+    row = Row(
+        task="poses",
+        mode="rigid/fitted",
+        method="2-sigma band",
+        setting="chosen of the family",
+        error_kind="outside_band",
+        error=1 - inside / count,
+        count=count,
+        note=f"{inside} of {count} errors inside (bodies x times){width}",
+    )
+    return [row], []

@@ -1,0 +1,109 @@
+"""Thresholds of the rasterizer against the finest picture: what each saves, and what it costs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..data import dataset as datasets
+from ..evaluation import evaluate, metrics
+from ..playback import scene_player
+from ..raster import RasterSettings, backends
+from ..render import scene_renderer
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import timing
+from .report_rows import Row, spread
+
+FINEST = {"alpha_min": 1e-4, "transmittance_min": 1e-30}
+SETTINGS: tuple[dict[str, float], ...] = (
+    {},
+    {"alpha_min": 1 / 1000},
+    {"alpha_min": 2 / 255},
+    {"alpha_min": 4 / 255},
+    {"alpha_min": 8 / 255},
+    {"alpha_min": 16 / 255},
+    {"transmittance_min": 1e-3},
+    {"transmittance_min": 1e-2},
+    {"transmittance_min": 0.05},
+    {"transmittance_min": 0.2},
+    {"alpha_min": 4 / 255, "transmittance_min": 1e-2},
+)
+VIEWS = 4
+
+
+def measure(
+    scene: Scene, views: Sequence[datasets.View], rounds: int, *, clock: str = "wall", backend: str = "auto"
+) -> tuple[list[Row], list[str]]:
+    """Rows of the task "raster", in mode "rigid".
+
+    Args:
+        scene: The scene.
+        views: Views with true images; none for the cameras of the scene at t_max.
+        rounds: Rounds of timing.
+        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        backend: Rasterizer.
+
+    Returns:
+        The rows, and what is absent and why.
+    """
+    absent, player = [], scene_player.Player(scene)
+    shots: list[tuple[Camera, float]] = [(view.camera, view.t) for view in views]
+    if not shots:
+        shots = [(camera, scene.t_max) for camera in scene.cameras]
+    if not shots:
+        return [], ["raster: neither the scene nor a data set gives a camera"]
+    kept = np.unique(np.linspace(0, len(shots) - 1, min(VIEWS, len(shots))).round().astype(int)).tolist()
+    shots = [shots[i] for i in kept]
+    frames = [player.frame(t) for _, t in shots]
+    if views:
+        truths = [datasets.load_image(views[i], evaluate.truth_background(scene)) for i in kept]
+    else:
+        truths = []
+        absent.append("raster: PSNR against true images needs a data set")
+    used = backends.choose_backend(backend, scene_renderer.tensor(scene.means))
+    base = RasterSettings(near_plane=scene.near_plane)
+
+    def draw(changes: dict[str, float]) -> list[np.ndarray]:
+        settings = dataclasses.replace(base, **changes)
+        outputs = [
+            scene_renderer.render_frame(scene, frame, camera, backend=backend, settings=settings)
+            for frame, (camera, _) in zip(frames, shots, strict=True)
+        ]
+        return [np.clip(scene_renderer.to_numpy(output.color, np.float32), 0, 1) for output in outputs]
+
+    labels = {"finest": FINEST, **{_name(changes): changes for changes in SETTINGS}}
+    calls: dict[str, Callable[[], object]] = {name: lambda c=changes: draw(c) for name, changes in labels.items()}
+    times = {name: found.scaled(1 / len(shots)) for name, found in timing.take(calls, rounds).items()}
+    exact, rows = draw(FINEST), []
+    for name, changes in labels.items():
+        pictures = draw(changes)
+        shared = {
+            "task": "raster",
+            "mode": "rigid",
+            "method": used,
+            "setting": name,
+            "count": len(shots),
+            "ms_raster": times[name].ms(clock),
+            **times[name].columns(clock),
+        }
+        if changes is not FINEST:
+            distances = [255 * metrics.mse(p, e) ** 0.5 for p, e in zip(pictures, exact, strict=True)]
+            rows.append(Row(error_kind="difference", **spread(np.array(distances)), **shared))
+        if truths:
+            quality = np.array([metrics.psnr(p, truth) for p, truth in zip(pictures, truths, strict=True)])
+            numbers = {**spread(quality, more_is_better=True), "error": float(quality.mean())}
+            rows.append(Row(error_kind="psnr", **numbers, **shared))
+    return rows, absent
+
+
+def _name(changes: dict[str, float]) -> str:
+    """Settings in a few words, thresholds of alpha in 8-bit levels."""
+    words = {"alpha_min": "alpha", "transmittance_min": "stop"}
+    parts = [
+        f"{words[key]} {round(255 * value, 2):g}/255" if key == "alpha_min" else f"{words[key]} {value:g}"
+        for key, value in changes.items()
+    ]
+    return ", ".join(parts) or "3DGS (alpha 1/255, stop 0.0001)"

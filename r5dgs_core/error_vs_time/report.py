@@ -1,0 +1,160 @@
+"""The report "error against run time": integrators, poses, pictures and rasterizer settings of one scene, in one run.
+
+Everything that is compared is timed in turns (`timing`), and every time stands beside the error that it buys.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import atomic_files
+from ..data.dataset import Dataset
+from ..errors import ConfigError
+from ..render import machine
+from ..scene.scene import Scene
+from . import image_task, integrator_task, pareto_plot, pose_task, rasterizer_task, report_rows, tables, timing
+from .report_rows import Row
+
+JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"
+ROUNDS = 7
+SHARE = 1 / 3  # of the observed time: how far past t_max without test views
+
+
+def measure(
+    scene: Scene,
+    dataset: Dataset | None = None,
+    *,
+    tasks: Sequence[str] = report_rows.TASKS,
+    splits: Sequence[str] = ("test",),
+    rounds: int = ROUNDS,
+    clock: str = "wall",
+    backend: str = "auto",
+    progress: Callable[[dict[str, Any]], None] = lambda event: None,
+) -> dict[str, Any]:
+    """Measure a scene.
+
+    Args:
+        scene: The scene.
+        dataset: Its data set: images and true poses are compared with; None leaves that out.
+        tasks: Of `report_rows.TASKS`.
+        splits: Splits whose images are compared; the first one decides the front.
+        rounds: Rounds of timing; medians and quartiles are over them.
+        clock: "wall", or "cpu" for processor time, which other work on the machine hardly disturbs.
+        backend: Rasterizer.
+        progress: Called with events.
+
+    Returns:
+        In JSON types ``scene gaussians groups t_max horizon rounds clock machine kinds absent rows``: ``horizon`` is
+        the time past t_max at which errors of integration are measured, ``absent`` says what could not be measured and
+        why, and ``rows`` are those of `report_rows.Row`.
+    """
+    tau, why = horizon(scene, dataset)
+    rows: list[Row] = []
+    absent: list[str] = []
+
+    def add(found: tuple[list[Row], list[str]]) -> None:
+        rows.extend(found[0])
+        absent.extend(found[1])
+
+    for task in report_rows.TASKS:
+        if task not in tasks:
+            absent.append(f"{task}: not asked for")
+            continue
+        if task != "images":
+            progress({"event": "report", "text": task})
+        if task == "dynamics":
+            add(integrator_task.measure(scene, tau, rounds, clock))
+        elif task == "poses":
+            if dataset is None:
+                absent.append("poses: no data set was given, so no true poses are known")
+            else:
+                add(pose_task.measure(scene, dataset.ground_truth, rounds, clock))
+        elif task == "images":
+            if dataset is None:
+                absent.append("images: no data set was given, so there is nothing to compare with")
+            else:
+                add(
+                    image_task.measure(
+                        scene,
+                        dataset,
+                        splits,
+                        rounds,
+                        clock=clock,
+                        backend=backend,
+                        progress=lambda done, total: progress({"event": "images", "done": done, "total": total}),
+                    )
+                )
+        else:
+            views = () if dataset is None else dataset.views(splits[0])
+            add(rasterizer_task.measure(scene, views, rounds, clock=clock, backend=backend))
+    busy = _busy(rows)
+    if busy > timing.BUSY and clock == "wall":
+        absent.append(
+            f"wall times of a machine at rest: here they are {busy:.1f} times the processor times (median); "
+            "measure again when nothing else runs, or with --clock cpu"
+        )
+    rows = report_rows.mark_front(rows)
+    return {
+        "scene": scene.name,
+        "gaussians": len(scene.means),
+        "groups": len(scene.groups),
+        "t_max": scene.t_max,
+        "horizon": {"tau": tau, "why": why},
+        "rounds": rounds,
+        "clock": clock,
+        "machine": {**machine.describe(), "versions": machine.versions()},
+        "kinds": {k: {"label": v.label, "more_is_better": v.more_is_better} for k, v in report_rows.KINDS.items()},
+        "absent": absent,
+        "rows": [row.to_dict() for row in rows],
+    }
+
+
+def _busy(rows: Sequence[Row]) -> float:
+    """Median of wall time over processor time, 1 without rows."""
+    ratios = [row.ms_wall / row.ms_cpu for row in rows if row.ms_cpu > 0]
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def horizon(scene: Scene, dataset: Dataset | None) -> tuple[float, str]:
+    """Time past t_max at which integration is compared, > 0, and why that one."""
+    last = [view.t for view in dataset.test] if dataset is not None else []
+    if last and max(last) > scene.t_max:
+        return float(max(last) - scene.t_max), "the last test time"
+    span = float(scene.track_times[-1] - scene.track_times[0])
+    return (SHARE * span, "a third of the observed time") if span > 0 else (1.0, "one unit of time")
+
+
+def write(report: dict[str, Any], folder: Path) -> tuple[Path, ...]:
+    """Write a report as JSON, CSV, Markdown and plot.
+
+    Args:
+        report: What `measure` gives.
+        folder: Made where it does not exist.
+
+    Returns:
+        The files.
+
+    Raises:
+        ConfigError: They cannot be written there.
+    """
+    rows = report_rows.from_dicts(report["rows"])
+    content = {
+        JSON_FILE: json.dumps(report, indent=2, allow_nan=False).encode(),
+        CSV_FILE: report_rows.to_csv(rows).encode(),
+        MARKDOWN_FILE: tables.markdown(report).encode(),
+        PLOT_FILE: pareto_plot.png(report),
+    }
+    paths = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in content.items():
+            atomic_files.write(folder / name, data)
+            paths.append(folder / name)
+    except OSError as error:
+        raise ConfigError(f"--out {folder}: the report cannot be written: {error}") from error
+    return tuple(paths)

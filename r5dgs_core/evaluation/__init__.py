@@ -1,0 +1,1 @@
+"""Measure a scene against its data set: metrics, tables, legend and contact sheet."""

@@ -1,0 +1,304 @@
+"""A baked scene against the images, masks and true poses of its data set.
+
+The result has one fixed shape (docs/evaluation.md), so that it can be compared across versions. Renderings are rounded
+to 8 bits before they are measured, as a file would hold them.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import atomic_files
+from ..data import dataset as datasets
+from ..data import images
+from ..errors import ConfigError
+from ..playback import scene_player
+from ..render import scene_renderer
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import ground_truth_poses, metrics, miou
+
+METRICS = (
+    "psnr",
+    "psnr_pooled",
+    "psnr_objects",
+    "ssim",
+    "ssim_objects",
+    "flip",
+    "lpips",
+    *miou.KEYS,
+    "ms_motion",
+    "ms_raster",
+    "images",
+    "images_later",
+)
+_SAME_TIME = 1e-9  # scene time
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One picture of a scene.
+
+    Attributes:
+        color: Display-referred sRGB, rounded to 8 bits. [H, W, 3] float32
+        ids: Object of each pixel, 0 = background. [H, W] int32
+        ms_motion: Time that the motion took, milliseconds.
+        ms_raster: Time that the rendering took, milliseconds.
+    """
+
+    color: np.ndarray
+    ids: np.ndarray
+    ms_motion: float
+    ms_raster: float
+
+
+def evaluate(
+    scene: Scene,
+    dataset: datasets.Dataset,
+    *,
+    modes: Sequence[str] = ("rigid",),
+    splits: Sequence[str] = ("val", "test"),
+    background: np.ndarray | None = None,
+    backend: str = "auto",
+    train: dict[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Measure a scene on the held-out views of a data set.
+
+    Args:
+        scene: The scene.
+        dataset: The data set.
+        modes: Ways to move past t_max, of `scene_player.modes`.
+        splits: Splits to measure.
+        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        backend: Rasterizer.
+        train: What the training took: "seconds", "iterations", "gaussians".
+        progress: Called with images measured and their number.
+
+    Returns:
+        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types; what could
+        not be computed is None.
+    """
+    background = truth_background(scene) if background is None else background
+    total = sum(len(dataset.views(split)) for split in splits) * len(modes)
+    done = 0
+    result: dict[str, Any] = {"scene": scene.name, "splits": {}, "objects": object_errors(scene, dataset.ground_truth)}
+    for split in splits:
+        result["splits"][split] = {}
+        views = dataset.views(split)
+        for mode in modes:
+
+            def count() -> None:
+                nonlocal done
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+
+            result["splits"][split][mode] = measure(
+                scene,
+                views,
+                scene_player.Player(scene, mode).frame,
+                background=background,
+                backend=backend,
+                measured=count,
+            )
+    given = train if train is not None else scene.provenance.get("train", {})
+    result["train"] = {
+        "seconds": given.get("seconds"),
+        "iterations": given.get("iterations"),
+        "gaussians": given.get("gaussians", len(scene.means)),
+    }
+    return result
+
+
+def measure(
+    scene: Scene,
+    views: Sequence[datasets.View],
+    move: Callable[[float], scene_player.Frame],
+    *,
+    background: np.ndarray | None = None,
+    backend: str = "auto",
+    measured: Callable[[], None] | None = None,
+) -> dict[str, Any]:
+    """Measure pictures of a scene that is moved in any way.
+
+    Args:
+        scene: The scene.
+        views: Cameras, times and true images.
+        move: The scene's Gaussians at a time.
+        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        backend: Rasterizer.
+        measured: Called after each image.
+
+    Returns:
+        METRICS; what could not be computed is None.
+    """
+    background = truth_background(scene) if background is None else background
+    tally = _Tally([item.id for item in scene.objects if item.id > 0])
+    for view in (views[0], views[-1]) if views else ():
+        draw(scene, view.camera, view.t, move, backend=backend)  # compiles, fills what is kept; not timed
+    for view in views:
+        rendering = draw(scene, view.camera, view.t, move, backend=backend)
+        later = is_later(scene, view.t)
+        tally.add(rendering, datasets.load_image(view, background), datasets.load_mask(view), later)
+        if measured is not None:
+            measured()
+    return tally.result()
+
+
+def write(evaluation: dict[str, Any], path: Path) -> Path:
+    """Write an evaluation as JSON; returns ``path``.
+
+    Raises:
+        ConfigError: It cannot be written there.
+    """
+    try:
+        atomic_files.write(path, json.dumps(evaluation, indent=2).encode())
+    except OSError as error:
+        raise ConfigError(f"{path}: the evaluation cannot be written: {error}") from error
+    return path
+
+
+def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
+    """Render colour and object ids of a scene at a time; see `draw`."""
+    return draw(scene, camera, t, functools.partial(scene_player.frame, scene, mode=mode), backend=backend)
+
+
+def draw(
+    scene: Scene, camera: Camera, t: float, move: Callable[[float], scene_player.Frame], *, backend: str = "auto"
+) -> Rendering:
+    """Render colour and object ids of a scene moved in any way, with the milliseconds that it took.
+
+    The id of a pixel is the classifier's answer to the blended identities where the scene has both, else the object
+    with the largest weight in the pixel.
+    """
+    start = time.perf_counter()
+    frame = move(t)
+    moved = time.perf_counter()
+    classified = scene.identities is not None and scene.classifier_weight is not None
+    output = scene_renderer.render_frame(
+        scene, frame, camera, backend=backend, features=scene.identities if classified else None
+    )
+    color = scene_renderer.to_numpy(output.color, np.float32)
+    rendered = time.perf_counter()
+    if classified:
+        ids = classify(scene, scene_renderer.to_numpy(output.features, np.float32))
+    else:
+        ids = np.maximum(scene_renderer.to_numpy(output.ids, np.int32), 0)
+    rounded = images.to_uint8(color).astype(np.float32) / np.float32(255.0)
+    return Rendering(rounded, ids, 1e3 * (moved - start), 1e3 * (rendered - moved))
+
+
+def truth_background(scene: Scene) -> np.ndarray:
+    """Colour that a scene was trained to show where its images are transparent: black if its configuration says so,
+    else white. [3] float32"""
+    train = scene.provenance.get("config", {}).get("train", {})
+    return np.zeros(3, np.float32) if train.get("background") == "black" else np.ones(3, np.float32)
+
+
+def classify(scene: Scene, features: np.ndarray) -> np.ndarray:
+    """Object of each pixel from its blended identity encoding: argmax of the scene's classifier.
+
+    Args:
+        scene: The scene, with classifier.
+        features: Blended identities, no background term. [H, W, 16]
+
+    Returns:
+        Object ids. [H, W] int32
+
+    Source: Gaussian Grouping (Ye et al. 2024), section 3.2.
+    """
+    if scene.classifier_weight is None or scene.classifier_bias is None:
+        raise ValueError("the scene has no classifier")
+    classes = np.array([item.id for item in scene.objects if item.id >= 0], np.int32)
+    if scene.classifier_weight.shape[0] != len(classes):
+        raise ValueError(f"expected {len(classes)} rows in classifier_weight, got {scene.classifier_weight.shape[0]}")
+    logits = features @ scene.classifier_weight.T.astype(np.float32) + scene.classifier_bias.astype(np.float32)
+    return classes[logits.argmax(axis=-1)]
+
+
+def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> list[dict[str, Any]]:
+    """Error of each object's predicted pose at the last time of the ground truth.
+
+    The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times
+    at which the object was seen decide (`ground_truth_poses.bodies`).
+
+    Returns:
+        Per object ``id name position_error rotation_error_deg``: world units and degrees, None where the object has no
+        true pose or no motion group. Without ground truth, one row per object of the scene.
+    """
+    named = {item.id: item.name for item in scene.objects if item.id > 0}
+    known: tuple[ground_truth_poses.Body, ...] = ()
+    if ground_truth is not None:
+        known = ground_truth_poses.bodies(scene, ground_truth)
+        if not scene.provenance.get("discovered"):  # else the ids of the truth mean nothing here
+            named = dict(zip(ground_truth.object_ids, ground_truth.names, strict=True)) | named
+    rows: dict[int, dict[str, Any]] = {
+        key: {"id": key, "name": name, "position_error": None, "rotation_error_deg": None}
+        for key, name in named.items()
+    }
+    for body in known:
+        predicted = ground_truth_poses.motion(scene, [body.group], body.times[-1:])[0]
+        position, angle = metrics.pose_errors(predicted, body.motion[-1:], body.group.pivot)
+        errors = {"position_error": float(position[0]), "rotation_error_deg": float(angle[0])}
+        rows[body.object_id].update(errors)
+    return [rows[key] for key in sorted(rows)]
+
+
+def is_later(scene: Scene, t: float) -> bool:
+    """Whether a time is past the scene's t_max: what it shows is extrapolated."""
+    return t > scene.t_max + _SAME_TIME
+
+
+class _Tally:
+    """Collects the errors of a split's images and averages them."""
+
+    def __init__(self, ids: list[int]) -> None:
+        self.values: dict[str, list[float]] = {name: [] for name in METRICS}
+        self.errors: list[float] = []
+        self.overlap = miou.Overlap(ids)
+        self.later = 0
+
+    def add(self, rendering: Rendering, truth: np.ndarray, mask: np.ndarray | None, later: bool) -> None:
+        self.later += later
+        self.errors.append(metrics.mse(rendering.color, truth))
+        self.values["psnr"].append(metrics.psnr_of_mse(self.errors[-1]))
+        similarity = metrics.ssim_map(rendering.color, truth)
+        self.values["ssim"].append(float(similarity.mean()))
+        flip = metrics.flip(rendering.color, truth)
+        if flip is not None:
+            self.values["flip"].append(flip)
+        if mask is not None:
+            shown = miou.objects_of(mask)
+            self.values["psnr_objects"].append(metrics.psnr(rendering.color, truth, shown))
+            if shown.any():
+                self.values["ssim_objects"].append(float(similarity[shown].mean()))
+            self.overlap.add(rendering.ids, mask)
+        self.values["ms_motion"].append(rendering.ms_motion)
+        self.values["ms_raster"].append(rendering.ms_raster)
+
+    def result(self) -> dict[str, Any]:
+        out: dict[str, Any] = dict.fromkeys(METRICS)
+        for name in ("psnr", "psnr_objects", "ssim", "ssim_objects", "flip"):
+            out[name] = _mean(self.values[name])
+        for name in ("ms_motion", "ms_raster"):
+            out[name] = float(np.median(self.values[name])) if self.values[name] else None
+        out["psnr_pooled"] = metrics.psnr_pooled(self.errors) if self.errors else None
+        out |= self.overlap.result()
+        out["images"], out["images_later"] = len(self.errors), self.later
+        return out
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    """Mean of the values that are numbers; None where there are none."""
+    kept = [value for value in values if not math.isnan(value)]
+    return float(np.mean(kept)) if kept else None

@@ -1,0 +1,223 @@
+"""Which id is what: one row per object of a scene, with how well it is seen, how it moves and how sure its label is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from ..data import dataset as datasets
+from ..playback import scene_player
+from ..render import viewpoints
+from ..scene.scene import MotionGroup, Scene
+from . import evaluate, miou
+from .scene_summary import motion_of
+
+MOST_VIEWS = 24  # that pixels are counted in
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """One object.
+
+    Attributes:
+        id: Object id; 0 is the background, -1 what is unassigned.
+        name: Its name.
+        aliases: Other words for it.
+        caption: A sentence about it, or "".
+        gaussians: Its members.
+        pixels: Mean number of pixels that it has in the views.
+        views: Views that show it.
+        motion: How it moves, in words.
+        rigid_rms: Root mean square distance of its members from its rigid motion, as a share of its radius; None where
+            its members move rigidly by construction, so that there is nothing to measure.
+        confidence: Mean probability that the classifier gives its members' encodings for this object, weighted by their
+            opacities; None where the scene stores no encodings.
+        strays: Members that move with another object's group than their own.
+        iou: Overlap with the true masks of the views, same ids; None without masks that show it.
+    """
+
+    id: int
+    name: str
+    aliases: tuple[str, ...]
+    caption: str
+    gaussians: int
+    pixels: float
+    views: int
+    motion: str
+    rigid_rms: float | None
+    confidence: float | None
+    strays: int
+    iou: float | None
+
+
+def measure(
+    scene: Scene, views: Sequence[datasets.View | viewpoints.Standpoint], mode: str = "rigid", *, backend: str = "auto"
+) -> list[ObjectRow]:
+    """Look at a scene from some views and describe its objects.
+
+    Args:
+        scene: The scene.
+        views: Where from and when; those of a data set are compared with their masks.
+        mode: Way to move past t_max.
+        backend: Rasterizer.
+
+    Returns:
+        A row per object of the scene's table.
+    """
+    player = scene_player.Player(scene, mode)
+    tally = miou.Overlap([item.id for item in scene.objects if item.id > 0])
+    pixels = {item.id: 0 for item in scene.objects}
+    seen = dict.fromkeys(pixels, 0)
+    for view in views:
+        ids = evaluate.draw(scene, view.camera, view.t, player.frame, backend=backend).ids
+        for object_id, count in zip(*(found.tolist() for found in np.unique(ids, return_counts=True)), strict=True):
+            pixels[object_id] = pixels.get(object_id, 0) + count
+            seen[object_id] = seen.get(object_id, 0) + 1
+        mask = datasets.load_mask(view) if isinstance(view, datasets.View) else None
+        if mask is not None:
+            tally.add(ids, mask)
+    found = tally.result()
+    known, sure, astray = found["iou_objects"] or {}, confidences(scene), strays(scene)
+    rows = []
+    for item in scene.objects:
+        groups = [group for group in scene.groups if group.object_id == item.id and group.role == "body"]
+        row = ObjectRow(
+            id=item.id,
+            name=item.name,
+            aliases=item.aliases,
+            caption=item.caption,
+            gaussians=item.count,
+            pixels=pixels[item.id] / max(len(views), 1),
+            views=seen[item.id],
+            motion=motion_of(scene, groups),
+            rigid_rms=_residual(scene, groups),
+            confidence=sure.get(item.id),
+            strays=astray.get(item.id, 0),
+            iou=known.get(str(item.id)) if item.id > 0 else found["iou_background"] if item.id == 0 else None,
+        )
+        rows.append(row)
+    return rows
+
+
+def own_views(scene: Scene) -> list[viewpoints.Standpoint]:
+    """Views of a scene's own cameras, each at another observed time; where it stores none, an overview at some."""
+    first = float(scene.track_times[0])
+    cameras = viewpoints.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
+    # Steps of the golden ratio: neither the order of the cameras nor that of the times shows in the pairs.
+    shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
+    times = first + shares * (scene.t_max - first)
+    return [viewpoints.Standpoint(camera, float(t)) for camera, t in zip(cameras, times, strict=True)]
+
+
+def confidences(scene: Scene) -> dict[int, float]:
+    """Mean probability that the classifier gives to the label of an object's members, weighted by their opacities.
+
+    Returns:
+        By object id; empty where the scene stores no encodings or no classifier, without objects that have no members.
+    """
+    if scene.identities is None or scene.classifier_weight is None or scene.classifier_bias is None:
+        return {}
+    opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+    found = {}
+    for k, item in enumerate(item for item in scene.objects if item.id >= 0):
+        rows = slice(item.start, item.start + item.count)
+        answers = scene.identities[rows].astype(np.float64) @ scene.classifier_weight.T + scene.classifier_bias
+        answers -= answers.max(axis=1, keepdims=True, initial=-np.inf)
+        shares = np.exp(answers)
+        total = float(opacities[rows].sum())
+        if total > 0:
+            found[item.id] = float((opacities[rows] * shares[:, k] / shares.sum(axis=1)).sum() / total)
+    return found
+
+
+def strays(scene: Scene) -> dict[int, int]:
+    """How many members of each object go with another one's group, or rest where theirs moves. A shadow is background
+    that follows its caster, and counts as resting."""
+    bodies = {group.id: group.object_id for group in scene.groups if group.role == "body"}
+    owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.motion_ids]
+    labels = np.maximum(scene.object_ids, 0)
+    # What has no group of its own rests with the background, as it should.
+    away = (owner != labels) & ((owner > 0) | np.isin(labels, list(bodies.values())))
+    ids, counts = np.unique(scene.object_ids[away], return_counts=True)
+    return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+
+
+def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
+    """The rows as a table for the terminal.
+
+    Args:
+        scene: The scene.
+        rows: Of `measure`.
+        views: Number of views that were looked at.
+    """
+    title = escape(f"objects of {scene.name}")
+    shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    measured, compared = (any(getattr(row, key) is not None for row in rows) for key in ("rigid_rms", "iou"))
+    numbers = (*(["bends"] if measured else []), "sure", "strays", *(["IoU"] if compared else []))
+    for name in ("id", "name", "count", "pixels", "views", "motion", *numbers):
+        left = name in ("name", "motion")
+        shown.add_column(name, justify="left" if left else "right", no_wrap=name != "name", overflow="fold")
+    for row in rows:
+        cells = [str(row.id), ", ".join([row.name, *row.aliases]), str(row.gaussians), f"{row.pixels:.0f}"]
+        cells += [str(row.views), row.motion]
+        cells += ["-" if row.rigid_rms is None else f"{100 * row.rigid_rms:.2g} %"] if measured else []
+        cells += ["-" if row.confidence is None else f"{row.confidence:.3f}", str(row.strays)]
+        cells += ["-" if row.iou is None else f"{row.iou:.3f}"] if compared else []
+        shown.add_row(*map(Text, cells))  # without markup: names may hold brackets
+    shown.caption, shown.caption_justify = _caption(scene, rows, views), "left"
+    return shown
+
+
+def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
+    """The same in JSON types: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
+    objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
+    cleaned = {"hygiene": _recorded(scene, "regrouping"), "label_hygiene": _recorded(scene, "label_hygiene")}
+    return {"scene": scene.name, "views": views, **cleaned, "objects": objects}
+
+
+def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:
+    """Counts that training left in the scene: ``regrouping`` of motion labels (`train.observed_motion.Moves`) or
+    ``label_cleanup`` of the objects' (`train.identity.label_cleanup.Changes`); None where it did not run."""
+    found = scene.provenance.get(key)
+    return dict(found) if isinstance(found, dict) else None
+
+
+def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
+    parts = [f"count: Gaussians; pixels: mean over {views} views"]
+    if any(row.rigid_rms is not None for row in rows):
+        parts.append("bends: rms distance from the rigid motion, of the radius; - where rigid by construction")
+    else:
+        parts.append("all members move rigidly by construction: no residual")
+    if any(row.confidence is not None for row in rows):
+        parts.append("sure: mean probability of the members' own id, by the classifier")
+    else:
+        parts.append("sure: -, as the scene stores no identity encodings")
+    parts.append("strays: members that move with another object")
+    if any(row.iou is not None for row in rows):
+        parts.append("IoU: with the true masks of these views, same ids")
+    found = _recorded(scene, "regrouping")
+    if found is not None:
+        moved = sum(int(found.get(key, 0)) for key in ("to_bodies", "to_shadows", "to_rest"))
+        parts.append(f"hygiene: {moved} of {found.get('moving', 0)} moving Gaussians changed their group")
+    cleaned = _recorded(scene, "label_hygiene")
+    if cleaned is not None:
+        rules = {rule: int(cleaned.get(rule, 0)) for rule in ("neighbours", "motion", "outliers")}
+        by = ", ".join(f"{rule} {count}" for rule, count in rules.items())
+        parts.append(f"hygiene: {sum(rules.values())} of {cleaned.get('gaussians', 0)} labels changed ({by})")
+    return "; ".join(parts)
+
+
+def _residual(scene: Scene, groups: Sequence[MotionGroup]) -> float | None:
+    """Share of the radius, by members; None where none of the groups was found to move otherwise than rigidly."""
+    if not any(group.rigid_max > 0 for group in groups):
+        return None
+    counts = np.array([max(int((scene.motion_ids == group.id).sum()), 1) for group in groups])
+    squares = np.array([(group.rigid_rms / max(group.model.radius, 1e-9 * scene.extent)) ** 2 for group in groups])
+    return float(np.sqrt(np.average(squares, weights=counts)))

@@ -1,0 +1,111 @@
+"""Cameras as the files that radiance-field tools read: `transforms.json` of NeRF and D-NeRF, COLMAP's text model."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import atomic_files
+from ..motion import rotations
+from ..scene import cameras
+from ..scene.cameras import Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """One image that a camera takes.
+
+    Attributes:
+        file_path: Path of the image relative to the camera file, "/" between folders, with suffix.
+        camera: The camera; its name is that of the camera and not of the image.
+        t: Scene time, or None where there is none.
+    """
+
+    file_path: str
+    camera: Camera
+    t: float | None = None
+
+
+def write_transforms(path: str | Path, views: Sequence[View]) -> Path:
+    """Write NeRF's camera file, atomically: camera to world with OpenGL axes, in the cameras' world.
+
+    ``camera_angle_x w h fl_x fl_y cx cy`` stand at the top where they hold for all views, else with each view; ``time``
+    with the views that have one.
+
+    Args:
+        path: Where to.
+        views: At least one.
+
+    Returns:
+        The path.
+    """
+    lenses = [_lens(view.camera) for view in views]
+    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    rows = []
+    for view, lens in zip(views, lenses, strict=True):
+        row: dict[str, Any] = {"file_path": view.file_path}
+        if view.t is not None:
+            row["time"] = float(view.t)
+        row["transform_matrix"] = cameras.cam_world_to_opengl(view.camera.T_cam_world).tolist()
+        rows.append(json.dumps(row if shared else {**row, **lens}, ensure_ascii=False))
+    head = "".join(f"{json.dumps(key)}: {json.dumps(value)},\n " for key, value in shared.items())
+    atomic_files.write(path, ("{" + head + '"frames": [\n' + ",\n".join(rows) + "\n]}\n").encode())
+    return Path(path)
+
+
+def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
+    """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically; the points are none.
+
+    Images are named by their paths without the leading folder ``images``, as COLMAP has it. Where views have times,
+    ``times.json`` beside ``sparse`` says them (docs/dataset.md), which COLMAP does not know.
+
+    Args:
+        folder: An existing folder.
+        views: At least one.
+
+    Returns:
+        The folder of the model.
+    """
+    if any(view.t is not None for view in views):
+        times = {_image_name(view): float(view.t) for view in views if view.t is not None}
+        atomic_files.write(Path(folder) / "times.json", (json.dumps({"times": times}, indent=1) + "\n").encode())
+    folder = Path(folder) / "sparse" / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    lenses: dict[tuple[float, ...], int] = {}
+    camera_lines, image_lines = [], []
+    for number, view in enumerate(views, 1):
+        camera, k = view.camera, view.camera.intrinsics
+        lens = (camera.width, camera.height, *(float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])))
+        if lens not in lenses:
+            lenses[lens] = len(lenses) + 1
+            camera_lines.append(f"{lenses[lens]} PINHOLE " + " ".join(repr(value) for value in lens))
+        quat = rotations.rotmats_to_quats(camera.T_cam_world[:3, :3])
+        center = cameras.cam_world_to_opengl(camera.T_cam_world)[:3, 3]
+        shift = -rotations.quats_to_rotmats(quat) @ center  # by the rotation that is read again, as `center` may be far
+        pose = " ".join(repr(float(value)) for value in (*quat, *shift))
+        image_lines.append(f"{number} {pose} {lenses[lens]} {_image_name(view)}\n")
+    _write_lines(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] (fx fy cx cy)", camera_lines)
+    _write_lines(folder / "images.txt", "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points", image_lines)
+    _write_lines(folder / "points3D.txt", "POINT3D_ID X Y Z R G B ERROR TRACK[]", [])
+    return folder
+
+
+def _lens(camera: Camera) -> dict[str, float]:
+    k = camera.intrinsics
+    fl_x, fl_y, cx, cy = (float(value) for value in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+    angle = 2 * math.atan(0.5 * camera.width / fl_x)
+    return {
+        "camera_angle_x": angle, "w": camera.width, "h": camera.height, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy,
+    }  # fmt: skip
+
+
+def _image_name(view: View) -> str:
+    return view.file_path.removeprefix("images/")
+
+
+def _write_lines(path: Path, head: str, lines: list[str]) -> None:
+    atomic_files.write(path, "".join(f"{line}\n" for line in [f"# {head}", *lines]).encode())

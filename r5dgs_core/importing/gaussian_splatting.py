@@ -1,0 +1,30 @@
+"""3D Gaussian Splatting and Gaussian Grouping: Gaussians that stand still, the latter with identities and classes."""
+
+from __future__ import annotations
+
+from ..errors import CheckpointError
+from ..formats import ply
+from ..scene.scene import IDENTITY_DIM
+from . import weights
+from .foreign_run import SPLATTING_NEAR, Foreign
+from .run_folder import RunFolder
+
+
+def read(run: RunFolder) -> Foreign:
+    """Read the Gaussians, and the classifier where there is one.
+
+    Raises:
+        CheckpointError: The classifier does not fit the identities.
+    """
+    splats = ply.read(run.ply)
+    if "classifier.pth" not in run.files:
+        return Foreign("3dgs", splats, SPLATTING_NEAR)
+    loaded = weights.load(run.weights("classifier.pth"))
+    if splats.identities is None or splats.identities.shape[1] != IDENTITY_DIM:
+        found = "none" if splats.identities is None else str(splats.identities.shape[1])
+        raise CheckpointError(
+            f"{run.ply}: expected the columns obj_dc_0..{IDENTITY_DIM - 1} beside a classifier.pth, found {found}"
+        )
+    weight = loaded.tensor("weight", (None, IDENTITY_DIM, 1, 1))
+    bias = loaded.tensor("bias", (weight.shape[0],))
+    return Foreign("gaussian_grouping", splats, SPLATTING_NEAR, classifier=(weight[:, :, 0, 0].numpy(), bias.numpy()))

@@ -1,0 +1,1 @@
+"""Embeddings of objects and phrases: build the lookup table of a scene and answer queries."""

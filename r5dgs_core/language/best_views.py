@@ -1,0 +1,152 @@
+"""The pictures by which an encoder gets to know an object: where it is seen well, cut out of renderings of the scene.
+
+Renderings need no data set, and a crop has as many pixels as the encoder wants. What is seen of an object is counted in
+small pictures from the scene's own cameras at observed times.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..playback import scene_player
+from ..render import highlight, scene_renderer, viewpoints
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+
+VIEWS = 6  # of an object at most
+_LOOK = 256  # longer side of the small pictures, pixels
+_CAMERAS = 8  # that are tried
+_TIMES = 4
+_TRIED = 10  # standpoints at which an object is drawn alone, to see how much of it is hidden
+_LEAST_PIXELS = 12  # of a small picture: fewer are no view
+_WANTED_SIDE = 32  # pixels of the camera's own picture: a smaller object counts less
+_CUT = 0.3  # worth of a view in which the border cuts the object
+_AGAIN = 0.4  # worth of one more view from the same camera
+_SAME_TIME = 0.8  # worth of one more view at the same time
+_MARGIN = 0.15  # around the object, on each side, of the larger of its width and height
+_GRAY = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Sighting:
+    """An object as one camera sees it.
+
+    Attributes:
+        camera: The scene's camera.
+        t: Scene time.
+        box: Square around the object: left, top, right, bottom in pixels of the camera.
+        worth: Visible pixels, less what is hidden, cut or tiny.
+    """
+
+    camera: Camera
+    t: float
+    box: tuple[float, float, float, float]
+    worth: float
+
+
+def find(
+    scene: Scene,
+    object_ids: Sequence[int],
+    *,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[int, list[Sighting]]:
+    """The best views of objects, spread over cameras and times.
+
+    Args:
+        scene: The scene.
+        object_ids: The objects.
+        backend: Rasterizer.
+        progress: Told of pictures looked at, and their number.
+
+    Returns:
+        At most `VIEWS` of each object, the best first; none for one that no camera sees.
+    """
+    seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
+    places = _standpoints(scene)
+    for done, at in enumerate(places):
+        small = viewpoints.sized(at.camera, _LOOK)
+        output = scene_renderer.render_frame(scene, scene_player.frame(scene, at.t), small, backend=backend)
+        ids = scene_renderer.to_numpy(output.ids, np.int32)
+        for object_id in object_ids:
+            mask = ids == object_id
+            if mask.sum() >= _LEAST_PIXELS:
+                seen[object_id].append((_sighting(at, small, mask), mask))
+        if progress:
+            progress(done + 1, len(places))
+    result = {}
+    for object_id, found in seen.items():
+        found.sort(key=lambda entry: -entry[0].worth)
+        tried = [
+            dataclasses.replace(sighting, worth=sighting.worth * _unhidden(scene, object_id, sighting, mask, backend))
+            for sighting, mask in found[:_TRIED]
+        ]
+        result[object_id] = _spread(tried)
+    return result
+
+
+def crops(
+    scene: Scene, object_id: int, sighting: Sighting, size: int = 256, *, backend: str = "auto"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two pictures of an object: alone on gray, and as it stands in the scene. Each [size, size, 3], sRGB in [0, 1]"""
+    camera = _cut(sighting.camera, sighting.box, size)
+    alone = highlight.isolate(scene, [object_id], camera, sighting.t, backend=backend)
+    alpha = alone[..., 3:]
+    frame = scene_player.frame(scene, sighting.t)
+    whole = scene_renderer.render_frame(scene, frame, camera, backend=backend)
+    context = np.clip(scene_renderer.to_numpy(whole.color, np.float32), 0, 1)
+    return (alone[..., :3] * alpha + _GRAY * (1 - alpha)).astype(np.float32), context
+
+
+def _standpoints(scene: Scene) -> list[viewpoints.Standpoint]:
+    some = viewpoints.spread(scene.cameras, _CAMERAS) or [viewpoints.overview(scene)]
+    times = np.unique(np.linspace(scene.track_times[0], scene.t_max, _TIMES))
+    return [viewpoints.Standpoint(camera, float(t)) for t in times for camera in some]
+
+
+def _sighting(at: viewpoints.Standpoint, small: Camera, mask: np.ndarray) -> Sighting:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    scale = at.camera.width / small.width
+    left, right = scale * columns[0], scale * (columns[-1] + 1)
+    top, bottom = scale * rows[0], scale * (rows[-1] + 1)
+    side = max(right - left, bottom - top)
+    whole = columns[0] > 0 and rows[0] > 0 and columns[-1] < mask.shape[1] - 1 and rows[-1] < mask.shape[0] - 1
+    worth = float(mask.sum()) * (1.0 if whole else _CUT) * min(side / _WANTED_SIDE, 1.0) ** 2
+    half = (0.5 + _MARGIN) * side
+    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
+    return Sighting(at.camera, at.t, (x - half, y - half, x + half, y + half), worth)
+
+
+def _unhidden(scene: Scene, object_id: int, sighting: Sighting, mask: np.ndarray, backend: str) -> float:
+    """Share of an object's pixels that nothing hides."""
+    small = viewpoints.sized(sighting.camera, _LOOK)
+    alone = highlight.isolate(scene, [object_id], small, sighting.t, backend=backend)[..., 3] > 0.5
+    return float((mask & alone).sum() / max(alone.sum(), 1))
+
+
+def _spread(sightings: list[Sighting]) -> list[Sighting]:
+    """The best ones; each that is taken makes others of its camera and time worth less."""
+    left, taken = list(sightings), []
+    while left and len(taken) < VIEWS:
+        worths = [
+            each.worth
+            * _AGAIN ** sum(other.camera is each.camera for other in taken)
+            * _SAME_TIME ** sum(other.t == each.t for other in taken)
+            for each in left
+        ]
+        best = int(np.argmax(worths))
+        if worths[best] <= 0:
+            break
+        taken.append(left.pop(best))
+    return taken
+
+
+def _cut(camera: Camera, box: tuple[float, float, float, float], size: int) -> Camera:
+    """A camera whose picture is a square of another's, with its own number of pixels."""
+    left, top, right, _ = box
+    scale = size / max(right - left, 1e-6)
+    to_square = np.array([[scale, 0, -scale * left], [0, scale, -scale * top], [0, 0, 1.0]])
+    return dataclasses.replace(camera, width=size, height=size, intrinsics=to_square @ camera.intrinsics)

@@ -1,0 +1,1 @@
+"""Text and image encoders that are read from a local folder."""

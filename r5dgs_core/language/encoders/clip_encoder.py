@@ -1,0 +1,81 @@
+"""CLIP and SigLIP by transformers, without torchvision: words and pictures in one space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import errors
+from ...scene.lookup_table import EncoderCard
+from . import encoder_base
+
+TEMPLATES = ("{}", "a photo of a {}", "a render of a {}")
+_BATCH = 16
+
+
+class ClipEncoder:
+    """A CLIP or SigLIP model of a folder.
+
+    Args:
+        folder: With config.json, model.safetensors, a tokenizer and preprocessor_config.json.
+        kind: "clip" or "siglip".
+    """
+
+    def __init__(self, folder: Path, kind: str):
+        try:
+            import torch
+            from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
+        except ImportError as error:
+            raise encoder_base.missing_package(error) from error
+        encoder_base.quieten()
+        self._torch = torch
+        encoder_base.read_json(folder / "preprocessor_config.json")
+        paths = encoder_base.weights_of(folder)
+        try:
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), **encoder_base.LOADING)
+            self._processor = AutoImageProcessor.from_pretrained(str(folder), **encoder_base.LOADING, backend="pil")
+            self._model, info = AutoModel.from_pretrained(
+                str(folder), **encoder_base.LOADING, use_safetensors=True, output_loading_info=True
+            )
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        encoder_base.check_loaded(folder, info)
+        encoder_base.check_words(folder, self._tokenizer)
+        self._model.eval()
+        self._longest = int(self._model.config.text_config.max_position_embeddings)
+        # SigLIP was trained on texts of one length, and looks at their padding.
+        self._padding: Any = "max_length" if kind == "siglip" else True
+        self._inputs = ("input_ids",) if kind == "siglip" else ("input_ids", "attention_mask")
+        dimension = self._texts(["object"]).shape[1]
+        digest = encoder_base.digest_of(paths)
+        self.card = EncoderCard(kind, folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoder_base.Encoder`."""
+        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
+
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """See `encoder_base.Encoder`."""
+        return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        tokens = self._tokenizer(
+            list(texts), padding=self._padding, truncation=True, max_length=self._longest, return_tensors="pt"
+        )
+        with self._torch.no_grad():
+            return _pooled(self._model.get_text_features(**{name: tokens[name] for name in self._inputs}))
+
+    def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        from ...data import images  # here, as OpenImageIO is not needed for words
+
+        pixels = self._processor(images=[images.to_uint8(each) for each in pictures], return_tensors="pt")
+        with self._torch.no_grad():
+            return _pooled(self._model.get_image_features(pixel_values=pixels["pixel_values"]))
+
+
+def _pooled(features: Any) -> np.ndarray:
+    """Rows of what transformers returns: an output with ``pooler_output``, a tensor before its version 5."""
+    return getattr(features, "pooler_output", features).float().numpy()

@@ -1,0 +1,161 @@
+"""Encoders of words and pictures, behind one small protocol; `registry` opens them.
+
+Weights are read from a folder that the user names and from nowhere else. A folder that is damaged or incomplete is an
+error: nothing is filled in with random numbers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from ... import errors, strict_json
+from ...scene.lookup_table import EncoderCard
+
+CANONICAL = ("object", "things", "stuff", "texture")  # LERF's
+SCALE = 10.0  # LERF's
+LOADING = {"local_files_only": True, "trust_remote_code": False}  # Python in a folder is neither run nor asked about
+_ARTICLE = re.compile(r"^(?:an?|the)\s+", re.IGNORECASE)
+
+
+class Encoder(Protocol):
+    """Turns phrases, and pictures where it sees, into unit vectors of one space.
+
+    Attributes:
+        card: What it is.
+    """
+
+    card: EncoderCard
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """Texts as they are, without templates. [n, D] float32, unit"""
+        ...
+
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """Pictures [H, W, 3], sRGB in [0, 1]. [n, D] float32, unit. Raises `BackendError` where it cannot see."""
+        ...
+
+
+def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
+    """Embeddings of phrases, each the mean over the encoder's templates. [n, D] float32, unit"""
+    if not phrases:
+        return np.zeros((0, encoder.card.dimension), np.float32)
+    bare = [_ARTICLE.sub("", phrase.strip()) or phrase for phrase in phrases]
+    total = sum(
+        encoder.embed_texts([template.replace("{}", phrase) for phrase in bare]).astype(np.float64)
+        for template in encoder.card.templates
+    )
+    return unit(np.asarray(total))
+
+
+def in_batches(
+    items: Sequence[Any], size: int, embed: Callable[[Sequence[Any]], np.ndarray], dimension: int
+) -> np.ndarray:
+    """Unit embeddings of items, so many at once. [n, D] float32"""
+    parts = [embed(items[start : start + size]) for start in range(0, len(items), size)]
+    return unit(np.concatenate([np.zeros((0, dimension), np.float32), *parts]))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors of length 1, float32; zero stays zero. [..., D]"""
+    wide = np.asarray(vectors, np.float64)
+    norms = np.linalg.norm(wide, axis=-1, keepdims=True)
+    return np.divide(wide, norms, out=np.zeros_like(wide), where=norms > 0).astype(np.float32)
+
+
+def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
+    """A JSON object of a model's folder. Raises `BackendError`."""
+    if not path.is_file():
+        raise errors.BackendError(
+            f"{path}: expected in the folder of {of}, found {what_is(path)}; download or copy the model again"
+        )
+    found = strict_json.read(path, errors.BackendError, "copy the model again")
+    if not isinstance(found, dict):
+        raise errors.BackendError(f"{path}: expected a JSON object, found {type(found).__name__}; copy the model again")
+    return found
+
+
+def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
+    """The files of a model's weights, each opened once to see that it is whole. Raises `BackendError`."""
+    try:
+        import safetensors
+    except ImportError as error:
+        raise missing_package(error) from error
+    paths = sorted(folder.glob(pattern))
+    if not paths:
+        raise errors.BackendError(
+            f"{folder / 'model.safetensors'}: expected the weights, found none; download the model's safetensors file "
+            "(others, such as .bin, are not read)"
+        )
+    for path in paths:
+        try:
+            with safetensors.safe_open(str(path), framework="np") as archive:
+                archive.keys()
+        except Exception as error:  # safetensors has a class of its own, and others for what the system says
+            raise errors.BackendError(
+                f"{path}: expected safetensors, found a damaged or cut file ({error}); copy the model again"
+            ) from error
+    return paths
+
+
+def digest_of(paths: Sequence[Path]) -> str:
+    """SHA-256 of files, one after the other."""
+    found = hashlib.sha256()
+    for path in paths:
+        with open(path, "rb") as stream:
+            while block := stream.read(1 << 20):
+                found.update(block)
+    return found.hexdigest()
+
+
+def quieten() -> None:
+    """Let transformers say nothing by itself: what matters is checked and said here."""
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()
+    logging.set_verbosity_error()
+
+
+def missing_package(error: ImportError) -> errors.BackendError:
+    """What to say where an optional package is missing."""
+    return errors.BackendError(
+        f"encoder: cannot import {error.name or error}; install what encoders need: pip install 'r5dgs[encoders]'"
+    )
+
+
+def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ()) -> None:
+    """Raise `BackendError` where weights were missing and would be random.
+
+    Args:
+        folder: For the message.
+        info: What transformers says about loading.
+        unused: Beginnings of names that do not matter.
+    """
+    absent = sorted(str(name) for name in info.get("missing_keys", ()) if not str(name).startswith(tuple(unused)))
+    wrong = sorted(str(each[0] if isinstance(each, tuple) else each) for each in info.get("mismatched_keys", ()))
+    for names, what in ((absent, "are missing"), (wrong, "have other shapes than config.json says")):
+        if names:
+            raise errors.BackendError(
+                f"{folder}: {len(names)} of the model's weights {what} ({names[0]}, ...); copy the model again, "
+                "config.json and weights from the same place"
+            )
+
+
+def check_words(folder: Path, tokenizer: Any) -> None:
+    """Raise `BackendError` where all words are one: without its files transformers makes a tokenizer of no words."""
+    one, other = tokenizer(["lemon", "apple"])["input_ids"]  # as long as each other: each letter may be unknown
+    if list(one) == list(other):
+        raise errors.BackendError(
+            f"{folder}: the tokenizer knows no words, its vocabulary is missing; copy the model again, tokenizer.json "
+            "and all other files"
+        )
+
+
+def what_is(path: Path) -> str:
+    """What is at a path, for messages: "a file", "a folder" or "nothing"."""
+    return "a file" if path.is_file() else "a folder" if path.is_dir() else "nothing"

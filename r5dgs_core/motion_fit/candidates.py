@@ -1,0 +1,389 @@
+"""The families of motion that `model_selection` chooses from, and their robust least-squares fit to a pose track.
+
+Everything here is dimensionless: times in units of the observed span and zero at t_max, lengths in units of the group's
+radius. A candidate is a list of free blocks; the pose at t_max (r, e of `models`) is always free. Notation: S poses,
+P parameters, B parameter vectors evaluated at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..motion import free_top, models, rotations, se3
+
+_SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
+# Priors as standard deviations, in radii and spans: far wider than what observed motions show; they only close
+# directions that the poses leave open (a centre along its own axis, the centre of a body that does not turn).
+_PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0, "swing": 10.0, "phase": 10.0, "pace": 5.0}
+_DIFFERENCE = 1e-5
+_STEPS = 30
+_STEPS_AGAIN = 4  # per round of reweighting, which starts near its end
+_ROUNDS = 8
+_PACES = 25  # frequencies tried for a first guess
+_STARTS = 2  # of them that are refined
+_GAIN = 9.0  # variances: a frequency three standard deviations from none
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A family of motions.
+
+    Attributes:
+        name: As in the score table.
+        kind: Kind of `models.MotionModel` that it becomes.
+        blocks: Free blocks besides the pose at t_max: "v", "a", "w", "eps", "u" as in `models`; "kappa" is the relative
+            rate of a spin about a fixed axis: w(tau) = w_mid (1 + kappa (tau - tau_mid)). "swing" q and "phase" f are
+            an angle about a fixed axis, q sin(W tau + f), which stays determined where w or eps is zero; "pace" is the
+            logit of W in `frequencies`.
+        tau_mid: Middle of the window, for "kappa".
+        frequencies: Lowest and highest W of a motion with "pace". Less than a quarter of a period in the window cannot
+            be told from a steady acceleration.
+        inertia: Of a "free_top", in the bind state. [3, 3]
+    """
+
+    name: str
+    kind: str
+    blocks: tuple[str, ...]
+    tau_mid: float = -0.5
+    frequencies: tuple[float, float] = (0.5 * np.pi, 8 * np.pi)
+    inertia: np.ndarray | None = field(default=None, compare=False)
+
+    @property
+    def parameters(self) -> int:
+        """Free parameters, the six of the pose at t_max included."""
+        return 6 + sum(_SIZES[b] for b in self.blocks)
+
+    def unpack(self, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """Vectors r, e, v, a, w, eps, u [B, 3] and frequency [B, 1] of parameters [B, P]; zero where not free."""
+        parts = {name: np.zeros((*theta.shape[:-1], 3)) for name in ("r", "e", "v", "a", "w", "eps", "u")}
+        parts["frequency"] = np.zeros((*theta.shape[:-1], 1))
+        start = 0
+        for block in ("r", "e", *self.blocks):
+            stop = start + _SIZES[block]
+            parts[block] = theta[..., start:stop]
+            start = stop
+        if "kappa" in parts:
+            kappa, w_mid = parts.pop("kappa"), parts["w"]
+            parts["eps"] = kappa * w_mid
+            parts["w"] = w_mid * (1 - kappa * self.tau_mid)
+        if "pace" in parts:
+            low, high = self.frequencies
+            parts["frequency"] = low + (high - low) / (1 + np.exp(-np.clip(parts.pop("pace"), -30, 30)))
+        if "swing" in parts:
+            swing, phase, frequency = parts.pop("swing"), parts.pop("phase"), parts["frequency"]
+            parts["w"], parts["eps"] = swing * np.cos(phase) * frequency, -swing * np.sin(phase) * frequency**2
+        return parts
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether a frequency is free."""
+        return "pace" in self.blocks
+
+    def index(self, block: str) -> int:
+        """Where a free block starts in the parameters."""
+        free = ("r", "e", *self.blocks)
+        return sum(_SIZES[b] for b in free[: free.index(block)])
+
+    def pace(self, frequency: float) -> float:
+        """The parameter "pace" of a frequency between the lowest and the highest."""
+        low, high = self.frequencies
+        share = min(max((frequency - low) / (high - low), 1e-3), 1 - 1e-3)
+        return float(np.log(share / (1 - share)))
+
+    def poses(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the fitted curve. [B, P], [S] -> quaternions [B, S, 4], displacements [B, S, 3]"""
+        p = {name: part[..., None, :] for name, part in self.unpack(theta).items()}
+        span = tau[:, None]
+        if self.kind == "free_top":
+            return self._tumbling(theta, tau)
+        if self.kind == "constant_twist":
+            quats, d = models.twist_poses(p["v"], p["w"], span)
+        elif self.kind == "world_twist":
+            quats, d = _world_twist(p, tau)
+        else:
+            quats, d = models.spin_poses(p["v"], p["a"], p["w"], p["eps"], p["u"], p["frequency"], span)
+        return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
+
+    def _tumbling(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`poses` of a free top, whose inertia turns with the pose at t_max: R = exp(r) R_top(exp(-r) w)."""
+        assert self.inertia is not None
+        p = self.unpack(theta)
+        first = rotations.rotvecs_to_quats(p["r"])
+        quats, _ = free_top.turns(self.inertia, rotations.rotate(rotations.conjugate(first), p["w"]), tau)
+        span = tau[:, None]
+        return (
+            rotations.multiply(first[..., None, :], quats),
+            p["e"][..., None, :] + p["v"][..., None, :] * span + p["a"][..., None, :] * (0.5 * span**2),
+        )
+
+
+def _world_twist(p: dict[str, np.ndarray], tau: np.ndarray) -> se3.Pose:
+    """Sixteen Magnus-4 steps over each time: enough to tell candidates apart; evaluation chooses its own steps."""
+    steps = 16
+    h = (tau / steps)[:, None]
+    middles = np.arange(steps)[:, None, None, None] + 0.5
+    mw, mv = p["w"] + middles * h * p["eps"], p["v"] + middles * h * p["a"]
+    bracket = (rotations.cross(mw, p["eps"]), rotations.cross(mw, p["a"]) - rotations.cross(p["eps"], mv))
+    return se3.product(*se3.exp(h * mw - h**3 / 12 * bracket[0], h * mv - h**3 / 12 * bracket[1]))
+
+
+# Ordered by the number of parameters, the plainer motion first where it is equal.
+FAMILY = (
+    Candidate("static", "static", ()),
+    Candidate("translation", "translation", ("v",)),
+    Candidate("spin", "ballistic_spin", ("w",)),
+    Candidate("spin, accelerating", "ballistic_spin", ("w", "kappa")),
+    Candidate("translation, quadratic", "translation", ("v", "a")),
+    Candidate("translation + spin", "ballistic_spin", ("v", "w")),
+    Candidate("constant twist", "constant_twist", ("v", "w")),
+    Candidate("hinge", "ballistic_spin", ("w", "kappa", "u")),
+    Candidate("spring", "translation", ("v", "a", "pace")),
+    Candidate("pendulum", "ballistic_spin", ("swing", "phase", "u", "pace")),
+    Candidate("ballistic + spin", "ballistic_spin", ("v", "a", "w")),
+    Candidate("ballistic + spin, accelerating", "ballistic_spin", ("v", "a", "w", "kappa")),
+    Candidate("ballistic + spin, free axis", "ballistic_spin", ("v", "a", "w", "eps")),
+    Candidate("ballistic + spin, free centre", "ballistic_spin", ("v", "a", "w", "u")),
+    Candidate("full, free centre", "ballistic_spin", ("v", "a", "w", "eps", "u")),
+)
+# The world twist is no member: a falling body that spins is none, as its centre's rate would be quadratic in time, and
+# the hinges and screws that are one are members already. The free top is tried where `model_selection` finds reason to.
+FREE_TOP = Candidate("free top", "free_top", ("v", "a", "w"))
+EXTRA = (Candidate("world twist", "world_twist", ("v", "a", "w", "eps")), FREE_TOP)
+BY_NAME = {candidate.name: candidate for candidate in (*FAMILY, *EXTRA)}
+
+
+@dataclass(frozen=True)
+class Track:
+    """Dimensionless observations.
+
+    Attributes:
+        tau: Times, <= 0 at t_max or before. [S]
+        quats: Unit wxyz relative to the bind state. [S, 4]
+        displacements: Of the pivot. [S, 3]
+        weights: Of the poses, > 0. [S]
+    """
+
+    tau: np.ndarray
+    quats: np.ndarray
+    displacements: np.ndarray
+    weights: np.ndarray
+
+    def rows(self, index: np.ndarray | slice) -> Track:
+        """The poses with these indices."""
+        return Track(self.tau[index], self.quats[index], self.displacements[index], self.weights[index])
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A fitted candidate.
+
+    Attributes:
+        candidate: Which.
+        theta: Parameters. [P]
+        robust: Weights that the loss gave to the poses, in [0, 1]. [S]
+        jacobian: Of the scaled residuals, weighted, priors included. [6 S + P, P]
+        chi2: Weighted mean of the squared scaled residuals per component.
+    """
+
+    candidate: Candidate
+    theta: np.ndarray
+    robust: np.ndarray
+    jacobian: np.ndarray
+    chi2: float
+
+
+def residuals(candidate: Candidate, theta: np.ndarray, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
+    """Displacement and rotation errors in units of their noise (sigma_t, sigma_r). [B, P] -> [B, S, 6]"""
+    quats, displacements = candidate.poses(theta, track.tau)
+    turn = rotations.quats_to_rotvecs(rotations.multiply(track.quats, rotations.conjugate(quats)))
+    return np.concatenate([(track.displacements - displacements) / sigmas[0], turn / sigmas[1]], axis=-1)
+
+
+def start(candidate: Candidate, track: Track) -> np.ndarray:
+    """First guess: the displacements' parabola and the turns between neighbours. [P]"""
+    tau, s = track.tau, len(track.tau)
+    degree = min(2 if "a" in candidate.blocks else 1, s - 1)
+    powers = np.stack([tau**k / (1, 1, 2)[k] for k in range(degree + 1)], -1)
+    root = np.sqrt(track.weights)[:, None]
+    line = np.linalg.lstsq(powers * root, track.displacements * root, rcond=None)[0]
+    steps = np.diff(tau)
+    turns = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
+    rates = turns / steps[:, None]
+    spin = np.median(rates, axis=0) if len(rates) else np.zeros(3)
+    guesses = {"r": np.zeros(3), "e": line[0], "w": spin, "eps": np.zeros(3), "kappa": np.zeros(1), "u": np.zeros(3)}
+    guesses["v"] = line[1] if degree >= 1 else np.zeros(3)
+    guesses["a"] = line[2] if degree >= 2 else np.zeros(3)
+    if "eps" in candidate.blocks and len(rates) >= 3:
+        middles = 0.5 * (tau[1:] + tau[:-1])
+        trend = np.linalg.lstsq(np.stack([np.ones_like(middles), middles], -1), rates, rcond=None)[0]
+        guesses["w"], guesses["eps"] = trend[0], trend[1]
+    if "u" in candidate.blocks and "v" not in candidate.blocks:
+        # The axis nearest to the pivot about which its velocity is a turn: w x (-u) = v.
+        guesses["u"] = np.cross(spin, line[1]) / max(float(spin @ spin), 1e-6) if degree >= 1 else np.zeros(3)
+    return np.concatenate([guesses[b] for b in ("r", "e", *candidate.blocks)])
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """A path fitted at each of F frequencies, where it is linear in place, rate and its rate.
+
+    Attributes:
+        frequencies: [F]
+        rates: Place, rate and its rate at t_max. [F, 3, 3]
+        misses: Weighted sum of squares that remains. [F]
+        gain: How much more the parabola leaves than the best frequency, in variances of the residuals of the latter.
+    """
+
+    frequencies: np.ndarray
+    rates: np.ndarray
+    misses: np.ndarray
+    gain: float
+
+
+def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
+    """Two rounds, the second with the poses weighed by the residuals of the first as in `solve`. path: [S, 3]"""
+    frequencies = np.r_[0.0, np.geomspace(*candidate.frequencies, _PACES)[1:-1]]
+    clocks = models.clocks(frequencies[:, None, None], track.tau[:, None])
+    columns = np.concatenate([np.ones_like(clocks[0]), *clocks], axis=-1)
+
+    def fit(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        root = np.sqrt(weights)[:, None]
+        rates = np.linalg.pinv(columns * root) @ (path * root)
+        sizes = ((columns @ rates - path) ** 2).sum(-1)
+        return rates, sizes, (weights * sizes).sum(-1)
+
+    _, sizes, misses = fit(track.weights)
+    best = sizes[1 + int(np.argmin(misses[1:]))]
+    scale2 = (2 * 1.4826) ** 2 * max(float(np.median(best)), 1e-18)
+    rates, _, misses = fit(track.weights / (1 + best / scale2))
+    least = float(misses[1:].min())
+    gain = (float(misses[0]) - least) / max(least, 1e-18) * (3 * len(path) - 10)
+    return _Sweep(frequencies[1:], rates[1:], misses[1:], gain)
+
+
+def _turned(track: Track) -> np.ndarray:
+    """Sum of the turns between neighbours: about a fixed axis, the rotation vector without its ambiguity. [S, 3]"""
+    turns = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
+
+
+def may_swing(candidate: Candidate, track: Track) -> bool:
+    """Whether a swing explains the turns or the displacements so much better than a parabola that fitting it pays."""
+    paths = [track.displacements] + ([_turned(track)] if "swing" in candidate.blocks else [])
+    return any(_sweep(candidate, track, path).gain > _GAIN for path in paths)
+
+
+def swinging_starts(candidate: Candidate, track: Track) -> list[np.ndarray]:
+    """First guesses of a motion with a frequency, the most promising first. [P] each
+
+    They are the frequencies that fit the displacements or the turns better than their neighbours do.
+    """
+    path = _turned(track) if "swing" in candidate.blocks else track.displacements
+    sweep = _sweep(candidate, track, path)
+    padded = np.pad(sweep.misses, 1, constant_values=np.inf)
+    valleys = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]))
+    best = valleys[np.argsort(sweep.misses[valleys], kind="stable")][:_STARTS]
+    return [_swinging(candidate, track, float(sweep.frequencies[i]), sweep.rates[i]) for i in best]
+
+
+def _swinging(candidate: Candidate, track: Track, frequency: float, rates: np.ndarray) -> np.ndarray:
+    """Parameters from the rates [3, 3] of a fit at one frequency: place, rate and its rate at t_max. [P]"""
+    guesses = {"r": np.zeros(3), "e": rates[0], "v": rates[1], "a": rates[2], "pace": candidate.pace(frequency)}
+    if "swing" in candidate.blocks:
+        # The axis and phase nearest to both rates: their matrix of rank one.
+        left, sizes, right = np.linalg.svd(np.stack([rates[1] / frequency, -rates[2] / frequency**2]).T)
+        guesses["swing"] = left[:, 0] * sizes[0]
+        guesses["phase"] = np.arctan2(right[0, 1], right[0, 0])
+        matrices = rotations.quats_to_rotmats(track.quats)
+        # d = e + u - R u is linear in e and u.
+        columns = np.concatenate([np.broadcast_to(np.eye(3), (len(track.tau), 3, 3)), np.eye(3) - matrices], -1)
+        ridge = np.diag([0.0] * 3 + [1 / _PRIORS["u"]] * 3) * 1e-3
+        stacked = np.concatenate([columns.reshape(-1, 6), ridge])
+        right_side = np.concatenate([track.displacements.reshape(-1), np.zeros(6)])
+        solution = np.linalg.lstsq(stacked, right_side, rcond=None)[0]
+        guesses["e"], guesses["u"] = solution[:3], solution[3:]
+    return np.concatenate([np.atleast_1d(guesses[b]) for b in ("r", "e", *candidate.blocks)])
+
+
+def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first: np.ndarray | None = None) -> Solution:
+    """Fit by Levenberg-Marquardt under a Cauchy loss.
+
+    Args:
+        candidate: The family.
+        track: The poses.
+        sigmas: Noise of displacements (radii) and rotations (rad): sets their relative weight.
+        first: First guess, or None for `start`; with a frequency, the best of `swinging_starts`. [P]
+
+    Returns:
+        The solution. Weights per pose are 1 / (1 + (rho / c)^2), rho the root mean square of its six scaled residuals
+        and c twice 1.4826 times their median; no reweighting where the largest is under four medians.
+    """
+    if first is None and candidate.oscillates:
+        solutions = [solve(candidate, track, sigmas, guess) for guess in swinging_starts(candidate, track)]
+        return min(solutions, key=lambda solution: solution.chi2)
+    theta = start(candidate, track) if first is None else first
+    precision = _prior_precision(candidate)
+    robust = np.ones(len(track.tau))
+    theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS)
+    for _ in range(_ROUNDS):
+        size = np.sqrt((values**2).mean(-1))
+        scale = 2 * 1.4826 * float(np.median(size))
+        if size.max() <= 4 * float(np.median(size)) or size.max() < 1e-6:
+            break
+        updated = 1 / (1 + (size / max(scale, 1e-9)) ** 2)
+        settled = np.abs(updated - robust).max() < 1e-3
+        robust = updated
+        theta, values, jacobian = _levenberg(candidate, track, sigmas, theta, robust, precision, _STEPS_AGAIN)
+        if settled:
+            break
+    weights = track.weights * robust
+    chi2 = float((weights[:, None] * values**2).sum() / (6 * weights.sum()))
+    return Solution(candidate, theta, robust, jacobian, chi2)
+
+
+def _prior_precision(candidate: Candidate) -> np.ndarray:
+    """Inverse standard deviation of the weak priors. [P]"""
+    parts = [np.full(_SIZES[b], 1 / _PRIORS[b] if b in _PRIORS else 0.0) for b in ("r", "e", *candidate.blocks)]
+    return np.concatenate(parts)
+
+
+def _levenberg(
+    candidate: Candidate,
+    track: Track,
+    sigmas: tuple[float, float],
+    theta: np.ndarray,
+    robust: np.ndarray,
+    precision: np.ndarray,
+    steps: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Minimise for fixed weights; returns parameters [P], unweighted residuals [S, 6] and the Jacobian."""
+    count = len(theta)
+    root = np.sqrt(track.weights * robust)[:, None]
+    offsets = np.concatenate([np.zeros((1, count)), _DIFFERENCE * np.eye(count), -_DIFFERENCE * np.eye(count)])
+    damping = 1e-4
+    values = residuals(candidate, theta[None], track, sigmas)[0]
+    cost = float(((root * values) ** 2).sum() + ((precision * theta) ** 2).sum())
+    jacobian = np.zeros((values.size + count, count))
+    for _ in range(steps):
+        batch = residuals(candidate, theta + offsets, track, sigmas)
+        slopes = (batch[1 : count + 1] - batch[count + 1 :]) / (2 * _DIFFERENCE)
+        jacobian = np.concatenate([(slopes * root).reshape(count, -1).T, np.diag(precision)])
+        right = -jacobian.T @ np.concatenate([(root * batch[0]).reshape(-1), precision * theta])
+        normal = jacobian.T @ jacobian
+        diagonal = np.diag(normal) + 1e-12 * max(float(np.trace(normal)), 1e-300)
+        gain, size = -1.0, 0.0
+        for _ in range(8):
+            step = np.linalg.solve(normal + np.diag(damping * diagonal), right)
+            trial = residuals(candidate, (theta + step)[None], track, sigmas)[0]
+            trial_cost = float(((root * trial) ** 2).sum() + ((precision * (theta + step)) ** 2).sum())
+            if np.isfinite(trial_cost) and trial_cost <= cost:
+                gain, size = cost - trial_cost, float(np.abs(step).max())
+                theta, values, cost = theta + step, trial, trial_cost
+                break
+            damping = min(damping * 10, 1e12)
+        damping = max(damping * 0.1, 1e-12)
+        if gain <= 1e-6 * cost or size < 1e-12:
+            break
+    return theta, values, jacobian

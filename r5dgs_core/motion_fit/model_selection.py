@@ -1,0 +1,388 @@
+"""Choose how a group moves past t_max from its poses in the observed time.
+
+A family of motions (`candidates`) is fitted to the noisy poses; the simplest whose error on held-out last poses is near
+the best is taken, unless the body has come to rest. Notation: S poses, tau = t - t_max <= 0, radius the size that
+rotations are weighed with.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..motion import free_top, models, rotations
+from . import candidates as families
+from . import rest_detection
+from .candidates import Candidate, Solution, Track
+
+logger = logging.getLogger(__name__)
+
+HELD_OUT = 0.2
+WITHIN = 1.5
+FADE_PER_SPAN = 0.1 / 0.75
+_RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
+_FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
+_LARGEST = families.BY_NAME["full, free centre"]
+FREQUENCY_ERROR = 0.25  # relative standard deviation above which a motion is not called a swing
+PARALLEL_RAD = math.radians(15.0)  # a spin whose rate lies nearer to it needs no tumbling
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of the score table.
+
+    Attributes:
+        name: Candidate.
+        parameters: Its free parameters, six of the pose included.
+        held_out: Root mean square of the held-out residuals in units of the noise; infinite where not fitted, and for a
+            swing whose frequency the poses do not determine.
+        fit: The same over all poses after the final fit, NaN where that was not made.
+    """
+
+    name: str
+    parameters: int
+    held_out: float
+    fit: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A chosen motion model with the evidence for it.
+
+    Attributes:
+        model: The motion past t_max.
+        scores: The score table, in the order of the candidates.
+        chosen: Name of the candidate in `model`.
+        rested: Whether the body was found to have come to rest, so that `chosen` is "static" for that reason.
+        sigma_t: Noise of the displacements, per component, world units.
+        sigma_r: Noise of the rotations, per component, rad.
+        band_tau: Times past t_max of `band`. [H]
+        band: Two standard deviations of the position of a point of the body, world units; wider by the held-out error
+            of the chosen candidate where that is above the noise. [H]
+    """
+
+    model: models.MotionModel
+    scores: tuple[Score, ...]
+    chosen: str
+    rested: bool
+    sigma_t: float
+    sigma_r: float
+    band_tau: np.ndarray
+    band: np.ndarray
+
+
+def fit(
+    times: np.ndarray,  # [S]
+    quats: np.ndarray,  # [S, 4]
+    displacements: np.ndarray,  # [S, 3]
+    *,
+    radius: float,
+    weights: np.ndarray | None = None,  # [S]
+    candidates: Sequence[str] | None = None,
+    inertia: np.ndarray | None = None,  # [3, 3]
+    least_noise: tuple[float, float] = (0.0, 0.0),
+) -> Fit:
+    """Fit the family to a pose track and choose.
+
+    Args:
+        times: Increasing, any spacing; the last is t_max. [S]
+        quats: Rotations relative to the bind state, unit wxyz, any sign. [S, 4]
+        displacements: Of the pivot, relative to the bind state, world units. [S, 3]
+        radius: Of the group, world units, > 0.
+        weights: How well each pose was seen, >= 0; 0 leaves a pose out. None for equal ones. [S]
+        candidates: Names out of `candidates.BY_NAME` to choose from; None for `candidates.FAMILY`.
+        inertia: Of the group in the bind state, up to a factor (`free_top.inertia`), or None. With it a body that spins
+            about a changing axis may be a free top: tried only where one of the best others has such a spin, and taken
+            where it predicts the held-out poses better. [3, 3]
+        least_noise: Noise of displacements (per component, world units) and rotations (rad) that the poses have at
+            least, where more is known of it than their scatter about a smooth motion shows.
+
+    Returns:
+        The fit. With fewer than four poses of positive weight it is at most a velocity and a spin; with one, static.
+
+    Source: selection by held-out error with the simplest within 1.5 of the best, rest test, band from the covariance
+        inflated for correlated residuals and from the spread of the candidates that are about as good.
+    """
+    times = np.asarray(times, np.float64)
+    quats = np.asarray(quats, np.float64)
+    displacements = np.asarray(displacements, np.float64)
+    weights = np.ones(len(times)) if weights is None else np.asarray(weights, np.float64)
+    _check(times, quats, displacements, weights, radius)
+    family = families.FAMILY if candidates is None else tuple(_named(name, inertia) for name in candidates)
+    used = weights > 0
+    if used.sum() < 2 or times[used][-1] == times[used][0]:
+        return _static(radius)
+    span = float(times[-1] - times[used][0])
+    track = Track(
+        (times[used] - times[-1]) / span,
+        rotations.make_continuous(rotations.normalize(quats[used])),
+        displacements[used] / radius,
+        weights[used] / weights[used].mean(),
+    )
+    middle, frequencies = float(0.5 * (track.tau[0] + track.tau[-1])), _frequencies(track)
+    family = tuple(replace(c, tau_mid=middle, frequencies=frequencies) for c in family)
+    family = tuple(c for c in family if not c.oscillates or frequencies[0] < frequencies[1])
+    if len(track.tau) < 4:
+        return _few(track, family, radius, span)
+
+    tried = tuple(c for c in family if not c.oscillates or families.may_swing(c, track))
+    sigmas, outliers = _noise(track, tried)
+    sigmas = (max(sigmas[0], least_noise[0] / radius), max(sigmas[1], least_noise[1]))
+    scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
+    solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
+    # Without a frequency that the poses determine, no swing: then others may be near the best.
+    for name, solution in list(solutions.items()):
+        if not _determined(solution, track, sigmas):
+            scores[name] = math.inf
+    near = _near(family, scores)
+    solutions = {c.name: solutions.get(c.name) or families.solve(c, track, sigmas) for c in near}
+    chosen = min(near, key=lambda c: c.parameters)
+    tail = rest_detection.poses_at_rest(solutions[chosen.name], track, sigmas)
+    rested = tail > 0
+    tops: list[Score] = []
+    if not rested and inertia is not None and any(_may_tumble(s, inertia) for s in solutions.values()):
+        free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
+        held, whole = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
+        tops = [Score(free.name, free.parameters, held, math.sqrt(whole.chi2))]
+        # A plainer motion gives way as among the others; one with a spin that changes freely has more parameters.
+        if held * (1.0 if "eps" in chosen.blocks else WITHIN) < scores[chosen.name]:
+            chosen, solutions[free.name] = free, whole
+    solution, evidence = solutions[chosen.name], track
+    if rested:
+        evidence = track.rows(slice(-tail, None))
+        solution = families.solve(rest_detection.STATIC, evidence, sigmas)
+    table = tuple(
+        Score(c.name, c.parameters, scores[c.name], math.sqrt(solutions[c.name].chi2) if c in near else math.nan)
+        for c in family
+    )
+    model = _to_model(solution, radius, span, evidence, sigmas)
+    near_solutions = [] if rested else list(solutions.values())
+    band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
+    if rested:  # a body that came to rest may go on: twice the variance
+        band = math.sqrt(2.0) * band
+    else:  # what was held out was missed by so many times the noise: so will be what follows
+        missed = next(row.held_out for row in (*tops, *table) if row.name == chosen.name)
+        band = max(1.0, missed if math.isfinite(missed) else 1.0) * band
+    return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
+    """Whether the picked motion needs a spin that changes its axis, and a body of this inertia could do so freely."""
+    if "eps" not in picked.candidate.blocks or picked.candidate.kind != "ballistic_spin":
+        return False
+    p = picked.candidate.unpack(picked.theta)
+    across = np.linalg.norm(np.cross(p["w"], p["eps"]))
+    along = abs(float(p["w"] @ p["eps"]))
+    return bool(np.arctan2(across, along) > PARALLEL_RAD) and free_top.tumbles(inertia)
+
+
+def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candidate]:
+    """Candidates whose held-out error is within `WITHIN` of the best; the first where none could be fitted."""
+    finite = [s for s in scores.values() if np.isfinite(s)]
+    best = max(min(finite), 1e-3) if finite else math.inf
+    return [c for c in family if scores[c.name] <= WITHIN * best and finite] or [family[0]]
+
+
+def _frequencies(track: Track) -> tuple[float, float]:
+    """Range of frequencies that can be seen: from a quarter of a period in the window to four poses a period."""
+    return 0.5 * math.pi / float(track.tau[-1] - track.tau[0]), 0.5 * math.pi / float(np.median(np.diff(track.tau)))
+
+
+def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
+    """Whether a frequency lies inside its range and is known to `FREQUENCY_ERROR`; True where none is free."""
+    candidate = solution.candidate
+    if not candidate.oscillates:
+        return True
+    low, high = candidate.frequencies
+    frequency = float(candidate.unpack(solution.theta)["frequency"][0])
+    index = candidate.index("pace")
+    variance = _covariance(solution, track, sigmas)[index, index]
+    share = (frequency - low) / (high - low)
+    sigma = math.sqrt(max(variance, 0.0)) * share * (1 - share) * (high - low)
+    return 0.01 < share < 0.99 and sigma < FREQUENCY_ERROR * frequency
+
+
+def _check(times: np.ndarray, quats: np.ndarray, displacements: np.ndarray, weights: np.ndarray, radius: float) -> None:
+    count = len(times)
+    shapes = (times.shape, quats.shape, displacements.shape, weights.shape)
+    if count == 0 or shapes != ((count,), (count, 4), (count, 3), (count,)):
+        raise ValueError(f"expected times (S,), quats (S, 4), displacements (S, 3), weights (S,), got {shapes}")
+    if not all(np.isfinite(x).all() for x in (times, quats, displacements, weights)):
+        raise ValueError("times, quats, displacements, weights: expected finite numbers")
+    if not (np.diff(times) > 0).all():
+        raise ValueError("times: expected strictly increasing")
+    if not (weights >= 0).all():
+        raise ValueError("weights: expected >= 0")
+    if not (math.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius: expected > 0, got {radius}")
+
+
+def _named(name: str, inertia: np.ndarray | None) -> Candidate:
+    if name not in families.BY_NAME:
+        raise ValueError(f"candidates: {name!r} is none of {', '.join(families.BY_NAME)}")
+    if name == families.FREE_TOP.name and inertia is None:
+        raise ValueError(f"candidates: {name!r} needs the inertia")
+    return replace(families.BY_NAME[name], inertia=inertia)
+
+
+def _static(radius: float) -> Fit:
+    model = models.MotionModel(radius=radius)
+    scores = (Score("static", 6, math.nan, math.nan),)
+    return Fit(model, scores, "static", False, 0.0, 0.0, np.zeros(1), np.zeros(1))
+
+
+def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float) -> Fit:
+    """Two or three poses: the plainest of static, translation, spin and both that explains them to a hundredth."""
+    sigmas = (1e-2, 1e-2)
+    allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [
+        rest_detection.STATIC
+    ]
+    solutions = [families.solve(c, track, sigmas) for c in allowed]
+    roots = [math.sqrt(s.chi2) for s in solutions]
+    index = next((i for i, root in enumerate(roots) if root <= 1.0), int(np.argmin(roots)))
+    chosen = solutions[index]
+    table = tuple(Score(c.name, c.parameters, math.inf, r) for c, r in zip(allowed, roots, strict=True))
+    model = _to_model(chosen, radius, span, track, sigmas)
+    band_tau, band = _band(chosen, solutions, track, sigmas, radius, span)
+    return Fit(model, table, chosen.candidate.name, False, sigmas[0] * radius, sigmas[1], band_tau, band)
+
+
+def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, float], np.ndarray]:
+    """Noise of displacements and rotations from the residuals of the largest models, and their weights per pose. [S]
+
+    Errors common to the members of a group do not show in its own rigid fit, so that fit's spread would be too small.
+    """
+    swings = (c for c in family if c.oscillates)
+    wide = [c for c in (_FREE_AXIS, _LARGEST, *swings) if c.parameters <= 6 * len(track.tau) - 6] or [
+        max(
+            (c for c in family if c.parameters < 6 * len(track.tau)),
+            key=lambda c: c.parameters,
+            default=rest_detection.STATIC,
+        )
+    ]
+    best: tuple[float, Solution, np.ndarray] | None = None
+    swung: dict[str, np.ndarray] = {}
+    sigmas = (1.0, 1.0)
+    for _ in range(2):
+        best = None
+        for candidate in wide:
+            solution = families.solve(candidate, track, sigmas, swung.get(candidate.name))
+            if candidate.oscillates:
+                swung[candidate.name] = solution.theta
+            values = families.residuals(candidate, solution.theta[None], track, (1.0, 1.0))[0]
+            dof = max(6 * len(track.tau) - candidate.parameters, 1) / (6 * len(track.tau))
+            level = solution.chi2 / dof
+            if best is None or level < best[0]:
+                best = (level, solution, values)
+        assert best is not None
+        _, solution, values = best
+        weights = (track.weights * solution.robust)[:, None]
+        dof = max(6 * len(track.tau) - solution.candidate.parameters, 1) / (6 * len(track.tau))
+        variances = (weights * values**2).sum(0) / (weights.sum() * dof)
+        sigma_t, sigma_r = np.sqrt([variances[:3].mean(), variances[3:].mean()]).tolist()
+        sigmas = (max(sigma_t, rest_detection.SIGMA_FLOOR), max(sigma_r, rest_detection.SIGMA_FLOOR))
+    assert best is not None
+    return sigmas, best[1].robust
+
+
+def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], outliers: np.ndarray) -> float:
+    """Root mean square of the residuals on the last poses of a fit to the first ones, in units of the noise."""
+    count = len(track.tau)
+    held = max(3, math.ceil(HELD_OUT * count)) if count >= 8 else max(1, count // 4)
+    # Six numbers a pose would determine more, but a third of them must be left to tell noise from motion.
+    if candidate.parameters > 4 * (count - held):
+        return math.inf
+    solution = families.solve(candidate, track.rows(slice(0, count - held)), sigmas)
+    tail = track.rows(slice(count - held, count))
+    values = families.residuals(candidate, solution.theta[None], tail, sigmas)[0]
+    weights = (tail.weights * np.maximum(outliers[count - held :], 1e-6))[:, None]
+    score = math.sqrt(float((weights * values**2).sum() / (6 * weights.sum())))
+    return score if math.isfinite(score) else math.inf
+
+
+def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
+    """Parameters in world units and units of time. [..., P] -> [..., 3] each"""
+    p = solution.candidate.unpack(theta)
+    return {
+        "velocity": p["v"] * radius / span,
+        "acceleration": p["a"] * radius / span**2,
+        "angular_velocity": p["w"] / span,
+        "angular_acceleration": p["eps"] / span**2,
+        "center_offset": p["u"] * radius,
+        "offset_rotvec": p["r"],
+        "offset_displacement": p["e"] * radius,
+        "frequency": p["frequency"] / span,
+    }
+
+
+def _to_model(
+    solution: Solution, radius: float, span: float, track: Track, sigmas: tuple[float, float]
+) -> models.MotionModel:
+    rates = _rates(solution, solution.theta, radius, span)
+    step = 1e-6
+    shifted = solution.theta + step * np.eye(len(solution.theta))
+    moved = _rates(solution, shifted, radius, span)
+    names = (*_RATES, *(["frequency"] if solution.candidate.oscillates else []))
+    slopes = np.concatenate([(moved[name] - rates[name]) / step for name in names], axis=-1).T
+    frequency = float(rates.pop("frequency")[0])
+    inertia = None
+    if solution.candidate.inertia is not None and solution.candidate.kind == "free_top":
+        turn = rotations.quats_to_rotmats(rotations.rotvecs_to_quats(rates["offset_rotvec"]))
+        inertia = turn @ solution.candidate.inertia @ turn.T
+    covariance = slopes @ _covariance(solution, track, sigmas) @ slopes.T
+    return models.MotionModel(
+        kind=solution.candidate.kind,
+        **rates,
+        frequency=frequency,
+        inertia=inertia,
+        fade_time=FADE_PER_SPAN * span,
+        radius=radius,
+        covariance=0.5 * (covariance + covariance.T),
+        covariance_names=(*(f"{name}.{axis}" for name in _RATES for axis in "xyz"), *names[len(_RATES) :]),
+    )
+
+
+def _covariance(solution: Solution, track: Track, sigmas: tuple[float, float]) -> np.ndarray:
+    """Covariance of the parameters, inflated for residuals that are correlated in time (AR(1)). [P, P]"""
+    size, count = len(solution.theta), len(track.tau)
+    values = families.residuals(solution.candidate, solution.theta[None], track, sigmas)[0]
+    s2 = max(solution.chi2 * 6 * count / max(6 * count - size, 1), 1e-12)
+    energy = float((values**2).sum())
+    lag = float((values[1:] * values[:-1]).sum()) / energy if energy > 0 else 0.0
+    rho = min(max(lag + (size / 6 + 1) / count, 0.0), 0.9)
+    return s2 * (1 + rho) / (1 - rho) * np.linalg.pinv(solution.jacobian.T @ solution.jacobian, hermitian=True)
+
+
+def _band(
+    chosen: Solution,
+    near: list[Solution],
+    track: Track,
+    sigmas: tuple[float, float],
+    radius: float,
+    span: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two standard deviations of the position of a surface point, up to one observed span past t_max."""
+    tau = np.linspace(0.0, 1.0, 17)
+    candidate, theta = chosen.candidate, chosen.theta
+    quats, displacements = (x[0] for x in candidate.poses(theta[None], tau))
+    step = 1e-5
+    moved_quats, moved = candidate.poses(theta + step * np.eye(len(theta)), tau)
+    turns = rotations.quats_to_rotvecs(rotations.multiply(moved_quats, rotations.conjugate(quats)))
+    slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
+    covariance = _covariance(chosen, track, sigmas)
+    spread = np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
+    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state, which
+    # all this starts from, is one of the poses and as noisy as they are.
+    variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1) + 3 * sigmas[0] ** 2 + 2 * sigmas[1] ** 2
+    others = [s for s in near if s.candidate.name != candidate.name]
+    total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0
+    for other in others:
+        other_quats, other_displacements = (x[0] for x in other.candidate.poses(other.theta[None], tau))
+        angle = rotations.angle_between(other_quats, quats)
+        distance2 = ((other_displacements - displacements) ** 2).sum(-1) + 2 / 3 * angle**2
+        variance = variance + distance2 / (other.candidate.parameters**2 * total)
+    return tau * span, 2 * radius * np.sqrt(variance)

@@ -1,0 +1,236 @@
+"""Gaussians carried by an affine map, with their shapes, their colours and the shading of that pose written out.
+
+What others draw without knowing our scenes: nothing is left to be turned, tinted or shaded later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..color import tints
+from ..formats.ply import Splats
+from ..motion import rotations
+from ..scene import spherical_harmonics
+from ..scene.scene import Scene
+from . import posing
+from .residuals import Residuals
+
+SIMILARITY_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Gaussians that leave the motion of their group.
+
+    Attributes:
+        rows: Which ones of a scene. [n]
+        offsets: Added to their centres, bind frame. [n, 3]
+        turns: Rotations applied to theirs, unit wxyz. [n, 4]
+        growths: Added to their log scales. [n, 3]
+    """
+
+    rows: np.ndarray
+    offsets: np.ndarray
+    turns: np.ndarray
+    growths: np.ndarray
+
+
+def bend_of(residuals: Residuals, t: float, start: int, count: int) -> Bend | None:
+    """What the residuals of a scene do at a time to a range of its Gaussians; None where that is nothing."""
+    part = slice(*np.searchsorted(residuals.rows, (start, start + count)))
+    found = residuals.at(t) if part.start < part.stop else None
+    if found is None:
+        return None
+    offsets, turns, growths = (values[:, part].T for values in found)
+    return Bend(residuals.rows[part], offsets, turns, growths)
+
+
+def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
+    """Gaussians after an affine map.
+
+    Rotation, translation, mirror and uniform scale are exact in every respect. Under any other map the ellipsoids are
+    still mapped exactly, and the harmonics are the best fit over all directions
+    (`spherical_harmonics.change_of_basis`).
+
+    Args:
+        splats: The Gaussians.
+        matrix: Affine map. [4, 4]
+        factor: On their display-referred colour, >= 0; none where None. [3], [N, 1] or [N, 3]
+
+    Returns:
+        New Gaussians; ids and identities are the given ones.
+
+    Raises:
+        ValueError: The matrix flattens space or is not finite.
+    """
+    linear, offset = affine(matrix)
+    means, quats, log_scales = (np.empty((len(splats.means), width), np.float32) for width in (3, 4, 3))
+    posing.move_points(splats.means, linear, offset, means)
+    map_shapes(linear, splats.quats, splats.log_scales, quats, log_scales)
+    sh = spherical_harmonics.carried(splats.sh, linear)
+    if factor is not None:
+        sh = tints.tint_sh(sh, factor)
+    return Splats(means, quats, log_scales, splats.opacity_logits, sh, splats.identities, splats.object_ids)
+
+
+def place(
+    scene: Scene,
+    start: int,
+    count: int,
+    matrix: np.ndarray,
+    *,
+    world: np.ndarray | None = None,
+    tint: np.ndarray | None = None,
+    bend: Bend | None = None,
+) -> Splats:
+    """A range of a scene's Gaussians, carried from the bind state, with the shading of the pose it brings them to.
+
+    Args:
+        scene: The scene.
+        start: First row.
+        count: Number of rows.
+        matrix: Affine map from the bind state to the wanted world. [4, 4]
+        world: Map from the scene's own world, in which its light stands, to the wanted one; None where they are the
+            same. Shading turns with the rotation nearest to ``matrix``, seen from there. [4, 4]
+        tint: Factor on the display-referred colour, or None. [3]
+        bend: What single Gaussians do in the bind state before they are carried, or None.
+
+    Returns:
+        The Gaussians.
+
+    Raises:
+        ValueError: The range leaves the scene, or the matrix flattens space or is not finite.
+    """
+    if not 0 <= start <= start + count <= len(scene.means):
+        raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.means)} Gaussians")
+    rows, turn = slice(start, start + count), nearest_rotation(affine(matrix)[0])
+    if world is not None:
+        turn = nearest_rotation(affine(world)[0]).T @ turn
+    splats, factor = bind_state(scene, rows), shading_factors(scene, rows, turn)
+    if bend is not None:
+        splats = _bent(scene, start, splats, bend)
+        _relight(scene, start, factor, turn, bend)
+    if tint is not None:
+        factor = np.asarray(tint, np.float64) if factor is None else factor * np.asarray(tint, np.float64)
+    return carry(splats, matrix, factor)
+
+
+def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
+    """Rows of a scene as they are in its file, without shading."""
+    identities = scene.identities
+    return Splats(
+        scene.means[rows],
+        scene.quats[rows],
+        scene.log_scales[rows],
+        scene.opacity_logits[rows],
+        scene.sh[rows],
+        None if identities is None else identities[rows].astype(np.float32),
+        scene.object_ids[rows],
+    )
+
+
+def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
+    """A range of the bind state that begins at a row, bent."""
+    at = bend.rows - start
+    means, quats, log_scales = (values.copy() for values in (splats.means, splats.quats, splats.log_scales))
+    means[at] += bend.offsets
+    quats[at] = rotations.multiply(bend.turns, quats[at].astype(np.float64))
+    log_scales[at] += bend.growths
+    sh = splats.sh
+    if scene.harmonics_turn and sh.shape[1] > 1:
+        sh = sh.copy()
+        sh[at] = spherical_harmonics.turned(sh[at], bend.turns)
+    return replace(splats, means=means, quats=quats, log_scales=log_scales, sh=sh)
+
+
+def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
+    """Write the shading of bent Gaussians that have then turned by a rotation. factor [n, 1], turn [3, 3]"""
+    if factor is None or scene.shading is None or scene.light_direction is None:
+        return
+    light = np.asarray(scene.light_direction, np.float64)
+    turns = turn @ rotations.quats_to_rotmats(bend.turns)
+    factor[bend.rows - start, 0] = posing.lit(
+        posing.rest_factors(scene)[bend.rows], scene.shading[bend.rows], light, turns
+    )
+
+
+def join(parts: Sequence[Splats]) -> Splats:
+    """Several sets of Gaussians as one, in this order; the degree is the highest one, absent coefficients are zero.
+
+    Identities are kept where all parts have them in the same width, ids where all have them.
+    """
+    bases = max((part.sh.shape[1] for part in parts), default=1)
+    sh = [np.pad(part.sh, ((0, 0), (0, bases - part.sh.shape[1]), (0, 0))) for part in parts]
+    widths = {None if part.identities is None else part.identities.shape[1] for part in parts}
+    kept = [part.identities for part in parts if part.identities is not None] if len(widths) == 1 else []
+    ids = [part.object_ids for part in parts if part.object_ids is not None]
+    return Splats(
+        np.concatenate([np.empty((0, 3), np.float32), *(part.means for part in parts)]),
+        np.concatenate([np.empty((0, 4), np.float32), *(part.quats for part in parts)]),
+        np.concatenate([np.empty((0, 3), np.float32), *(part.log_scales for part in parts)]),
+        np.concatenate([np.empty(0, np.float32), *(part.opacity_logits for part in parts)]),
+        np.concatenate([np.empty((0, bases, 3), np.float32), *sh]),
+        np.concatenate(kept) if kept else None,
+        np.concatenate(ids) if parts and len(ids) == len(parts) else None,
+    )
+
+
+def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linear part and translation of a [4, 4] matrix that can be undone. Raises ValueError for any other."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"expected a finite matrix [4, 4], got {matrix!r}")
+    singular = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if singular[-1] <= 1e-9 * max(singular[0], 1e-30):
+        raise ValueError("the matrix flattens space (scale 0)")
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+def is_similarity(linear: np.ndarray) -> bool:
+    """Whether a linear map only turns, mirrors and scales uniformly. [3, 3]"""
+    return _even(np.linalg.svd(linear, compute_uv=False))
+
+
+def nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """Return the rotation nearest to a linear map; a mirror is undone along the first axis before the map.
+
+    [..., 3, 3] -> [..., 3, 3]
+    """
+    u, _, vt = np.linalg.svd(linear)
+    result = u @ vt
+    result[..., :, 0] *= np.sign(np.linalg.det(result))[..., None]
+    return result
+
+
+def _even(singular: np.ndarray) -> bool:
+    return bool(singular[0] - singular[-1] <= SIMILARITY_TOLERANCE * singular[0])
+
+
+def map_shapes(
+    linear: np.ndarray,  # [3, 3]
+    quats: np.ndarray,  # [N, 4]
+    log_scales: np.ndarray,  # [N, 3]
+    new_quats: np.ndarray,  # [N, 4]
+    new_log_scales: np.ndarray,  # [N, 3]
+) -> None:
+    """Write the shapes of ellipsoids under a linear map, exact for any, to the last two, which are float32."""
+    u, singular, vt = np.linalg.svd(linear)
+    if _even(singular) and np.linalg.det(linear) > 0:
+        posing.turn_quats(quats, rotations.rotmats_to_quats(u @ vt), new_quats)
+        np.add(log_scales, np.float32(np.log(singular.mean())), out=new_log_scales)
+        return
+    axes = linear @ (rotations.quats_to_rotmats(np.asarray(quats, np.float64)) * np.exp(log_scales)[:, None, :])
+    u, singular, _ = np.linalg.svd(axes)
+    u[..., 2] *= np.sign(np.linalg.det(u))[:, None]
+    new_quats[:], new_log_scales[:] = rotations.rotmats_to_quats(u), np.log(np.maximum(singular, 1e-30))
+
+
+def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
+    """Factor on the colour of rows that have turned by a rotation since the bind state, or None. [3, 3] -> [n, 1]"""
+    if scene.shading is None or scene.light_direction is None:
+        return None
+    light = np.asarray(scene.light_direction, np.float64)
+    return posing.lit(posing.rest_factors(scene)[rows], scene.shading[rows], light, rotation)[:, None]

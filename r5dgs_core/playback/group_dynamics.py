@@ -1,0 +1,274 @@
+"""How motion groups go on past t_max: the model fitted to their observed poses, or one twist out of their members' own.
+
+Notation: a group turns about its pivot p; a member at y_i = p + r_i has a twist (v_i, w_i) with rates (a_i, e_i) about
+its own centre. Rewritten about the pivot (`se3.recentre`) the twists of a rigid body's members are equal, whatever the
+origin of the coordinates, so that they can be compared and averaged; about a far origin they cancel badly.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from ..motion import key_reduction, models, rigid_fit, rotations, se3, twist_propagation
+from ..motion.models import STATIC, MotionModel
+from ..scene.scene import MotionGroup, Scene
+from . import visibility
+from .modes import SOURCES
+
+HORIZON = 1 / 3  # of the observed span: how far past t_max members of "kabsch" are followed
+_FUTURES = 6  # times within it
+_ROUNDS = 6  # of reweighting
+_TOLERANCE = 1e-6  # of the group's radius
+
+
+def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
+    """Motion past t_max of every group, out of one source.
+
+    Args:
+        scene: The scene; every source but "fitted" asks for its `dynamics`.
+        source: "fitted": what was fitted to the observed poses. The others give a "world_twist" of the members'
+            dynamics about the pivot: "representative" that of the group's representative; "median" the median of all
+            by component; "least_squares" the twist that gives the members' velocities and accelerations best;
+            "kabsch" the twist whose motion best carries the members where their own dynamics bring them.
+
+    Returns:
+        One model per group; static for pinned groups and for those that follow another.
+
+    Raises:
+        ValueError: There is no such source, or the scene has no dynamics.
+
+    Source: "representative" is the anchor of the R5DGS paper. Members fainter than
+        `visibility.SEEN_OPACITY` do not vote, and fits are weighted by opacity and robust (Cauchy).
+    """
+    if source not in SOURCES:
+        raise ValueError(f"source: expected one of {', '.join(SOURCES)}, got {source!r}")
+    if source == "fitted":
+        return tuple(group.model for group in scene.groups)
+    if scene.dynamics is None:
+        raise ValueError(f"source: the scene {scene.name!r} has no dynamics of its Gaussians, only 'fitted'")
+    return tuple(_model_of(scene, group, source) for group in scene.groups)
+
+
+class GroupMotion:
+    """Poses of all motion groups of a scene at any time; what does not depend on the time is computed once.
+
+    Args:
+        scene: The scene.
+        source: Of the motion past t_max, of `SOURCES`.
+    """
+
+    def __init__(self, scene: Scene, source: str = "fitted"):
+        self._times, self._t_max = scene.track_times, scene.t_max
+        self._scene, self._source = scene, source
+        self._quats, self._displacements = knots(scene)
+        self._slopes = (
+            key_reduction.slopes(self._times, self._quats),
+            key_reduction.slopes(self._times, self._displacements),
+        )
+        self._followers = [
+            (g, group.follows, group.follow_matrix)
+            for g, group in enumerate(scene.groups)
+            if group.follows is not None and group.follow_matrix is not None
+        ]
+
+    @functools.cached_property
+    def models(self) -> tuple[MotionModel, ...]:
+        """Motion of each group past t_max."""
+        return models_of(self._scene, self._source)
+
+    @functools.cached_property
+    def _future(self) -> models.Stack:
+        return models.Stack(
+            [STATIC if g.follows is not None else m for g, m in zip(self._scene.groups, self.models, strict=True)]
+        )
+
+    def poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of every group relative to the bind state, as `scene_player.group_poses`."""
+        if not np.isfinite(t):
+            raise ValueError(f"t: expected a finite scene time, got {t}")
+        if t < self._t_max:
+            return self._observed(t)
+        quats, displacements = self._future.poses(t - self._t_max)
+        for g, leader, matrix in self._followers:
+            displacements[g] = matrix @ displacements[leader]
+        return quats, displacements
+
+    def _observed(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        times = self._times
+        if t <= times[0]:
+            return rotations.normalize(self._quats[:, 0]), self._displacements[:, 0].copy()
+        k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
+        h = times[k + 1] - times[k]
+        u = (t - times[k]) / h
+        q, d = (
+            key_reduction.hermite(values[:, k], values[:, k + 1], slopes[:, k], slopes[:, k + 1], h, u)
+            for values, slopes in zip((self._quats, self._displacements), self._slopes, strict=True)
+        )
+        return rotations.normalize(q), d
+
+
+def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Poses at the observed times with signs chosen so that quaternions are continuous and end at (1, 0, 0, 0).
+
+    Args:
+        scene: The scene.
+        groups: Motion groups to return, G of them; all by default.
+
+    Returns:
+        Quaternions [G, S, 4] and displacements [G, S, 3], float64.
+    """
+    poses = np.asarray(scene.track_poses[groups], np.float64)
+    quats = np.moveaxis(poses[..., :4], 1, 0)
+    quats = rotations.make_continuous(quats[::-1])[::-1]
+    quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
+    return np.moveaxis(quats, 0, 1), poses[..., 4:]
+
+
+def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of some Gaussians that are opaque enough to vote, all where none is, and their opacities. [n] each"""
+    with np.errstate(over="ignore"):
+        opacities = 1 / (1 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
+    seen = visibility.seen(opacities)
+    return rows[seen], np.maximum(opacities[seen], 1e-12)
+
+
+def representative(scene: Scene, rows: np.ndarray) -> int:
+    """Of some Gaussians, at least one, the opaque one that is nearest to their centroid: its row."""
+    rows, _ = voters(scene, rows)
+    points = scene.means[rows].astype(np.float64)
+    return int(rows[np.argmin(((points - points.mean(0)) ** 2).sum(-1))])
+
+
+def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
+    assert scene.dynamics is not None
+    rows = np.flatnonzero(scene.motion_ids == group.id)
+    if group.role == "pinned" or group.follows is not None or len(rows) == 0:
+        return STATIC
+    rows, weights = voters(scene, rows)
+    if source == "representative":
+        rows, weights = (np.array([group.anchor_index]), np.ones(1)) if group.anchor_index >= 0 else (rows, weights)
+    arms = scene.means[rows].astype(np.float64) - group.pivot
+    states = scene.dynamics[rows].astype(np.float64)
+    radius = max(float(np.quantile(np.linalg.norm(arms, axis=-1), 0.98)), 1e-9 * scene.extent)
+    if not states.any():
+        return MotionModel(radius=radius)
+    v, w, a, e = np.split(states, 4, axis=-1)
+    about_pivot = np.concatenate([*se3.recentre(w, v, e, a, -arms), w, e], axis=-1)  # v, a, w, e
+    twist = np.median(about_pivot, axis=0)
+    span = float(scene.track_times[-1] - scene.track_times[0]) * HORIZON or 1.0
+    if source in ("least_squares", "kabsch"):
+        twist = _least_squares(arms, states, weights, twist, span)
+    if source == "kabsch":
+        twist = _kabsch(arms, states, weights, twist, span, radius)
+    return _world_twist(twist, radius)
+
+
+def _world_twist(twist: np.ndarray, radius: float) -> MotionModel:
+    """The model of v, a, w, e about the pivot. [12]"""
+    v, a, w, e = np.split(twist, 4)
+    return MotionModel(
+        "world_twist", velocity=v, acceleration=a, angular_velocity=w, angular_acceleration=e, radius=radius
+    )
+
+
+def _least_squares(
+    arms: np.ndarray,  # [n, 3]
+    states: np.ndarray,  # [n, 12]
+    weights: np.ndarray,  # [n]
+    guess: np.ndarray,  # [12]
+    span: float,
+) -> np.ndarray:  # [12]
+    """The twist v, a, w, e about the pivot whose field has the members' velocities and accelerations.
+
+    A member's own spin does not tell how the body turns (only v + w x r is seen in training), so it decides only about
+    axes that the members' velocities leave open.
+
+    Source: velocity v + w x r, acceleration a + e x r + w x (v + w x r).
+    """
+    v_i, w_i, a_i, _ = np.split(states, 4, axis=-1)
+    v, w = _screw(arms, v_i, weights, guess[6:9], rigid_fit.UNDETERMINED_RAD / span)
+    bent = a_i + rotations.cross(w_i, v_i) - rotations.cross(w, v + rotations.cross(w, arms))
+    a, e = _screw(arms, bent, weights, guess[9:], 2 * rigid_fit.UNDETERMINED_RAD / span**2)
+    return np.concatenate([v, a, w, e])
+
+
+def _screw(
+    arms: np.ndarray, speeds: np.ndarray, weights: np.ndarray, guess: np.ndarray, doubt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The field v + w x r nearest to vectors at points r: v and w, robust.
+
+    Args:
+        arms: r. [n, 3]
+        speeds: The vectors. [n, 3]
+        weights: > 0. [n]
+        guess: What w is about an axis that the points leave open. [3]
+        doubt: Standard deviation of w from which an axis counts as open.
+    """
+    current, center, mean, w = weights / weights.sum(), arms[0], speeds[0], guess
+    for remaining in range(_ROUNDS, -1, -1):
+        center, mean = current @ arms, current @ speeds
+        x, u = arms - center, speeds - mean
+        values, axes = np.linalg.eigh(np.einsum("n,nij->ij", current, rigid_fit.inertias(x)))
+        torque = current @ rotations.cross(x, u)
+        floor = 1e-12 * max(float(values[-1]), 1e-300)
+        w = axes @ (axes.T @ torque / np.maximum(values, floor))
+        errors = u - rotations.cross(w, x)
+        relative = current / current.max()
+        variance = (relative @ (errors**2).sum(-1)) / max(3 * relative.sum() - 6, 1.0) / relative.sum()
+        open_axes = (values <= floor) | (variance > doubt**2 * np.maximum(values, floor))
+        w = axes @ np.where(open_axes, axes.T @ guess, axes.T @ w)
+        distances = np.linalg.norm(u - rotations.cross(w, x), axis=-1)
+        median = float(np.median(distances))
+        if remaining == 0 or distances.max() <= 4 * median or distances.max() <= 1e-12 * np.abs(speeds).max():
+            break
+        scale = max(2 * 1.4826 * median, 1e-9 * float(np.abs(speeds).max()))
+        current = weights / (1 + (distances / scale) ** 2)
+        current = current / current.sum()
+    return mean - rotations.cross(w, center), w
+
+
+def _kabsch(
+    arms: np.ndarray, states: np.ndarray, weights: np.ndarray, guess: np.ndarray, span: float, radius: float
+) -> np.ndarray:
+    """The twist whose motion is nearest to the best rigid motions of the members at several times up to ``span``."""
+    taus = span * np.arange(1, _FUTURES + 1) / _FUTURES
+    quats, displacements = np.empty((_FUTURES, 4)), np.empty((_FUTURES, 3))
+    future = twist_propagation.Propagator(states, _TOLERANCE * radius)
+    hints = models.evaluate(_world_twist(guess, radius), taus)[0]
+    for k, tau in enumerate(taus):
+        moves = future.rows_of(float(tau))[1]
+        fit = rigid_fit.fit_rigid(arms, arms + moves, weights, hint=hints[k])
+        quats[k], displacements[k] = fit.quat, fit.displacement_at(np.zeros(3))
+    return _fit_twist(taus, quats, displacements, guess, radius)
+
+
+def _fit_twist(
+    taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray, guess: np.ndarray, radius: float
+) -> np.ndarray:
+    """The twist v, a, w, e whose poses are nearest to given ones, by Levenberg-Marquardt from a guess. [12]"""
+    span = float(taus[-1])
+    units = np.repeat([radius / span, radius / span**2, 1 / span, 1 / span**2], 3)
+
+    def errors(batch: np.ndarray) -> np.ndarray:  # [B, 12] -> [B, 6 K], in radii
+        v, a, w, e = (part[:, None] for part in np.split(batch * units, 4, axis=-1))
+        durations = np.broadcast_to(taus, (len(batch), len(taus)))
+        needed = se3.steps_needed(w, v, e, a, durations, radius, _TOLERANCE * radius)
+        q, d = se3.integrate(w, v, e, a, durations, int(min(needed.max(), twist_propagation.MAX_STEPS)))
+        turns = rotations.quats_to_rotvecs(rotations.multiply(q, rotations.conjugate(quats)))
+        return np.concatenate([(d - displacements) / radius, turns], axis=-1).reshape(len(batch), -1)
+
+    x, damping = guess / units, 1e-6
+    for _ in range(20):
+        found = errors(np.concatenate([x[None], x + 1e-6 * np.eye(12)]))
+        jacobian = (found[1:] - found[0]).T / 1e-6
+        step = -np.linalg.solve(jacobian.T @ jacobian + damping * np.eye(12), jacobian.T @ found[0])
+        better = float((errors((x + step)[None]) ** 2).sum()) < float((found[0] ** 2).sum())
+        if better:
+            x, damping = x + step, max(damping / 10, 1e-12)
+        else:
+            damping *= 10
+        if np.abs(step).max() < 1e-9 or damping > 1e3:
+            break
+    return x * units

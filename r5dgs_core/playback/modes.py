@@ -1,0 +1,36 @@
+"""Names of the playback modes: BASE or BASE/VARIANT. Needs the standard library alone.
+
+The first variant of a base is meant if none is given. `scene_player` describes what each mode does.
+"""
+
+from __future__ import annotations
+
+SOURCES = ("fitted", "representative", "median", "least_squares", "kabsch")  # of a group's motion past t_max
+MODES = ("rigid", "hybrid", "standard", "rigid_paper")
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "rigid": SOURCES,
+    "hybrid": SOURCES,
+    "standard": (),
+    "rigid_paper": ("pinned", "anchored"),
+}
+
+
+def split(mode: str) -> tuple[str, str]:
+    """Return base and variant of a mode; the variant is the first one if none is given, "" if the base has none.
+
+    Raises:
+        ValueError: The mode is unknown.
+    """
+    base, slash, variant = mode.partition("/") if isinstance(mode, str) else ("", "", "")
+    if base not in MODES:
+        raise ValueError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
+    variants = VARIANTS[base]
+    if slash and variant not in variants:
+        known = ", ".join(f"{base}/{name}" for name in variants) or base
+        raise ValueError(f"mode: expected one of {known}, got {mode!r}")
+    return base, variant or next(iter(variants), "")
+
+
+def every() -> tuple[str, ...]:
+    """Return all modes, each once; the first variant of a base goes by the name of the base."""
+    return tuple(mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:])))

@@ -1,0 +1,179 @@
+"""Gaussians of a scene carried by affine maps, one per motion group.
+
+Notation: member i of a group lies at p + r_i at t_max, p the group's pivot; its place is R r_i + (p + d), computed in
+float64 relative to an origin and rounded to float32 once, so that it is as sharp as numbers near that origin are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..motion import quaternion_columns, rotations
+from ..scene.row_runs import runs
+from ..scene.scene import Scene
+
+
+class Poser:
+    """The Gaussians of a scene, ready to be carried; what does not depend on poses is computed once.
+
+    Args:
+        scene: The scene.
+    """
+
+    def __init__(self, scene: Scene):
+        self._scene = scene
+        self._runs = runs(scene.motion_ids)
+        self.pivots = np.array([group.pivot for group in scene.groups], np.float64).reshape(-1, 3)
+        self._shaded = scene.shading is not None and scene.light_direction is not None
+        self._rest = rest_factors(scene)
+        self._arms: np.ndarray | None = None
+        self._still: tuple[np.ndarray, np.ndarray] | None = None
+
+    def means(self, group_quats: np.ndarray, group_displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Centres with each group in a pose, relative to an origin.
+
+        Args:
+            group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
+            group_displacements: Displacement of each pivot, world. [G, 3]
+            origin: [3]
+
+        Returns:
+            A new array; Gaussians of groups that did not move are those of the bind state to the bit where the origin
+            is zero. [N, 3] float32
+        """
+        result = self._resting(origin).copy()
+        moved = (group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1)
+        if moved.any():
+            maps, arms = self.maps(group_quats, group_displacements, origin), self.arms
+            for start, stop, g in self._runs:
+                if moved[g]:
+                    result[start:stop] = arms[start:stop] @ maps[g]
+        return result
+
+    def maps(self, group_quats: np.ndarray, group_displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """What `arms` are multiplied with from the right. [G, 4], [G, 3], [3] -> [G, 4, 3]"""
+        maps = np.empty((len(group_quats), 4, 3))
+        maps[:, :3] = np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
+        maps[:, 3] = self.pivots + group_displacements - origin
+        return maps
+
+    def shift(self, offsets: np.ndarray, maps: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Centres at t_max plus what the maps of their groups make of offsets, relative to an origin.
+
+        Args:
+            offsets: With a fourth column of ones. [N, 4]
+            maps: [G, 4, 3]
+            origin: [3]
+
+        Returns:
+            A new array; groups of a zero map stay as in `means`. [N, 3] float32
+        """
+        result = self._resting(origin).copy()
+        for start, stop, g in self._runs:
+            if maps[g].any():
+                moves = offsets[start:stop] @ maps[g]
+                moves += self._scene.means[start:stop]
+                moves -= origin
+                result[start:stop] = moves
+        return result
+
+    def quats(self, group_quats: np.ndarray) -> np.ndarray:
+        """Rotations of the Gaussians with each group turned. [G, 4] -> [N, 4] float32, the scene's where none turned"""
+        turned = (group_quats[:, 1:] != 0).any(-1)
+        if not turned.any():
+            return self._scene.quats
+        result = self._scene.quats.copy()
+        for start, stop, g in self._runs:
+            if turned[g]:
+                turn_quats(self._scene.quats[start:stop], group_quats[g], result[start:stop])
+        return result
+
+    def shading(self, group_quats: np.ndarray) -> np.ndarray | None:
+        """Factor on the colour of each Gaussian with each group turned, or None. [G, 4] -> [N] float32"""
+        vectors, light = self._scene.shading, self._scene.light_direction
+        if not self._shaded or vectors is None or light is None:
+            return None
+        result = np.maximum(self._rest, 0)
+        change = (rotations.rotate(rotations.conjugate(group_quats), light) - light).astype(np.float32)
+        for start, stop, g in self._runs:
+            if change[g].any():
+                result[start:stop] = np.maximum(self._rest[start:stop] + vectors[start:stop] @ change[g], 0)
+        return result
+
+    def relight(self, factors: np.ndarray | None, rows: np.ndarray, turns: np.ndarray) -> None:
+        """Write the factors of Gaussians that turned on their own. factors [N], rows [R], turns since t_max [4, R]"""
+        vectors, light = self._scene.shading, self._scene.light_direction
+        if factors is None or vectors is None or light is None:
+            return
+        lit = self._rest[rows] + (
+            vectors[rows].T * quaternion_columns.direction_changes(turns, light.astype(turns.dtype))
+        ).sum(0)
+        factors[rows] = np.maximum(lit, 0)
+
+    @property
+    def arms(self) -> np.ndarray:
+        """Places of the Gaussians from the pivots of their groups, with a fourth column of ones. [N, 4] float64"""
+        if self._arms is None:
+            self._arms = np.ones((len(self._scene.means), 4))
+            np.subtract(self._scene.means, self.pivots[self._scene.motion_ids], out=self._arms[:, :3])
+        return self._arms
+
+    def _resting(self, origin: np.ndarray) -> np.ndarray:
+        if not origin.any():
+            return self._scene.means
+        if self._still is None or not np.array_equal(self._still[0], origin):
+            self._still = origin.copy(), (self._scene.means.astype(np.float64) - origin).astype(np.float32)
+        return self._still[1]
+
+
+def rest_factors(scene: Scene) -> np.ndarray:
+    """Factor of each Gaussian's colour in the bind state, before it is bounded at 0. [N] float32"""
+    rest = scene.shading_rest
+    return np.ones(len(scene.means), np.float32) if rest is None else rest
+
+
+def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Factors on the colours of Gaussians that have turned since the bind state.
+
+    Args:
+        rest: Their factors there, before they are bounded at 0. [n]
+        shading: How they change with the light's direction. [n, 3]
+        light: Direction of the light. [3]
+        turns: One rotation for all, or one for each. [3, 3] or [n, 3, 3]
+
+    Returns:
+        The factors, >= 0. [n]
+    """
+    change = light_change(light, turns).astype(np.float32)
+    return np.maximum(rest + (shading @ change if change.ndim == 1 else (shading * change).sum(-1)), 0)
+
+
+def light_change(light: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """How the light's direction, seen from what has turned, has changed. [3] and [..., 3, 3] -> [..., 3]"""
+    return np.swapaxes(turns, -1, -2) @ light - light
+
+
+def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, result: np.ndarray) -> None:
+    """Write ``linear p + shift`` for each point p to ``result``, computed in float64.
+
+    Args:
+        points: [N, 3] float32
+        linear: [3, 3] float64
+        shift: [3] float64
+        result: Not ``points``. [N, 3] float32
+    """
+    turned = points.astype(np.float64) @ linear.T
+    for axis in range(3):  # a column at a time: numpy is slow at rows of three
+        np.add(turned[:, axis], shift[axis], out=result[:, axis], casting="same_kind")
+
+
+def turn_quats(quats: np.ndarray, turn: np.ndarray, result: np.ndarray) -> None:
+    """Write the products ``turn q`` to ``result``.
+
+    Args:
+        quats: Unit wxyz. [N, 4] float32
+        turn: Unit wxyz. [4] float64
+        result: Not ``quats``. [N, 4] float32
+    """
+    # Linear in q: row k of the matrix is the product with the k-th unit quaternion.
+    np.matmul(quats, rotations.multiply(turn, np.eye(4)).astype(np.float32), out=result)

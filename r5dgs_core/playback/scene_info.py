@@ -1,0 +1,47 @@
+"""The summary of a scene that ``r5dgs info --json`` prints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..scene.scene import Scene
+from . import scene_player
+
+
+def info(scene: Scene) -> dict[str, Any]:
+    """Return what `r5dgs info --json` prints, as JSON types."""
+    return {
+        "name": scene.name,
+        "gaussians": len(scene.means),
+        "sh_degree": int(np.sqrt(scene.sh.shape[1])) - 1,
+        "objects": [
+            {"id": o.id, "name": o.name, "aliases": list(o.aliases), "gaussians": o.count} for o in scene.objects
+        ],
+        "motion_groups": [
+            {
+                "id": g.id,
+                "object": g.object_id,
+                "role": g.role,
+                "gaussians": int((scene.motion_ids == g.id).sum()),
+                "model": g.model.kind if g.follows is None else f"follows {g.follows}",
+                "rigid_rms": g.rigid_rms,
+            }
+            for g in scene.groups
+        ],
+        "times": [float(scene.track_times[0]), scene.t_max],
+        "knots": len(scene.track_times),
+        "frames_per_unit": scene.frames_per_unit,
+        "world_convention": scene.world_convention,
+        "cameras": len(scene.cameras),
+        "extent": scene.extent,
+        **({"origin": scene.origin.tolist()} if scene.origin.any() else {}),
+        "identities": scene.identities is not None,
+        "shading": scene.shading is not None,
+        "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),
+        "modes": list(scene_player.modes(scene)),
+        "vocabulary": len(scene.vocabulary),
+        "lookup": None if scene.lookup is None else f"{scene.lookup.encoder.kind} {scene.lookup.encoder.name}",
+        "needs": list(scene.needs),
+    }

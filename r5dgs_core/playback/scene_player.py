@@ -1,0 +1,298 @@
+"""A scene at any time: poses of its motion groups, and its Gaussians moved by them.
+
+Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
+(the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours.
+Blender's Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce
+playback at sub-frames. Before the first knot the pose is held; past t_max it is what the mode says.
+
+A mode is one string, BASE or BASE/VARIANT; the first of `VARIANTS` is meant where none is given. Up to t_max all modes
+are the same. Past it:
+
+- "rigid" moves every Gaussian with its group. The variant is the source of the group's motion (`group_dynamics`).
+- "hybrid" does, too, except for Gaussians that no group's motion explains (`residuals.unexplained`): they move by their
+  own dynamics.
+- "standard" moves every Gaussian by its own dynamics.
+- "rigid_paper" is Eq. 6 and 7 to the letter; "pinned" leaves what belongs to no body in its place, "anchored" gives it
+  a representative, as the paper's text does.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import quaternion_columns, rotations
+from ..motion.key_reduction import slopes
+from ..scene.scene import Scene
+from . import group_dynamics, posing
+from .group_dynamics import knots
+from .modes import MODES, VARIANTS, every, split
+from .posing import move_points, rest_factors, turn_quats
+from .residuals import Literal, OwnMotion, Residuals, unexplained
+
+__all__ = (
+    "MODES", "VARIANTS", "Frame", "Player", "available", "every", "frame", "group_poses", "knot_slopes", "knots",
+    "modes", "move_points", "pose", "rest_factors", "sh_rotations", "slopes", "split", "turn_quats",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The Gaussians of a scene at time t.
+
+    `sh` stays in the frame of the bind state: a renderer turns each viewing direction back by the group's rotation
+    (`sh_rotations`), or by the Gaussian's own, instead of turning the coefficients.
+
+    Attributes:
+        t: Scene time.
+        means: Centres relative to ``origin``, along the world's axes. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: [N, 3] float32
+        opacity_logits: As in the scene. [N] float32
+        sh: As in the scene, bind frame. [N, K, 3] float32
+        shading_factor: Factor on the colour, >= 0, or None without shading. [N] float32
+        object_ids: [N] int32
+        motion_ids: [N] int32
+        group_quats: Rotation of each motion group since the bind state, unit wxyz. [G, 4] float64
+        group_displacements: Displacement of each group's pivot, world. [G, 3] float64
+        origin: Point of the world that ``means`` are relative to. [3] float64
+        turned_rows: Gaussians that turned otherwise than their group, or None. [R] int64
+        turned_quats: Their rotations since the bind state, unit wxyz, or None. [R, 4] float32
+    """
+
+    t: float
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    shading_factor: np.ndarray | None
+    object_ids: np.ndarray
+    motion_ids: np.ndarray
+    group_quats: np.ndarray
+    group_displacements: np.ndarray
+    origin: np.ndarray
+    turned_rows: np.ndarray | None = None
+    turned_quats: np.ndarray | None = None
+
+
+def modes(scene: Scene) -> tuple[str, ...]:
+    """Those of `every` that a scene holds data for: `rigid` always, the others where it carries dynamics."""
+    return tuple(mode for mode in every() if available(scene, mode))
+
+
+def available(scene: Scene, mode: str) -> bool:
+    """Whether a scene holds data for a mode. Raises ValueError where there is no such mode."""
+    base, variant = split(mode)
+    if base == "rigid_paper":
+        return scene.dynamics is not None and scene.canonical_means is not None
+    return scene.dynamics is not None or (base == "rigid" and variant == "fitted")
+
+
+class Player:
+    """A scene in one mode, ready for any time; what does not depend on the time is computed once, when it is needed.
+
+    Args:
+        scene: The scene; its arrays must not change.
+        mode: Of `modes`.
+
+    Raises:
+        ValueError: There is no such mode, or the scene holds no data for it.
+    """
+
+    def __init__(self, scene: Scene, mode: str = "rigid"):
+        self.scene, self.mode = scene, mode
+        self._base, self._variant = split(mode)
+        if not available(scene, mode):
+            raise ValueError(f"mode: the scene {scene.name!r} has {', '.join(modes(scene))}, not {mode!r}")
+        self._poser = posing.Poser(scene)
+        source = self._variant if self._base in ("rigid", "hybrid") else "fitted"
+        self._groups = group_dynamics.GroupMotion(scene, source)
+
+    @functools.cached_property
+    def _residuals(self) -> Residuals:
+        return Residuals(self.scene)
+
+    @functools.cached_property
+    def _own(self) -> OwnMotion | None:
+        if self._base == "standard":
+            return OwnMotion(self.scene)
+        rows = unexplained(self.scene) if self._base == "hybrid" else ()
+        return OwnMotion(self.scene, np.asarray(rows)) if len(rows) else None
+
+    @functools.cached_property
+    def _literal(self) -> Literal:
+        return Literal(self.scene, self._variant == "anchored")
+
+    def group_poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of every motion group that this mode's Gaussians are moved by, relative to the bind state.
+
+        Returns:
+            Unit quaternions wxyz [G, 4] and displacements of the pivots (of the representatives in mode "rigid_paper"),
+            world [G, 3], float64; those at rest in mode "standard".
+        """
+        if t <= self.scene.t_max or self._base in ("rigid", "hybrid"):
+            return self._groups.poses(t)
+        if self._base == "rigid_paper":
+            return self._literal.at(t - self.scene.t_max)
+        return rotations.identity(len(self.scene.groups)), np.zeros((len(self.scene.groups), 3))
+
+    def frame(self, t: float, origin: np.ndarray | None = None) -> Frame:
+        """The scene's Gaussians at a time.
+
+        Args:
+            t: Scene time.
+            origin: Point of the world that the centres are to be relative to, such as the camera's; the world's own
+                where None. Single precision is sharp near it. [3]
+
+        Returns:
+            The frame. Gaussians that did not move are equal to the bind state to the bit where there is no origin.
+        """
+        scene, poser = self.scene, self._poser
+        center = np.zeros(3) if origin is None else np.array(origin, np.float64)
+        if center.shape != (3,) or not np.isfinite(center).all():
+            raise ValueError(f"origin: expected three finite numbers, got {origin!r}")
+        quats, displacements = self.group_poses(t)
+        past = t > scene.t_max
+        if past and self._base == "rigid_paper":
+            means = self._literal.means(poser, quats, displacements, center)
+        else:
+            means = poser.means(quats, displacements, center)
+        moved = _Moved(means, poser.quats(quats), scene.log_scales, poser.shading(quats))
+        if not past:
+            self._bend(moved, t, quats, displacements, center)
+        elif self._own is not None:
+            self._part(moved, t - scene.t_max, center)
+        return Frame(
+            t=float(t),
+            means=moved.means,
+            quats=moved.quats,
+            log_scales=moved.log_scales,
+            opacity_logits=scene.opacity_logits,
+            sh=scene.sh,
+            shading_factor=moved.shading,
+            object_ids=scene.object_ids,
+            motion_ids=scene.motion_ids,
+            group_quats=quats,
+            group_displacements=displacements,
+            origin=center,
+            turned_rows=moved.rows if scene.harmonics_turn else None,
+            turned_quats=moved.turns if scene.harmonics_turn else None,
+        )
+
+    def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:
+        """Residuals of the observed time, in the bind state before the group moves it."""
+        found = self._residuals.at(t)
+        if found is None:
+            return
+        offsets, turns, growths = found
+        rows, scene = self._residuals.rows, self.scene
+        arms = self._poser.arms[rows]
+        arms[:, :3] += offsets.T
+        maps = self._poser.maps(quats, displacements, origin)
+        for start, stop, g in self._residuals.runs:
+            moved.means[rows[start:stop]] = arms[start:stop] @ maps[g]
+        carried = np.take(quats.T.astype(np.float32), scene.motion_ids[rows], axis=1)
+        since = quaternion_columns.multiply(carried, turns.astype(np.float32))
+        moved.turn(rows, since, quaternion_columns.multiply(since, self._residuals.bind_quats), scene)
+        moved.log_scales = scene.log_scales.copy()
+        moved.log_scales[rows] += growths.T
+        self._poser.relight(moved.shading, rows, since)
+
+    def _part(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:
+        """Gaussians that leave their groups past t_max."""
+        assert self._own is not None
+        means, quats, turns = self._own.at(tau, origin)
+        moved.means[self._own.rows] = means.T
+        moved.turn(self._own.rows, turns, quats, self.scene)
+        self._poser.relight(moved.shading, self._own.rows, turns)
+
+
+@dataclass
+class _Moved:
+    """What becomes a frame. means [N, 3], quats [N, 4], log_scales [N, 3], shading [N]; rows [R], turns [R, 4]"""
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    shading: np.ndarray | None
+    rows: np.ndarray | None = None
+    turns: np.ndarray | None = None
+
+    def turn(self, rows: np.ndarray, since: np.ndarray, quats: np.ndarray, scene: Scene) -> None:
+        """Take rotations of some Gaussians since the bind state, and what they turned: by column, [4, R]."""
+        if self.quats is scene.quats:
+            self.quats = scene.quats.copy()
+        self.quats[rows] = quats.T
+        self.rows, self.turns = rows, since.T
+
+
+def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | None = None) -> Frame:
+    """The scene's Gaussians at time t. Whoever asks for many times keeps a `Player`.
+
+    Args:
+        scene: The scene.
+        t: Scene time.
+        mode: How Gaussians move past t_max, of `modes`.
+        origin: Point of the world that the centres are to be relative to, or None. [3]
+
+    Returns:
+        As `Player.frame`.
+
+    Raises:
+        ValueError: There is no such mode, or the scene holds no data for it.
+    """
+    return Player(scene, mode).frame(t, origin)
+
+
+def knot_slopes(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
+    quats, displacements = knots(scene, groups)
+    return slopes(scene.track_times, quats), slopes(scene.track_times, displacements)
+
+
+def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of every motion group relative to the bind state, in mode "rigid".
+
+    Args:
+        scene: The scene.
+        t: Scene time; before the first knot the first pose is held.
+
+    Returns:
+        Unit quaternions wxyz [G, 4] and displacements of the pivots, world [G, 3], float64. At t_max exactly the
+        identity; a group that `follows` another takes its displacement through `follow_matrix` past t_max.
+    """
+    return group_dynamics.GroupMotion(scene).poses(t)
+
+
+def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
+    """Matrices that bring world directions into each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
+    return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
+
+
+def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray, t: float = float("nan")) -> Frame:
+    """The scene's Gaussians with each motion group in a given pose.
+
+    Args:
+        scene: The scene.
+        group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
+        group_displacements: Displacement of each pivot, world. [G, 3]
+        t: Time written into the frame.
+    """
+    poser, center = posing.Poser(scene), np.zeros(3)
+    return Frame(
+        t=float(t),
+        means=poser.means(group_quats, group_displacements, center),
+        quats=poser.quats(group_quats),
+        log_scales=scene.log_scales,
+        opacity_logits=scene.opacity_logits,
+        sh=scene.sh,
+        shading_factor=poser.shading(group_quats),
+        object_ids=scene.object_ids,
+        motion_ids=scene.motion_ids,
+        group_quats=group_quats,
+        group_displacements=group_displacements,
+        origin=center,
+    )

@@ -1,0 +1,1 @@
+"""The `cpu` backend: numba kernels for projection, tiling, blending and spherical harmonics."""

@@ -1,0 +1,1 @@
+"""Fixed-width vector types for numba kernels, emitted as LLVM vectors."""

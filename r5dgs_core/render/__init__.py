@@ -1,0 +1,1 @@
+"""Render a posed `Scene`: whole pictures, incremental frames, coverage, highlights and viewpoints."""

@@ -1,0 +1,77 @@
+"""How much of each pixel belongs to whom: soft masks, the largest shares first, as Cryptomatte keeps them.
+
+Every group of Gaussians is a channel that is 1 on its own and 0 elsewhere; blended, it is the part of a pixel that the
+group covers before the eye, and all groups together are the pixel's alpha.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..raster import rasterize
+from ..raster.settings import RasterSettings
+from ..scene import cameras
+from ..scene.cameras import Camera
+from . import scene_renderer
+
+CHANNELS = 11  # groups in one pass: three as colour, the others as features, so that memory stays small
+
+
+def shares(
+    posed: scene_renderer.PosedScene,
+    groups: np.ndarray,  # [N]
+    camera: Camera,
+    *,
+    ranks: int,
+    settings: RasterSettings,
+    backend: str = "auto",
+) -> tuple[np.ndarray, np.ndarray]:
+    """The groups that cover each pixel most, and how much of it.
+
+    Args:
+        posed: Gaussians in the world.
+        groups: Group of each Gaussian, -1 for one that covers others without being of interest. [N] int
+        camera: The camera.
+        ranks: How many groups to keep for each pixel, >= 1.
+        settings: Of the rasterizer.
+        backend: Rasterizer, as for `rasterize`.
+
+    Returns:
+        Groups, -1 where there are fewer [H, W, ranks] int32, and their shares in falling order, of at most alpha in
+        all [H, W, ranks] float32.
+    """
+    size = (ranks, camera.height * camera.width)
+    best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
+    groups = np.asarray(groups, np.int64)
+    gaussians, seen = scene_renderer.PosedGaussians(posed), cameras.moved(camera, -posed.origin)
+    present = np.unique(groups[groups >= 0])
+    for first in range(0, len(present), CHANNELS):
+        chosen = present[first : first + CHANNELS]
+        channels = torch.zeros((len(groups), max(len(chosen), 3)))
+        channels[:, : len(chosen)] = torch.from_numpy((groups[:, None] == chosen).astype(np.float32))
+        with torch.no_grad():
+            output = rasterize(
+                gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
+            )
+        assert output.features is not None  # they were asked for
+        image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
+        values = scene_renderer.to_numpy(image, np.float32).reshape(-1, len(chosen))
+        for column, group in enumerate(chosen):
+            _insert(best, found, values[:, column], int(group))
+    shape = (camera.height, camera.width, ranks)
+    return found.T.reshape(shape), best.T.reshape(shape)
+
+
+def _insert(best: np.ndarray, found: np.ndarray, values: np.ndarray, group: int) -> None:
+    """Sort a group's shares [P] into the largest ones so far, [ranks, P] each; most groups are in few pixels."""
+    pixels = np.flatnonzero(values > 0)
+    shares, names = values[pixels], np.full(len(pixels), group, np.int32)
+    for rank in range(len(best)):
+        larger = np.flatnonzero(shares > best[rank, pixels])
+        places = pixels[larger]
+        passed, passed_names = best[rank, places], found[rank, places]
+        best[rank, places], found[rank, places] = shares[larger], names[larger]
+        shares[larger], names[larger] = passed, passed_names
+        left = shares > 0
+        pixels, shares, names = pixels[left], shares[left], names[left]

@@ -1,0 +1,296 @@
+"""Scenes drawn together frame after frame by one camera: what has not moved since the last frame is not drawn again.
+
+Which instances move is learned from the frames themselves. Under a new camera, or after another change of what is
+shown or behind it, everything is drawn; from the next frame on, the instances that have kept their place are a
+`Backdrop`, and only those that have ever left theirs are drawn into it. The pictures are those of
+`scene_renderer.render_frame`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ..raster import backends, rasterize
+from ..raster.settings import RasterSettings, RenderOutput
+from ..scene.cameras import Camera
+from ..scene.scene import NEAR_PLANE, Scene
+from . import coverage, posed_scene, scene_renderer
+from .scene_renderer import Instance
+
+WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; with more, keeping the rest costs what it saves
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Whose sky lies behind everything.
+
+    Attributes:
+        scene: Which of the scenes.
+        matrix: Map from that scene's world to the world of the picture; what it shifts has no effect. [4, 4]
+    """
+
+    scene: int = 0
+    matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+
+class Stage:
+    """Draws one scene, or several in one world, again and again, on the CPU in float32.
+
+    Args:
+        scenes: What instances are of.
+
+    Attributes:
+        ms_motion: What bringing Gaussians to their places took in the last frame, milliseconds.
+    """
+
+    def __init__(self, scenes: Scene | Sequence[Scene]):
+        self.ms_motion = 0.0
+        self._lock = threading.Lock()
+        self._scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+        self._gathered = scene_renderer.gather(self._scenes)
+        self._shown: tuple | None = None  # camera, background, ranges and looks of the last frame
+        self._places: list[np.ndarray] = []  # of all instances, where they stood first
+        self._moving: set[int] = set()
+        self._backdrop = None
+
+    def render(
+        self,
+        instances: Sequence[Instance],
+        camera: Camera,
+        *,
+        sky: Sky | None = Sky(),
+        near: float | None = None,
+        distance: float = 0.0,
+    ) -> RenderOutput:
+        """Render ranges of the scenes' Gaussians, each moved by a matrix of its own.
+
+        Args:
+            instances: As for `scene_renderer.pose_instances`; compared with those of the last frame one by one.
+            camera: The camera, in the world of the picture.
+            sky: The sky behind everything; None for black.
+            near: Gaussians whose centre lies nearer than this depth are not drawn; where None, the scenes' own near
+                plane, of those that have an instance the smallest one in this world.
+            distance: How far before the camera the plane lies that the depths of the result are counted from. A camera
+                that stands very far away has its depths as sharp as one that does not.
+
+        Returns:
+            Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance that has the largest share of each
+            pixel, -1 where there is too little of all; tensors without gradient. Hold-outs are black in the colour, and
+            their share of each pixel is ``holdout``; all else is of the other instances alone.
+
+        Raises:
+            ValueError: As `scene_renderer.pose_instances`.
+        """
+        with self._lock:
+            try:
+                return self._render(instances, camera, sky, near, distance)
+            except ValueError:
+                self._shown = None
+                scene_renderer.pose_instances(self._gathered, instances)  # numbers the bad one as the caller does
+                raise
+
+    def coverage(
+        self,
+        instances: Sequence[Instance],
+        groups: Sequence[int],
+        camera: Camera,
+        *,
+        ranks: int,
+        near: float | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How much of each pixel belongs to whom.
+
+        Args:
+            instances: As for `render`.
+            groups: Group of each instance, -1 for none.
+            camera: The camera, in the world of the picture.
+            ranks: How many groups to keep for each pixel.
+            near: As for `render`.
+
+        Returns:
+            Groups and shares, of `coverage.shares`. [H, W, ranks] each
+        """
+        with self._lock:
+            settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
+            labels = np.repeat(np.asarray(groups, np.int64), [instance.count for instance in instances])
+            return coverage.shares(self._pose(instances), labels, camera, ranks=ranks, settings=settings)
+
+    def _render(
+        self, instances: Sequence[Instance], camera: Camera, sky: Sky | None, near: float | None, distance: float
+    ) -> RenderOutput:
+        self.ms_motion = 0.0
+        settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
+        view = (
+            camera.width,
+            camera.height,
+            camera.intrinsics.tobytes(),
+            camera.T_cam_world.tobytes(),
+            settings,
+            distance,
+        )
+        behind = None if sky is None else (sky.scene, np.asarray(sky.matrix, np.float64).tobytes())
+        if any(one.holdout for one in instances):
+            self._shown = None
+            return self._render_all(instances, camera, sky, settings, distance)
+        shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
+        if shown != self._shown:
+            self._shown, self._backdrop, self._moving = shown, None, set()
+            self._places = [self._place(instance) for instance in instances]
+            return self._render_all(instances, camera, sky, settings, distance)
+        left = {i for i, one in enumerate(instances) if not np.array_equal(self._place(one), self._places[i])}
+        if not left <= self._moving:
+            self._moving |= left
+            self._backdrop = None
+        moving = [i for i in range(len(instances)) if i in self._moving]
+        still = [i for i in range(len(instances)) if i not in self._moving]
+        if not self._has_backdrop(instances, still, moving):
+            return self._render_all(instances, camera, sky, settings, distance)
+        if self._backdrop is None:
+            self._backdrop = self._make_backdrop(instances, still, camera, sky, settings, distance)
+        means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera, distance)
+        picture = self._backdrop.draw(
+            means, quats, scales, opacities, colors, labels=labels, ranks=_ranks(instances, moving)
+        )
+        depth = _mean(picture.image[..., 3], picture.alpha) if distance else picture.depth
+        return RenderOutput(picture.image[..., :3], picture.alpha, depth, None, picture.ids)
+
+    def _place(self, instance: Instance) -> np.ndarray:
+        """What of an instance changes as it moves: its matrix, that of its world, and its time where it bends. [33]"""
+        world = np.eye(4) if instance.world is None else instance.world
+        t = np.array([instance.t if posed_scene.bends(self._gathered, instance) else np.inf], np.float64)
+        return np.concatenate([np.ravel(instance.matrix), np.ravel(world), t]).astype(np.float64)
+
+    def _near(self, instances: Sequence[Instance]) -> float:
+        """The near plane of the scenes that have an instance, in the world of the picture."""
+        planes = {
+            self._scenes[one.scene].near_plane * _scale(one)
+            for one in instances
+            if 0 <= one.scene < len(self._scenes)  # who asks for another is refused later
+        }
+        return min((plane for plane in planes if plane > 0), default=NEAR_PLANE)
+
+    def _sky(self, sky: Sky | None, camera: Camera) -> torch.Tensor | None:
+        if sky is None:
+            return None
+        if not 0 <= sky.scene < len(self._scenes):
+            raise ValueError(f"sky: scene {sky.scene} of {len(self._scenes)} is not there")
+        scene, turned = self._scenes[sky.scene], scene_renderer.in_world_of(camera, sky.matrix)
+        return scene_renderer.tensor(scene_renderer.behind(scene, turned))
+
+    def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
+        if not backends.numba_is_there():
+            return False
+        moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
+        return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)
+
+    def _make_backdrop(
+        self,
+        instances: Sequence[Instance],
+        still: list[int],
+        camera: Camera,
+        sky: Sky | None,
+        settings: RasterSettings,
+        distance: float,
+    ):
+        from .static_layer import Backdrop
+
+        means, quats, scales, opacities, channels, labels = self._splats(instances, still, camera, distance)
+        background = self._sky(sky, camera)
+        if background is not None and distance:
+            background = torch.cat([background, torch.zeros_like(background[..., :1])], -1)
+        return Backdrop(
+            means, quats, scales, opacities, channels, camera, background,
+            labels=labels, ranks=_ranks(instances, still), settings=settings,
+        )  # fmt: skip
+
+    def _splats(
+        self, instances: Sequence[Instance], part: list[int], camera: Camera, distance: float
+    ) -> tuple[torch.Tensor, ...]:
+        """Means, quats, scales, opacities, channels and owners of some instances; channels are colours, and depths."""
+        posed = self._pose([instances[i] for i in part])
+        gaussians = scene_renderer.PosedGaussians(posed)
+        channels = scene_renderer.tensor(scene_renderer.colors(posed, camera))
+        if distance:
+            channels = torch.cat([channels, _depths(posed, camera, distance)], 1)
+        labels = torch.from_numpy(_owners(instances, part))
+        return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, channels, labels
+
+    def _render_all(
+        self,
+        instances: Sequence[Instance],
+        camera: Camera,
+        sky: Sky | None,
+        settings: RasterSettings,
+        distance: float,
+    ) -> RenderOutput:
+        posed = self._pose(instances)
+        gaussians = scene_renderer.PosedGaussians(posed)
+        gaussians.object_ids = torch.from_numpy(_owners(instances, range(len(instances))))
+        colors = scene_renderer.tensor(scene_renderer.colors(posed, camera))
+        held = torch.tensor([one.holdout for one in instances]) if any(one.holdout for one in instances) else None
+        features = _depths(posed, camera, distance) if distance or held is not None else None
+        if held is not None and features is not None:
+            hidden = held[gaussians.object_ids.long()][:, None]
+            colors, features = colors * ~hidden, torch.cat([features * ~hidden, hidden], 1)
+        with torch.no_grad():
+            found = rasterize(
+                gaussians,
+                camera,
+                features,
+                background=self._sky(sky, camera),
+                colors=colors,
+                settings=settings,
+            )
+        if found.features is None or features is None:
+            return found
+        alpha, ids, holdout = found.alpha, found.ids, None
+        if held is not None and ids is not None:
+            holdout = found.features[..., 1]
+            alpha, ids = (alpha - holdout).clamp_min(0), torch.where((ids >= 0) & held[ids.long()], -1, ids)
+        depth = _mean(found.features[..., 0], alpha)
+        return RenderOutput(found.color, alpha, depth, None, ids, holdout)
+
+    def _pose(self, instances: Sequence[Instance]) -> scene_renderer.PosedScene:
+        start = time.perf_counter()
+        posed = scene_renderer.pose_instances(self._gathered, instances)
+        self.ms_motion += 1e3 * (time.perf_counter() - start)
+        return posed
+
+
+def _depths(posed: scene_renderer.PosedScene, camera: Camera, distance: float) -> torch.Tensor:
+    """Depths of centres beyond a distance, computed in float64. [N, 1] float32"""
+    depths = (posed.means + posed.origin) @ camera.T_cam_world[2, :3] + (camera.T_cam_world[2, 3] - distance)
+    return scene_renderer.tensor(depths[:, None])
+
+
+def _mean(blended: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+    """What was blended without a background, per alpha; 0 where that is 0. [H, W]"""
+    return torch.where(alpha > 0, blended / torch.where(alpha > 0, alpha, 1), 0)
+
+
+def _look(instance: Instance) -> tuple | None:
+    return None if instance.tint is None else tuple(instance.tint)
+
+
+def _scale(instance: Instance) -> float:
+    """How many units of the picture's world one of the scene's own is, over all directions; NaN where that is none."""
+    if instance.world is None:
+        return 1.0
+    return float(abs(np.linalg.det(np.asarray(instance.world, np.float64)[:3, :3])) ** (1 / 3))
+
+
+def _owners(instances: Sequence[Instance], part: Sequence[int]) -> np.ndarray:
+    """Which instance each Gaussian of some instances belongs to. [n] int32"""
+    return np.repeat(np.asarray(part, np.int32), [instances[i].count for i in part])
+
+
+def _ranks(instances: Sequence[Instance], part: list[int]) -> np.ndarray:
+    """Place of each Gaussian of some instances among those of all. [n]"""
+    starts = np.cumsum([0, *(instance.count for instance in instances)])
+    return np.concatenate([np.arange(starts[i], starts[i + 1]) for i in part] or [np.arange(0)])

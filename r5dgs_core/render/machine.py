@@ -1,0 +1,47 @@
+"""What times, and in the last bits numbers, depend on: versions and the machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from .. import __version__
+from ..raster.cpu import compilation
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result may depend on."""
+    import numba
+    import OpenImageIO as oiio
+
+    return {
+        "r5dgs": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+        "openimageio": oiio.VERSION_STRING,
+    }
+
+
+def describe() -> dict[str, Any]:
+    """What a run's times, and in the last bits its numbers, depend on beside the versions."""
+    processor = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+        processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), processor)
+    except OSError:
+        pass  # another system
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "system": platform.platform(),
+        "processor": processor,
+        "cores": usable,
+        "raster_threads": compilation.threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+    }

@@ -1,0 +1,336 @@
+"""Gaussians in the pose of a picture: a frame of playback, or ranges of scenes' Gaussians, each moved by a matrix."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..motion import quaternion_columns, rotations
+from ..playback import affine_transform, posing, scene_player
+from ..playback.residuals import Residuals
+from ..scene.scene import Scene
+
+MANY = 16  # stretches that are worth gathering their rows
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A range of a scene's Gaussians somewhere else than in its bind state.
+
+    Attributes:
+        start: First row.
+        count: Number of rows.
+        matrix: Affine map from the bind state to the world of the picture. [4, 4]
+        scene: Which of several scenes.
+        world: Map from that scene's own world, in which its light stands, to the world of the picture; None where they
+            are the same. [4, 4]
+        tint: Factors >= 0 on the display-referred red, green and blue; None for 1.
+        t: Scene time at which Gaussians with residuals are bent, before the matrix moves them; None for not at all.
+        holdout: True if the Gaussians cut a hole into the picture instead of being visible.
+    """
+
+    start: int
+    count: int
+    matrix: np.ndarray
+    scene: int = 0
+    world: np.ndarray | None = None
+    tint: tuple[float, float, float] | None = None
+    t: float | None = None
+    holdout: bool = False
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The Gaussians of several scenes one after the other, as one set of arrays. S scenes.
+
+    Attributes:
+        means, quats, log_scales, opacity_logits, object_ids: As in `Scene`.
+        sh: Of the largest degree, zero where a scene's is smaller. [N, K, 3]
+        starts: First row of each scene, and N. [S + 1]
+        shading: As in `Scene`, zero for scenes without; None where no scene has it. [N, 3]
+        shading_rest: Factor in the bind state, not bounded. [N]
+        lights: The scenes' light directions, None for those without shading.
+        residuals: Gives what the scenes' residuals say; made when it is first asked for.
+        harmonics_turn: As in `Scene`.
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    object_ids: np.ndarray
+    sh: np.ndarray
+    starts: tuple[int, ...]
+    shading: np.ndarray | None
+    shading_rest: np.ndarray | None
+    lights: tuple[np.ndarray | None, ...]
+    residuals: tuple[Callable[[], Residuals], ...]
+    harmonics_turn: tuple[bool, ...]
+
+
+def gather(scenes: Sequence[Scene]) -> Gathered:
+    """The Gaussians of scenes as one set; of one scene, or none, nothing is copied."""
+    lit = [scene.shading is not None and scene.light_direction is not None for scene in scenes]
+    bases = max((scene.sh.shape[1] for scene in scenes), default=1)
+
+    def stacked(arrays: list[np.ndarray], shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        return arrays[0] if len(arrays) == 1 else np.concatenate([np.empty((0, *shape), dtype), *arrays])
+
+    def padded(sh: np.ndarray) -> np.ndarray:
+        return sh if sh.shape[1] == bases else np.pad(sh, ((0, 0), (0, bases - sh.shape[1]), (0, 0)))
+
+    def vectors(scene: Scene) -> np.ndarray:
+        return scene.shading if scene.shading is not None else np.zeros((len(scene.means), 3), np.float32)
+
+    def rest(scene: Scene, shaded: bool) -> np.ndarray:
+        return scene_player.rest_factors(scene) if shaded else np.ones(len(scene.means), np.float32)
+
+    return Gathered(
+        means=stacked([scene.means for scene in scenes], (3,)),
+        quats=stacked([scene.quats for scene in scenes], (4,)),
+        log_scales=stacked([scene.log_scales for scene in scenes], (3,)),
+        opacity_logits=stacked([scene.opacity_logits for scene in scenes], ()),
+        object_ids=stacked([scene.object_ids for scene in scenes], (), np.int32),
+        sh=stacked([padded(scene.sh) for scene in scenes], (bases, 3)),
+        starts=(0, *(int(stop) for stop in np.cumsum([len(scene.means) for scene in scenes]))),
+        shading=stacked([vectors(scene) for scene in scenes], (3,)) if any(lit) else None,
+        shading_rest=stacked([rest(*pair) for pair in zip(scenes, lit, strict=True)], ()) if any(lit) else None,
+        lights=tuple(
+            np.asarray(scene.light_direction, np.float64) if shaded else None
+            for scene, shaded in zip(scenes, lit, strict=True)
+        ),
+        residuals=tuple(functools.cache(functools.partial(Residuals, scene)) for scene in scenes),
+        harmonics_turn=tuple(scene.harmonics_turn for scene in scenes),
+    )
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """Gaussians in the world, with what their colour needs of the bind state. P poses.
+
+    Attributes:
+        means: Centres, world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: Logarithms of the standard deviations. [N, 3] float32
+        opacity_logits: Before the sigmoid. [N] float32
+        sh: Spherical harmonics in the bind frame. [N, K, 3] float32
+        object_ids: [N] int32
+        view_maps: Linear maps that bring world directions into the bind frame, up to length. [P, 3, 3]
+        pose_ids: Pose of each Gaussian, a row of ``view_maps``. [N] int64
+        shading_factor: Factor on the colour, or None. [N] float32
+        origin: Point of the world that ``means`` are relative to. [3] float64
+        tints: Factors on red, green and blue of each pose, or None. [P, 3] float32
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    object_ids: np.ndarray
+    view_maps: np.ndarray
+    pose_ids: np.ndarray
+    shading_factor: np.ndarray | None
+    origin: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    tints: np.ndarray | None = None
+
+
+def pose_frame(scene: Scene, frame: scene_player.Frame) -> PosedScene:
+    """The Gaussians of a frame of `scene_player`."""
+    view_maps, pose_ids = scene_player.sh_rotations(frame.group_quats), frame.motion_ids.astype(np.int64)
+    if frame.turned_rows is not None and frame.turned_quats is not None and frame.sh.shape[1] > 1:
+        pose_ids[frame.turned_rows] = len(view_maps) + np.arange(len(frame.turned_rows))
+        view_maps = np.concatenate([view_maps, scene_player.sh_rotations(frame.turned_quats)])
+    return PosedScene(
+        means=frame.means,
+        quats=frame.quats,
+        log_scales=frame.log_scales,
+        opacity_logits=frame.opacity_logits,
+        sh=frame.sh,
+        object_ids=frame.object_ids,
+        view_maps=view_maps,
+        pose_ids=pose_ids,
+        shading_factor=frame.shading_factor,
+        origin=frame.origin,
+    )
+
+
+def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> PosedScene:
+    """Ranges of the Gaussians of a scene or of several, each moved by a matrix of its own.
+
+    A range may appear several times, or not at all. Rotation, translation and uniform scale are exact in every respect;
+    under any other linear map the ellipsoids are still mapped exactly and the viewing direction is brought back by the
+    inverse. Shading turns with the rotation that is nearest to the map, seen from the scene's own world.
+
+    Args:
+        scene: The scene, or several that were gathered.
+        instances: Ranges and their maps.
+
+    Returns:
+        The Gaussians, in the order of ``instances``.
+
+    Raises:
+        ValueError: A range leaves its scene, a matrix flattens space or is not finite, or a tint is negative.
+    """
+    given = scene if isinstance(scene, Gathered) else gather([scene])
+    ranges = [_rows(given, index, instance) for index, instance in enumerate(instances)]
+    total = sum(instance.count for instance in instances)
+    means, quats, log_scales = (np.empty((total, width), np.float32) for width in (3, 4, 3))
+    shading, pose_ids = np.ones(total, np.float32), np.empty(total, np.int64)
+    view_maps, tints, poses, filled = [np.eye(3)[None]], [np.ones((1, 3))], 1, 0
+    for index, part in _parts(instances, ranges):
+        instance = instances[index]
+        linear, offset = affine(instance.matrix, index)
+        to = slice(filled, filled + (part.stop - part.start if isinstance(part, slice) else len(part)))
+        scene_player.move_points(given.means[part], linear, offset, means[to])
+        affine_transform.map_shapes(linear, given.quats[part], given.log_scales[part], quats[to], log_scales[to])
+        light = given.lights[instance.scene]
+        world = None if instance.world is None else affine(instance.world, index)[0]
+        rotation = np.eye(3) if light is None else affine_transform.nearest_rotation(linear)
+        if light is not None and world is not None:
+            rotation = affine_transform.nearest_rotation(world).T @ rotation
+        shading[to] = _shading(given, part, rotation, light)
+        pose_ids[to] = poses
+        maps = np.linalg.inv(linear)[None]
+        bent = _bent(given, instance, part)
+        if bent is not None:
+            rows, at = bent.rows, filled + bent.places
+            means[at] = (given.means[rows] + bent.offsets) @ linear.T + offset
+            shapes = np.empty((len(at), 4), np.float32), np.empty((len(at), 3), np.float32)
+            affine_transform.map_shapes(linear, bent.quats, given.log_scales[rows] + bent.growths, *shapes)
+            quats[at], log_scales[at] = shapes
+            turns = rotations.quats_to_rotmats(bent.turns)
+            shading[at] = _shading(given, rows, rotation @ turns, light)
+            if given.harmonics_turn[instance.scene] and given.sh.shape[1] > 1:
+                pose_ids[at] = poses + 1 + np.arange(len(at))
+                maps = np.concatenate([maps, np.swapaxes(turns, -1, -2) @ maps])
+        view_maps.append(maps)
+        tints.append(np.broadcast_to(_tint(instance, index), (len(maps), 3)))
+        poses, filled = poses + len(maps), to.stop
+    return PosedScene(
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        opacity_logits=_take(given.opacity_logits, ranges),
+        sh=_take(given.sh, ranges),
+        object_ids=_take(given.object_ids, ranges),
+        view_maps=np.concatenate(view_maps),
+        pose_ids=pose_ids,
+        shading_factor=shading if given.shading is not None else None,
+        tints=None if all(one.tint is None for one in instances) else np.concatenate(tints).astype(np.float32),
+    )
+
+
+@dataclass(frozen=True)
+class _Bent:
+    """Gaussians that have left their group's motion, in the bind state: rows among those gathered [R], places among
+    the part's [R], offsets [R, 3], rotations unit wxyz [R, 4], the turns that led there [R, 4], and growths of log
+    scales [R, 3]."""
+
+    rows: np.ndarray
+    places: np.ndarray
+    offsets: np.ndarray
+    quats: np.ndarray
+    turns: np.ndarray
+    growths: np.ndarray
+
+
+def bends(given: Gathered, instance: Instance) -> bool:
+    """Whether an instance has Gaussians that may be bent."""
+    if instance.t is None or not 0 <= instance.scene < len(given.residuals):
+        return False
+    rows = given.residuals[instance.scene]().rows
+    return bool(np.searchsorted(rows, instance.start) < np.searchsorted(rows, instance.start + instance.count))
+
+
+def _bent(given: Gathered, instance: Instance, part: slice | np.ndarray) -> _Bent | None:
+    if instance.t is None:
+        return None
+    residuals = given.residuals[instance.scene]()
+    found, known = residuals.at(float(instance.t)), given.starts[instance.scene] + residuals.rows
+    if found is None:
+        return None
+    if isinstance(part, slice):
+        which = np.arange(*np.searchsorted(known, (part.start, part.stop)))
+        places = known[which] - part.start
+    else:
+        near = np.minimum(np.searchsorted(known, part), len(known) - 1)
+        places = np.flatnonzero(known[near] == part)
+        which = near[places]
+    if len(which) == 0:
+        return None
+    offsets, turns, growths = (values[:, which] for values in found)
+    turned = quaternion_columns.multiply(turns.astype(np.float32), residuals.bind_quats[:, which])
+    return _Bent(known[which], places, offsets.T, np.ascontiguousarray(turned.T), turns.T, growths.T)
+
+
+def _parts(
+    instances: Sequence[Instance], ranges: Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, slice | np.ndarray]]:
+    """What is moved in one go: the first instance of each part, and the part's rows among those gathered.
+
+    A part is one instance, but for many stretches one after the other that share everything else, as they are left of a
+    cloud of which points were deleted.
+    """
+    keys = [(one.scene, np.asarray(one.matrix).tobytes(), _bytes(one.world), one.tint, one.t) for one in instances]
+    index = 0
+    for _, same in itertools.groupby(keys):
+        count = len(list(same))
+        if count < MANY:
+            yield from ((i, slice(*ranges[i])) for i in range(index, index + count))
+        else:
+            yield index, np.concatenate([np.arange(*ranges[i]) for i in range(index, index + count)])
+        index += count
+
+
+def _bytes(matrix: np.ndarray | None) -> bytes:
+    return b"" if matrix is None else np.asarray(matrix).tobytes()
+
+
+def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Linear part and translation of a [4, 4] matrix that can be undone."""
+    try:
+        return affine_transform.affine(matrix)
+    except ValueError as error:
+        raise ValueError(f"instance {index}: {error}; hide the object instead") from error
+
+
+def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
+    """First row of an instance among those gathered, and the one past its last."""
+    if not 0 <= instance.scene < len(given.starts) - 1:
+        raise ValueError(f"instance {index}: scene {instance.scene} of {len(given.starts) - 1} is not there")
+    first, end = given.starts[instance.scene : instance.scene + 2]
+    start, stop = instance.start, instance.start + instance.count
+    if not 0 <= start <= stop <= end - first:
+        raise ValueError(f"instance {index}: rows {start}:{stop} leave the scene's {end - first} Gaussians")
+    return first + start, first + stop
+
+
+def _tint(instance: Instance, index: int) -> np.ndarray:
+    """Factors on the colours of an instance. [3]"""
+    if instance.tint is None:
+        return np.ones(3)
+    tint = np.asarray(instance.tint, np.float64)
+    if tint.shape != (3,) or not np.isfinite(tint).all() or (tint < 0).any():
+        raise ValueError(f"instance {index}: expected a tint of three factors >= 0, got {instance.tint!r}")
+    return tint
+
+
+def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Rows of ranges, one after the other; the array itself where they are all of it in order."""
+    edges = [0, *(edge for start, stop in ranges for edge in (start, stop)), len(array)]
+    if all(before == after for before, after in zip(edges[::2], edges[1::2], strict=True)):
+        return array
+    return np.concatenate([array[:0], *(array[start:stop] for start, stop in ranges)])
+
+
+def _shading(given: Gathered, rows: slice | np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
+    """Shading factors of rows that have turned under a light, all alike or each. [3, 3] or [n, 3, 3] -> [n] float32"""
+    if given.shading is None or given.shading_rest is None or light is None:
+        return np.ones(len(given.means[rows]), np.float32)
+    return posing.lit(given.shading_rest[rows], given.shading[rows], light, turns)

@@ -1,0 +1,151 @@
+"""A posed scene to a picture: the one place where evaluation, the worker and export turn Gaussians of a `Scene` into
+pixels.
+
+Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times max(0, shading factor) as in training, with d the viewing
+direction in the world and A the map that brought the Gaussian from its bind state; times a tint where it has one.
+Behind everything lies the scene's sky, the spherical harmonics `Scene.background_sh` along each pixel's ray, within
+[0, 1] as in training.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..playback import scene_player
+from ..raster import RasterSettings, RenderOutput, rasterize, shade
+from ..scene import cameras, sh_color
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import posed_scene
+from .posed_scene import Gathered, Instance, PosedScene, gather, pose_frame, pose_instances
+
+__all__ = (
+    "Gathered", "Instance", "PosedGaussians", "PosedScene", "behind", "colors", "gather", "in_world_of", "pose_frame",
+    "pose_instances", "render_frame", "sky", "tensor", "to_numpy",
+)  # fmt: skip
+
+
+def render_frame(
+    scene: Scene,
+    pose: scene_player.Frame | PosedScene,
+    camera: Camera,
+    *,
+    background: str | np.ndarray | None = "scene",
+    backend: str = "auto",
+    features: np.ndarray | None = None,
+    settings: RasterSettings | None = None,
+) -> RenderOutput:
+    """Render a scene in a pose.
+
+    Args:
+        scene: The scene; its sky is the background.
+        pose: A frame of `scene_player`, or what `pose_frame` and `pose_instances` give.
+        camera: The camera, in the scene's world.
+        background: "scene" for the sky, None for black, or a colour [3] or image [H, W, 3].
+        backend: Rasterizer: "auto", "cpu", "cuda" or "reference".
+        features: More channels to blend beside the colour. [N, F]
+        settings: Of the rasterizer; the defaults with the scene's near plane where None.
+
+    Returns:
+        Colour (not clamped at 1), alpha, depth, features and object ids, tensors without gradient.
+    """
+    posed = pose_frame(scene, pose) if isinstance(pose, scene_player.Frame) else pose
+    if isinstance(background, str):
+        if background != "scene":
+            raise ValueError(f"background: expected 'scene', None or an array, got {background!r}")
+        background = behind(scene, camera)
+    with torch.no_grad():
+        return rasterize(
+            PosedGaussians(posed),
+            cameras.moved(camera, -posed.origin),
+            None if features is None else torch.from_numpy(np.ascontiguousarray(features, np.float32)),
+            None if background is None else tensor(background),
+            colors=tensor(colors(posed, camera)),
+            settings=settings or RasterSettings(near_plane=scene.near_plane),
+            backend=backend,
+        )
+
+
+def sky(scene: Scene, camera: Camera) -> np.ndarray:
+    """The scene's background as this camera sees it, display-referred sRGB. [H, W, 3] float32"""
+    return shade.sky(scene.background_sh, camera)
+
+
+def in_world_of(camera: Camera, matrix: np.ndarray) -> Camera:
+    """A camera whose rays have the directions that another's have in a world that a map brings to that other's.
+
+    Args:
+        camera: The camera.
+        matrix: Affine map to the camera's world; what it shifts has no part in directions. [4, 4]
+
+    Returns:
+        A camera for `sky`, and for nothing else: it is rigid only where the map turns alone.
+
+    Raises:
+        ValueError: The matrix flattens space or is not finite.
+    """
+    linear, _ = posed_scene.affine(matrix, 0)
+    T_cam_world = np.eye(4)
+    T_cam_world[:3, :3] = camera.T_cam_world[:3, :3] @ np.linalg.inv(linear).T
+    return dataclasses.replace(camera, T_cam_world=T_cam_world)
+
+
+def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
+    """Display-referred colour of every Gaussian as this camera sees it, >= 0. [N, 3] float32"""
+    factor = posed.shading_factor
+    if posed.sh.shape[1] == 1:
+        rgb = np.maximum(sh_color.dc_to_rgb(np.asarray(posed.sh[:, 0], np.float32)), 0)
+        if factor is not None:
+            for channel in range(3):  # a column at a time: numpy is slow at rows of three
+                rgb[:, channel] *= factor
+    else:
+        with torch.no_grad():
+            rgb = shade.seen_colors(
+                tensor(posed.means),
+                tensor(posed.sh),
+                camera.center - posed.origin,
+                view_maps=posed.view_maps,
+                pose_ids=posed.pose_ids,
+                factor=None if factor is None else tensor(factor),
+            ).numpy()
+    if posed.tints is not None:  # >= 0: the same as on the harmonics, t (0.5 + SH), before the bound at 0
+        for channel in range(3):
+            rgb[:, channel] *= posed.tints[:, channel][posed.pose_ids]
+    return rgb
+
+
+def behind(scene: Scene, camera: Camera) -> np.ndarray:
+    """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
+    image = sky(scene, camera)
+    return image[0, 0] if len(scene.background_sh) == 1 else image
+
+
+def to_numpy(value: Any, dtype: type) -> np.ndarray:
+    """A tensor of a `RenderOutput` as an array on the host."""
+    return value.detach().cpu().numpy().astype(dtype, copy=False)
+
+
+class PosedGaussians:
+    """What the rasterizer reads of a posed scene, beside its colours.
+
+    numpy computes it, like everything else of a frame before the kernels: torch would wake its threads for that, and
+    they get in the way of ours.
+    """
+
+    def __init__(self, posed: PosedScene):
+        self.means = tensor(posed.means)
+        self.quats = tensor(posed.quats)
+        self.scales = tensor(np.exp(posed.log_scales))
+        with np.errstate(over="ignore"):
+            self.opacities = tensor(1 / (1 + np.exp(-posed.opacity_logits)))
+        self.object_ids = torch.from_numpy(np.ascontiguousarray(posed.object_ids))
+
+
+def tensor(array: np.ndarray) -> torch.Tensor:
+    """A float32 tensor of an array, which stays as it is."""
+    array = np.ascontiguousarray(array, np.float32)
+    return torch.from_numpy(array if array.flags.writeable else array.copy())

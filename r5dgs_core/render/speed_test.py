@@ -1,0 +1,70 @@
+"""How fast this machine draws: one made picture, timed."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..raster import backends, rasterize_splats
+from ..scene.cameras import Camera
+from . import warm_up
+
+GAUSSIANS = 20_000
+SIZE = 400
+REPEATS = 7
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of it.
+
+    Attributes:
+        milliseconds: Median of a few pictures.
+        gaussians: Number of Gaussians.
+        size: Width and height in pixels.
+        device: What drew them.
+    """
+
+    milliseconds: float
+    gaussians: int
+    size: tuple[int, int]
+    device: str
+
+
+def run() -> Trial:
+    """Draw a ball of Gaussians a few times, after the kernels are ready. Raises BackendError without a rasterizer."""
+    random = np.random.default_rng(0)
+    directions = random.normal(size=(GAUSSIANS, 3))
+    means = (
+        directions / np.linalg.norm(directions, axis=1, keepdims=True) * np.cbrt(random.uniform(size=(GAUSSIANS, 1)))
+    )
+    scales = 0.015 * np.exp(0.5 * random.normal(size=(GAUSSIANS, 3)))
+    quats, colors = (random.uniform(0.1, 0.9, (GAUSSIANS, width)) for width in (4, 3))
+    places, axes, turns, values = (torch.from_numpy(a.astype(np.float32)) for a in (means, scales, quats, colors))
+    opacities = torch.from_numpy(random.uniform(0.1, 0.9, GAUSSIANS).astype(np.float32))
+    T_cam_world = np.eye(4)
+    T_cam_world[2, 3] = 3.0
+    half = SIZE / 2
+    camera = Camera(SIZE, SIZE, np.array([[2.2 * half, 0, half], [0, 2.2 * half, half], [0, 0, 1]]), T_cam_world)
+    if backends.numba_is_there():
+        warm_up.warm_up(gradients=False)
+    milliseconds = []
+    with torch.no_grad():
+        for _ in range(REPEATS):
+            start = time.perf_counter()
+            rasterize_splats(places, turns, axes, opacities, values, camera)
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+    return Trial(statistics.median(milliseconds), GAUSSIANS, (SIZE, SIZE), _device())
+
+
+def _device() -> str:
+    if not backends.numba_is_there():
+        return "CPU without kernels"
+    from ..raster.cpu import compilation
+
+    count = compilation.threads()
+    return f"CPU, {count} threads" if count > 1 else "CPU, 1 thread"

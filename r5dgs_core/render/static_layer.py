@@ -1,0 +1,194 @@
+"""What stands still before a camera that does: rasterized once, while what moves is drawn into it frame by frame.
+
+A tile that nothing moving touches is the same in every frame, and is copied. In the others the two lists of Gaussians,
+each sorted once, are merged by depth and blended anew. The result is that of rasterizing everything, to the bit, in
+whatever order of depth the parts lie; what is saved is all work on still Gaussians but that.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import torch
+
+from ..raster import backends, rasterizer
+from ..raster.cpu import blend, cpu_backend, projection
+from ..raster.cpu import tiles as cpu_tiles
+from ..raster.cpu.compilation import run
+from ..raster.settings import RasterSettings, SplatImage
+from ..scene.cameras import Camera
+
+_NOTHING = np.empty((0, 0), np.float32)
+
+
+class Backdrop:
+    """Gaussians that stand still, drawn once for one camera by the backend `cpu_backend`, without gradients.
+
+    Args:
+        means, quats, scales, opacities, channels, camera, background: As for `rasterize_splats`; copied.
+        labels: As there; for both parts or for neither. [N]
+        ranks: Place of each Gaussian among all, rising, which decides at equal depths; before all that moves where
+            None. [N]
+        settings: As there.
+
+    Raises:
+        ValueError, BackendError: As `rasterize_splats` does.
+    """
+
+    def __init__(
+        self,
+        means: torch.Tensor,  # [N, 3]
+        quats: torch.Tensor,  # [N, 4]
+        scales: torch.Tensor,  # [N, 3]
+        opacities: torch.Tensor,  # [N]
+        channels: torch.Tensor,  # [N, D]
+        camera: Camera,
+        background: torch.Tensor | None = None,  # [D] or [H, W, D]
+        *,
+        labels: torch.Tensor | None = None,  # [N]
+        ranks: np.ndarray | None = None,  # [N]
+        settings: RasterSettings | None = None,
+    ):
+        rasterizer.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
+        backends.choose_backend("cpu", means)
+        settings = settings or RasterSettings()
+        self._lock = threading.Lock()
+        self._camera = camera
+        self._view, self._limits = cpu_backend.pack_view(camera, settings), cpu_backend.pack_limits(settings)
+        self._background = cpu_backend.pack_background(background, channels.shape[1]).copy()
+        # Rows of the tables: first what is still, padded, then what moves.
+        n, rows = len(means), projection.padded_rows(len(means))
+        self._count = self._end = rows
+        self._geometry = cpu_backend.aligned((rows, projection.GEOMETRY), np.float64)
+        self._depths, self._boxes, self._radii = np.empty(rows), np.empty(rows), np.empty(rows, np.float32)
+        self._channels = np.zeros((rows, channels.shape[1]), np.float32)
+        self._channels[:n] = cpu_backend.to_array(channels)
+        self._ranks = np.zeros(rows, np.int64)
+        self._ranks[:n] = np.arange(n) - n if ranks is None else ranks
+        self._labels = None
+        if labels is not None:
+            self._labels = np.full(rows, -1, np.int64)
+            self._labels[:n] = cpu_backend.to_numbers(labels)
+        shapes = [cpu_backend.to_array(t) for t in (means, quats, scales, opacities)]
+        cpu_backend.project(self._view, shapes, self._geometry, self._depths, self._boxes, self._radii)
+        self._starts, self._rows = self._assign(0, rows)
+        self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+        size = (camera.height, camera.width)
+        self._image = np.empty((*size, channels.shape[1]), np.float32)
+        self._alpha, self._depth = np.empty(size, np.float32), np.empty(size, np.float32)
+        self._ids = np.full(size if labels is not None else (0, 0), -1, np.int32)
+        everywhere = np.arange(len(self._starts) - 1)
+        self._blend(everywhere, self._starts, self._rows, (self._image, self._alpha, self._depth, self._ids))
+
+    def draw(
+        self,
+        means: torch.Tensor,  # [M, 3]
+        quats: torch.Tensor,  # [M, 4]
+        scales: torch.Tensor,  # [M, 3]
+        opacities: torch.Tensor,  # [M]
+        channels: torch.Tensor,  # [M, D]
+        labels: torch.Tensor | None = None,  # [M]
+        ranks: np.ndarray | None = None,  # [M]
+    ) -> SplatImage:
+        """Draw what moves into what stands still; from several threads one call waits for the other.
+
+        Args:
+            means, quats, scales, opacities, channels: As for `rasterize_splats`.
+            labels: As there; only, and always, where the backdrop has labels. [M]
+            ranks: Place of each Gaussian among all, rising; after all that stands still where None. [M]
+
+        Returns:
+            What `rasterize_splats` gives for all Gaussians in the order of their ranks, without gradients.
+
+        Raises:
+            ValueError, BackendError: As `rasterize_splats` does; the backdrop stays as it was.
+        """
+        rasterizer.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
+        backends.choose_backend("cpu", means)
+        expected = self._channels.shape[1]
+        if channels.shape[1] != expected:
+            raise ValueError(f"channels: expected {expected} as in the backdrop, got {channels.shape[1]}")
+        if (labels is None) != (self._labels is None):
+            raise ValueError("labels: expected for the backdrop and for what moves, or for neither")
+        numbers = None if labels is None else cpu_backend.to_numbers(labels)
+        shapes = [cpu_backend.to_array(t) for t in (means, quats, scales, opacities)]
+        with self._lock:
+            self._place(
+                shapes, cpu_backend.to_array(channels), numbers, np.arange(len(means)) if ranks is None else ranks
+            )
+            moving_starts, moving_rows = self._assign(self._count, self._end)
+            touched = np.flatnonzero(np.diff(moving_starts))
+            starts, merged = self._merge(touched, moving_starts, moving_rows)
+            results = tuple(array.copy() for array in (self._image, self._alpha, self._depth, self._ids))
+            self._blend(touched, starts, merged, results)
+        image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
+        return SplatImage(image, alpha, depth, None if labels is None else ids)
+
+    def _place(self, shapes, channels, numbers, ranks) -> None:
+        """Put what moves behind what is still in the tables."""
+        begin, n = self._count, len(channels)
+        self._end = begin + projection.padded_rows(n)
+        if self._end > len(self._geometry):
+            self._make_room()
+        part = slice(begin, self._end)
+        cpu_backend.project(
+            self._view, shapes, self._geometry[part], self._depths[part], self._boxes[part], self._radii[part]
+        )  # fmt: skip
+        self._channels[begin : begin + n] = channels
+        self._ranks[begin : begin + n] = ranks
+        if self._labels is not None and not np.array_equal(self._labels[begin : begin + n], numbers):
+            self._labels[begin : begin + n] = numbers
+            self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+
+    def _make_room(self) -> None:
+        """Let the tables have rows up to the end."""
+
+        def longer(table, fill):
+            result = np.full((self._end, *table.shape[1:]), fill, table.dtype)
+            result[: self._count] = table[: self._count]
+            return result
+
+        geometry = cpu_backend.aligned((self._end, projection.GEOMETRY), np.float64)
+        geometry[: self._count] = self._geometry[: self._count]
+        self._geometry = geometry
+        self._depths, self._boxes = longer(self._depths, 1.0), longer(self._boxes, 0.0)
+        self._radii, self._channels = longer(self._radii, 0), longer(self._channels, 0)
+        self._ranks = longer(self._ranks, 0)
+        if self._labels is not None:
+            self._labels = longer(self._labels, -1)
+            self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+
+    def _assign(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of some rows: where those of each tile begin, and the rows."""
+        order = cpu_tiles.sort_by_depth(self._depths[begin:end], self._radii[begin:end]) + np.int32(begin)
+        starts, rows, _, _ = cpu_tiles.assign_tiles(
+            order, self._boxes, self._geometry, self._camera.width, self._camera.height, False
+        )
+        return starts, rows
+
+    def _merge(self, tiles, moving_starts, moving_rows):
+        """Pairs of some tiles, still and moving ones: where those of each tile begin, and the rows."""
+        still = np.stack([self._starts[tiles], self._starts[tiles + 1]], 1)
+        moving = np.stack([moving_starts[tiles], moving_starts[tiles + 1]], 1)
+        starts = np.zeros(len(tiles) + 1, np.int64)
+        np.cumsum(still[:, 1] - still[:, 0] + moving[:, 1] - moving[:, 0], out=starts[1:])
+        merged = np.empty(starts[-1], np.int32)
+        run(
+            cpu_tiles.merge_pairs, len(tiles) // 8,
+            self._depths, self._ranks, still, self._rows, moving, moving_rows, starts, merged,
+        )  # fmt: skip
+        return starts, merged
+
+    def _blend(self, tiles, starts, rows, results) -> None:
+        image, alpha, depth, ids = results
+        run(
+            blend.blend, len(tiles) // 2,
+            tiles, starts, rows, self._geometry, self._channels, self._depths, self._votes, self._names,
+            self._background, self._limits, image, alpha, depth, _NOTHING, _NOTHING, ids,
+            np.empty(len(tiles), np.int64), np.empty(len(rows), np.uint64),
+        )  # fmt: skip
+
+
+def _tensor(numbers: np.ndarray | None) -> torch.Tensor | None:
+    return None if numbers is None else torch.from_numpy(numbers)

@@ -1,0 +1,154 @@
+"""Where to look at a scene from, and when: one of its cameras, chosen by name, by number or by what it sees.
+
+What a camera sees is counted in small pictures, as shares of the picture, so that the size of images has no part in it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from .. import errors
+from ..playback import scene_player
+from ..scene import cameras as axes
+from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import scene_renderer
+
+LOOK = 160  # longest side of the small pictures, pixels
+MOST_CAMERAS = 16  # that are tried
+NOTICED = 5e-4  # share of the picture from which on an object is seen
+
+Item = TypeVar("Item")
+
+
+@dataclasses.dataclass(frozen=True)
+class Standpoint:
+    """A camera at a time.
+
+    Attributes:
+        camera: The camera, in the scene's world.
+        t: Scene time.
+    """
+
+    camera: Camera
+    t: float
+
+
+def named(scene: Scene, which: str) -> Camera:
+    """The camera of a scene with a name, or else with a number that counts from 0.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    for camera in scene.cameras:
+        if camera.name == which:
+            return camera
+    if which.isdecimal() and int(which) < len(scene.cameras):
+        return scene.cameras[int(which)]
+    if not scene.cameras:
+        raise errors.ConfigError(f"--camera {which}: {scene.name} stores no cameras; leave it out for an overview")
+    shown = ", ".join(camera.name for camera in scene.cameras[:8])
+    more = ", ..." if len(scene.cameras) > 8 else ""
+    last = len(scene.cameras) - 1
+    raise errors.ConfigError(f"--camera {which}: expected 0 to {last}, or a name of a camera: {shown}{more}")
+
+
+def candidates(scene: Scene, camera: str | None = None, t: float | None = None) -> list[Standpoint]:
+    """Standpoints to choose among.
+
+    Args:
+        scene: The scene.
+        camera: Name or number of the camera; some that are spread over all where None.
+        t: Scene time; the first, middle and last observed one where None.
+
+    Raises:
+        ConfigError: There is no such camera, or the time is not a number.
+    """
+    if t is not None and not np.isfinite(t):
+        raise errors.ConfigError(f"--time {t}: expected a number, in the scene's time (t_max is {scene.t_max:g})")
+    if camera is not None:
+        some = [named(scene, camera)]
+    elif scene.cameras:
+        some = spread(scene.cameras, MOST_CAMERAS)
+    else:
+        some = [overview(scene)]
+    first = float(scene.track_times[0])
+    times = np.unique([scene.t_max, 0.5 * (first + scene.t_max), first])[::-1].tolist() if t is None else [float(t)]
+    return [Standpoint(view, when) for when in times for view in some]
+
+
+def best(
+    scene: Scene,
+    among: Sequence[Standpoint],
+    object_ids: Collection[int],
+    mode: str = "rigid",
+    *,
+    backend: str = "auto",
+) -> Standpoint:
+    """The standpoint that sees most of some objects: as many of them as there can be, then large and uncut.
+
+    Args:
+        scene: The scene.
+        among: The standpoints, the first of equal ones is taken; at least one.
+        object_ids: The objects.
+        mode: Way to move past t_max.
+        backend: Rasterizer.
+    """
+    if len(among) == 1:
+        return among[0]
+    player = scene_player.Player(scene, mode)
+    scores = [_score(scene, player, standpoint, object_ids, backend) for standpoint in among]
+    return among[max(range(len(among)), key=lambda k: scores[k])]
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many of some items, evenly, with the first and the last."""
+    at = np.linspace(0, max(len(items) - 1, 0), min(most, len(items))).round()
+    return [items[int(k)] for k in at]
+
+
+def sized(camera: Camera, longest: int) -> Camera:
+    """The same picture with so many pixels along its longer side."""
+    scale = longest / max(camera.width, camera.height)
+    return axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
+
+
+def overview(scene: Scene) -> Camera:
+    """A camera that sees the whole scene from above its side, for scenes that store none."""
+    up = axes.WORLD_TO_BLENDER[scene.world_convention].T @ np.array([0.0, 0.0, 1.0])
+    seen = scene.means[scene.object_ids > 0]
+    points = (seen if len(seen) else scene.means).astype(np.float64)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    radius = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98)) if len(points) else 1.0
+    side = np.cross(up, [1.0, 0.2, 0.1])
+    back = side / np.linalg.norm(side) + 0.6 * up
+    back /= np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, -np.cross(back, right), -back])  # OpenCV: x right, y down, z forward
+    center = middle + 3.0 * max(radius, 1e-6 * scene.extent) * back
+    T_cam_world = np.eye(4)
+    T_cam_world[:3, :3], T_cam_world[:3, 3] = rotation, -rotation @ center
+    focal = 640 * 1.2
+    return Camera(640, 480, np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1.0]]), T_cam_world, "overview")
+
+
+def _score(
+    scene: Scene, player: scene_player.Player, standpoint: Standpoint, object_ids: Collection[int], backend: str
+) -> tuple[int, float]:
+    """How many of the objects are seen, and how well: roots of their shares, halved where the border cuts them."""
+    frame = player.frame(standpoint.t)
+    output = scene_renderer.render_frame(scene, frame, sized(standpoint.camera, LOOK), backend=backend)
+    ids = scene_renderer.to_numpy(output.ids, np.int32)
+    border = np.concatenate([ids[0], ids[-1], ids[:, 0], ids[:, -1]])
+    count, quality = 0, 0.0
+    for object_id in object_ids:
+        share = float((ids == object_id).mean())
+        if share >= NOTICED:
+            count += 1
+            quality += np.sqrt(share) * (0.5 if (border == object_id).any() else 1.0)
+    return count, quality

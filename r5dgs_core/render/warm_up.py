@@ -1,0 +1,95 @@
+"""Compiling the kernels of the `cpu` backend before they are needed, or loading them where an earlier process did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ..raster import rasterizer, shade
+from ..scene.cameras import Camera
+
+_VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
+_SH = 4  # coefficients: degree 1, the least that has kernels
+
+
+def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:
+    """Make every kernel of the `cpu` backend ready.
+
+    The first call of a fresh installation takes ten to fifteen seconds, later processes well below one.
+
+    Args:
+        gradients: Whether those that training needs are wanted, too; viewers do without.
+        progress: Called with the name of each stage before it begins.
+
+    Returns:
+        The seconds it took.
+
+    Raises:
+        BackendError: There is no numba.
+    """
+    start = time.perf_counter()
+    stages: list[tuple[str, Callable[[], object]]] = [
+        *(("splats", _splats), ("splats before others", _backdrop)),
+        *(("colors", _colors), ("sky", _sky)),
+    ]
+    if gradients:
+        stages += [
+            *(("weights of segments", _segment_weights), ("gradients of splats", _splat_gradients)),
+            ("gradients of colors", _color_gradients),
+        ]
+    for name, stage in stages:
+        if progress is not None:
+            progress(name)
+        with torch.inference_mode(False), torch.enable_grad():  # whatever the caller is in the middle of
+            stage()
+    return time.perf_counter() - start
+
+
+def _inputs(row: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    return row, torch.ones(1, 4), row, row[:, 0], row
+
+
+def _draw(row: torch.Tensor) -> torch.Tensor:
+    labels = torch.zeros(1, dtype=torch.int32)
+    return rasterizer.rasterize_splats(*_inputs(row), _VIEW, labels=labels, backend="cpu").image
+
+
+def _shade(row: torch.Tensor) -> torch.Tensor:
+    return shade.seen_colors(row, row.expand(1, _SH, 3), np.zeros(3))
+
+
+def _splats() -> None:
+    _draw(torch.ones(1, 3))
+
+
+def _backdrop() -> None:
+    from . import static_layer  # needs numba, which whoever imports the package may do without
+
+    still = moving = _inputs(torch.ones(1, 3))
+    static_layer.Backdrop(*still, _VIEW).draw(*moving)
+
+
+def _splat_gradients() -> None:
+    _draw(torch.ones(1, 3, requires_grad=True)).sum().backward()
+
+
+def _segment_weights() -> None:
+    from . import segment_weights  # needs scipy, which is slow to import
+
+    segments = torch.zeros(_VIEW.height, _VIEW.width, dtype=torch.int64)
+    segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1, backend="cpu")
+
+
+def _colors() -> None:
+    _shade(torch.ones(1, 3))
+
+
+def _color_gradients() -> None:
+    _shade(torch.ones(1, 3, requires_grad=True)).sum().backward()
+
+
+def _sky() -> None:
+    shade.sky(np.zeros((_SH, 3)), _VIEW)

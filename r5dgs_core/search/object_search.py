@@ -1,0 +1,361 @@
+"""Find objects by words, without any network: names and aliases first, then what stored embeddings say.
+
+A query is cut into wishes at "and", "," and the like, unless it is a name with such a word; each wish is compared with
+every name and alias of the table. "Everything", "not" and their like are understood by `prompts`.
+Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo. A name that says a
+wish whole settles it; other wishes are asked of the embeddings, too (`embedding_search`), where their words have one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import errors
+from ..scene.scene import Scene
+from ..scene.stored_embeddings import Meanings
+from . import embedding_search as stored
+from . import english, prompts
+
+THRESHOLD = stored.PASS
+EVERYTHING = "all"  # begins the reason of a match that no word of its own found
+Embed = Callable[[str], np.ndarray | None]  # embedding of a phrase, unit [D]; None where it cannot be had
+_SETTLED = 0.9  # of a name that says the wish whole
+_TYPO_RATIO = 0.75
+_LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
+_MOST_SLIPS = 3
+_HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
+
+
+@dataclass(frozen=True)
+class Match:
+    """One object that a query found.
+
+    Attributes:
+        object_id: Id in the table.
+        score: In (0, 1], 1 for its exact name.
+        why: In words, such as "name 'mug'" or "alias 'cup', spelled 'cupp'".
+        cosine: Of the embeddings, None for a match by name.
+        relevancy: See `embedding_search`, None for a match by name and where the file has no canonical phrases.
+    """
+
+    object_id: int
+    score: float
+    why: str
+    cosine: float | None = None
+    relevancy: float | None = None
+
+
+@dataclass(frozen=True)
+class Label:
+    """What an object answers to. `search_labels` needs no more, so it works without the scene file."""
+
+    object_id: int
+    name: str
+    aliases: tuple[str, ...] = ()
+
+
+def labels_of(scene: Scene) -> list[Label]:
+    """What the objects of a scene answer to, the background among them."""
+    return [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
+
+
+def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed | None = None) -> list[Match]:
+    """Objects that a text names or means, best first.
+
+    Args:
+        scene: The scene; its stored embeddings are used for words that its vocabulary holds.
+        text: One or several names: "red mug", "mugs and lemon".
+        threshold: Least score that counts as a match.
+        embed: Gives the embedding of other words, by the encoder that made the scene's.
+
+    Returns:
+        Matches with score >= threshold, ranked by score, then by id; empty if nothing matches.
+
+    Raises:
+        ConfigError: Something is to be left out that nothing matches.
+    """
+    labels, meanings = labels_of(scene), Meanings.of(scene)
+    check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
+    return search_labels(labels, text, threshold, meanings, embed)
+
+
+def search_labels(
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
+) -> list[Match]:
+    """As `search`, on names and aliases, and on stored embeddings if they are given.
+
+    What cannot be left out, as nothing matches it, is ignored here: the caller asks `not_excluded`.
+    """
+    asked, best = _asked(labels, text), {}
+    if asked.everything:
+        why = f"{EVERYTHING} others" if asked.excluded else EVERYTHING
+        best = {label.object_id: Match(label.object_id, 1.0, why) for label in labels if label.object_id > 0}
+    for match in _matches(labels, asked.wanted, threshold, meanings, embed):
+        if match.object_id not in best or match.score > best[match.object_id].score:
+            best[match.object_id] = match
+    for match in _matches(labels, asked.excluded, threshold, meanings, embed):
+        best.pop(match.object_id, None)
+    return _ranked(best.values())
+
+
+def unanswered(
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
+) -> list[str]:
+    """Phrases of a text that are wanted and that nothing matches; arguments as of `search_labels`."""
+    wanted = _asked(labels, text).wanted
+    return [said for said, wish in wanted if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+
+
+def not_excluded(
+    labels: Sequence[Label],
+    text: str,
+    threshold: float = THRESHOLD,
+    meanings: Meanings | None = None,
+    embed: Embed | None = None,
+) -> list[str]:
+    """Phrases that a text leaves out and that nothing matches; arguments as of `search_labels`."""
+    excluded = _asked(labels, text).excluded
+    return [said for said, wish in excluded if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
+
+
+def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str]) -> None:
+    """Refuse a text that leaves out what is not there: that would select what the user did not mean.
+
+    Args:
+        labels: Labels of the objects.
+        text: The text.
+        missing: Its phrases of `not_excluded`.
+
+    Raises:
+        ConfigError: There are such phrases.
+    """
+    if missing:
+        raise errors.ConfigError(
+            f"{text.strip()!r} leaves out what is not there: {explain_nothing(labels, missing[0])}"
+        )
+
+
+def is_nothing(labels: Sequence[Label], text: str) -> bool:
+    """True for a text that asks for no object at all, such as "none" and "not everything"."""
+    asked = _asked(labels, text)
+    return bool(english.words_of(text)) and not asked.wanted and not asked.everything
+
+
+def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
+    """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
+    asked = _asked(labels, text)
+    return [
+        said
+        for said, wish in (*asked.wanted, *asked.excluded)
+        if not any(match.score >= _SETTLED for match in _named(labels, wish))
+        and (meanings is None or vocabulary_row(meanings.vocabulary, wish) is None)
+    ]
+
+
+def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
+    """Names and aliases that someone may have meant who typed a text that nothing matches.
+
+    Args:
+        labels: Labels of the objects.
+        text: What was typed.
+        count: Most suggestions.
+
+    Returns:
+        The closest word of each object that is near, the best first; a word is near that a few slips of the keyboard
+        make of what was typed.
+    """
+    ranked = []
+    for label in labels:
+        nearest = max(((_closeness(text, name), name) for name in (label.name, *label.aliases)), key=lambda c: c[0])
+        if nearest[0] > 0:
+            ranked.append((-nearest[0], label.object_id, nearest[1]))
+    return [name for _, _, name in sorted(ranked)[:count]]
+
+
+def explain_nothing(labels: Sequence[Label], text: str) -> str:
+    """A sentence for the user when nothing matched: what is close, else the names that there are."""
+    said = f"nothing matches {text.strip()!r}"
+    meant = suggest(labels, text)
+    if meant:
+        return f"{said}; did you mean {' or '.join(repr(name) for name in meant)}?"
+    return f"{said}; the scene has: {', '.join(label.name for label in labels) or 'no objects'}"
+
+
+def wishes(text: str) -> list[list[str]]:
+    """Words of each thing that a text asks for, normalised, fillers left out."""
+    return [words for _, words in english.phrases(text)]
+
+
+def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
+    """Row of the first word of a vocabulary that says a wish, None for none."""
+    return _vocabulary_rows(tuple(vocabulary)).get(tuple(wish))
+
+
+@functools.lru_cache(maxsize=8)
+def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
+    """Row of each word that is one wish, by its normalised words."""
+    rows: dict[tuple[str, ...], int] = {}
+    for row, word in enumerate(vocabulary):
+        said = wishes(word)
+        if len(said) == 1:
+            rows.setdefault(tuple(said[0]), row)
+    return rows
+
+
+def _asked(labels: Sequence[Label], text: str) -> prompts.Prompt:
+    return prompts.parse(text, [name for label in labels for name in (label.name, *label.aliases)])
+
+
+def _matches(
+    labels: Sequence[Label],
+    phrases: Sequence[tuple[str, list[str]]],
+    threshold: float,
+    meanings: Meanings | None,
+    embed: Embed | None,
+) -> list[Match]:
+    """Everything that fits one of some phrases well enough."""
+    found = [match for said, wish in phrases for match in _fulfil(labels, said, wish, meanings, embed)]
+    return [match for match in found if match.score >= threshold]
+
+
+def _fulfil(
+    labels: Sequence[Label], said: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
+) -> list[Match]:
+    """Everything that fits one wish at all."""
+    named = _named(labels, wish)
+    if meanings is None or any(match.score >= _SETTLED for match in named):
+        return named
+    row = vocabulary_row(meanings.vocabulary, wish)
+    query = meanings.vocabulary_embeddings[row] if row is not None else embed(said) if embed is not None else None
+    if query is None:
+        return named
+    known = {label.object_id: label for label in labels}
+    meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
+    if row is not None:  # a word of its own is neither a typo nor the beginning of another: "car" is no "cart"
+        fitting = {one.object_id for one in meant if one.score >= stored.PASS}
+        named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
+    word = said if row is None else meanings.vocabulary[row]
+    return [*named, *(_by_meaning(one, word) for one in meant)]
+
+
+def _by_meaning(one: stored.Meant, said: str) -> Match:
+    why = f"meaning of {said!r} ({one.cosine:.2f})"
+    return Match(one.object_id, one.score, why, one.cosine, one.relevancy)
+
+
+def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
+    asked = tuple(wish)
+    return [match for label in labels if (match := _match(label, asked)) is not None]
+
+
+def _ends_with(label: Label, word: str) -> bool:
+    """Whether a word is the end of one of a name: a chessboard is a board."""
+    return any(present.endswith(word) for name in (label.name, *label.aliases) for present in english.words_of(name))
+
+
+def _ranked(matches: Iterable[Match]) -> list[Match]:
+    return sorted(matches, key=lambda match: (-round(match.score, 6), match.object_id))
+
+
+@functools.lru_cache(maxsize=1 << 14)  # what is unknown, what is found and what is void ask for the same
+def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
+    """Best of the object's name and aliases for one wish; an alias counts a little less than a name."""
+    best: Match | None = None
+    for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
+        words = english.words_of(text)
+        if not words:
+            continue
+        table = [[_similarity(word, present) for present in words] for word in wish]
+        whole = "".join(words)
+        said = [max(*row, _similarity(word, whole)) for word, row in zip(wish, table, strict=True)]
+        covered = said[0] if len(said) == 1 else _HEAD_WEIGHT * said[-1] + (1 - _HEAD_WEIGHT) * _mean(said[:-1])
+        named = _mean([max(column) for column in zip(*table, strict=True)])
+        # Words of the name that were not said cost little; words that the name does not have cost much.
+        score = weight * covered * (0.85 + 0.15 * named)
+        if score > 0 and (best is None or score > best.score):
+            spelled = "" if max(said) == 1 else f", near {' '.join(wish)!r}"
+            best = Match(label.object_id, score, f"{kind} {text!r}{spelled}")
+    return best
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _similarity(word: str, present: str) -> float:
+    """Of a word asked for to a word of a name: 1 for equal ones, 0.6 to 0.95 for a part or a typo, else 0.
+
+    A part of the name's word counts ("glob" of "globe"), a word with the name's inside does not ("cupboard" is no cup).
+    """
+    if word == present:
+        return 1.0
+    if len(word) >= 3 and present.startswith(word):
+        return 0.75 + 0.2 * len(word) / len(present)
+    if len(word) >= 3 and word in present:
+        return 0.6 + 0.2 * len(word) / len(present)
+    shorter, longer = sorted((len(word), len(present)))
+    if shorter < 4 or 2 * shorter < _TYPO_RATIO * (shorter + longer):  # the ratio below cannot be larger than that
+        return 0.0
+    ratio = difflib.SequenceMatcher(None, word, present, autojunk=False).ratio()
+    if sorted(word) == sorted(present):
+        ratio = max(ratio, 0.85)  # letters exchanged
+    return 0.9 * ratio if ratio >= _TYPO_RATIO else 0.0
+
+
+def _closeness(text: str, name: str) -> float:
+    """How near two texts are, in [0, 1]: the best of their words, or all of them run together; 0 where none is."""
+    asked = [word for wish in wishes(text) for word in wish]
+    present = english.words_of(name)
+    if not asked or not present:
+        return 0.0
+    pairs = [(a, b) for a in asked for b in present] + [("".join(asked), "".join(present))]
+    return max(_nearness(a, b) for a, b in pairs)
+
+
+def _nearness(word: str, other: str) -> float:
+    """1 for equal words, less for each slip that makes one of the other; 0 for more slips than their length excuses."""
+    shorter, longer = sorted((len(word), len(other)))
+    excused = min(shorter // _LETTERS_PER_SLIP, _MOST_SLIPS)
+    if longer - shorter > excused:
+        return 0.0
+    slips = edit_distance(word, other, excused)
+    return 1 - slips / longer if slips <= excused else 0.0
+
+
+def edit_distance(word: str, other: str, most: int) -> int:
+    """Least number of slips between two words: letters that are too many, missing, wrong, or two that are exchanged.
+
+    Args:
+        word: One word.
+        other: The other word.
+        most: Limit of the slips that are counted; the work grows with this times the length of the words.
+
+    Returns:
+        The number, or ``most + 1`` if it is larger.
+    """
+    rows: list[dict[int, int]] = [{}, {j: j for j in range(min(len(other), most) + 1)}]
+    for i, letter in enumerate(word, 1):
+        last, before = rows
+        row: dict[int, int] = {}
+        for j in range(max(0, i - most), min(len(other), i + most) + 1):
+            best = i if j == 0 else min(row.get(j - 1, most), before.get(j, most)) + 1
+            if j > 0:
+                best = min(best, before.get(j - 1, most + 1) + (letter != other[j - 1]))
+            if i > 1 and j > 1 and letter == other[j - 2] and word[i - 2] == other[j - 1]:
+                best = min(best, last.get(j - 2, most) + 1)
+            row[j] = best
+        rows = [before, row]
+    return min(rows[1].get(len(other), most + 1), most + 1)

@@ -1,0 +1,191 @@
+"""`r5dgs report --stability`: stiff, extreme and degenerate cases on the code as it is shipped, one row each.
+
+Nothing is read but the code itself, and nothing is random: the rows are the same on every run but for their seconds
+and, on another processor, their last digits.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from .. import atomic_files, errors
+from . import (
+    extremes,
+    groups,
+    keys,
+    loading,
+    orders,
+    playback,
+    rotations,
+    steps,
+)
+from .cases import MOST_SECONDS, Case, logged
+
+CASES: tuple[Case, ...] = (
+    *orders.CASES,
+    *steps.CASES,
+    *extremes.CASES,
+    *rotations.CASES,
+    *groups.CASES,
+    *playback.CASES,
+    *keys.CASES,
+    *loading.CASES,
+)
+_CAPTION = (
+    f"Less is better. A case over {MOST_SECONDS:g} s of processor time fails. No motion model has drag, so none is "
+    "stiff by it. --json FILE has the quantity, the function, TRACE's integrator on the same case, and where "
+    "tolerances come from."
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case with what came of it.
+
+    Attributes:
+        topic: Rows of one topic stand together.
+        name: What was tried.
+        method: Our function.
+        quantity: What was measured; less is better.
+        measured: The value, NaN where the case could not be measured.
+        tolerance: Largest value that passes.
+        source: Where the tolerance comes from.
+        trace_rk2: The same value for TRACE's integrator, or None where it has no part in the case.
+        passed: True if the value is within the tolerance and the case took at most `MOST_SECONDS`.
+        seconds: CPU time of our side.
+        message: The error of a case that raised one, else "".
+    """
+
+    topic: str
+    name: str
+    method: str
+    quantity: str
+    measured: float
+    tolerance: float
+    source: str
+    trace_rk2: float | None
+    passed: bool
+    seconds: float
+    message: str = ""
+
+
+def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | None = None) -> list[Row]:
+    """Measure cases. One that raises fails with its message, and the others still run.
+
+    Args:
+        cases: Which ones; None for all.
+        progress: Called with the number of cases that are done.
+    """
+    rows: list[Row] = []
+    for case in CASES if cases is None else cases:
+        rows.append(_measured(case))
+        if progress is not None:
+            progress(len(rows))
+    return rows
+
+
+def _measured(case: Case) -> Row:
+    message, start = "", 0.0
+    # What the core warns of belongs to the case; that the value is right is what counts.
+    with logged(), warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)
+        try:
+            if case.prepare is not None:
+                case.prepare()
+            start = time.process_time()
+            value = float(case.measure())
+        except Exception as error:  # the table is there to show what breaks, whatever it is
+            value, message = math.nan, f"{type(error).__name__}: {error}"
+        seconds = time.process_time() - start
+        other = None
+        if case.trace_rk2 is not None:
+            try:
+                other = float(case.trace_rk2())
+            except Exception as error:
+                other, message = math.nan, message or f"trace_rk2: {type(error).__name__}: {error}"
+    if seconds > MOST_SECONDS:
+        message = message or f"took {seconds:.1f} s of processor time, expected at most {MOST_SECONDS:g}"
+    passed = bool(value <= case.tolerance) and seconds <= MOST_SECONDS  # NaN does not pass
+    return Row(
+        case.topic,
+        case.name,
+        case.method,
+        case.quantity,
+        value,
+        case.tolerance,
+        case.source,
+        other,
+        passed,
+        seconds,
+        message,
+    )
+
+
+def make(rows: Sequence[Row]) -> Table:
+    """Lay out the rows, to print with rich."""
+    table = Table(title="stability", title_justify="left", caption=_CAPTION, caption_justify="left")
+    table.add_column("case", overflow="fold")
+    for name in ("measured", "at most", "CPU s"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    topic = None
+    for row in rows:
+        if row.topic != topic:
+            topic = row.topic
+            table.add_section()
+            table.add_row(f"[bold]{topic}[/bold]")
+        figures = (f"{row.measured:.3g}", f"{row.tolerance:.3g}", f"{row.seconds:.2f}")
+        result = "pass" if row.passed else "[bold red]FAIL[/bold red]"
+        name = f"{row.name}: {row.message}" if row.message else row.name
+        table.add_row(_plain(name), *figures, result)
+    return table
+
+
+def _plain(text: str) -> str:
+    """Text whose brackets rich leaves alone."""
+    return text.replace("[", r"\[")
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """One line: how many passed, which failed, in what time."""
+    failed = [row for row in rows if not row.passed]
+    seconds = sum(row.seconds for row in rows)
+    text = f"{len(rows) - len(failed)} of {len(rows)} cases pass, in {seconds:.1f} s of CPU time"
+    return text + "".join(f"\nfailed: {row.topic}: {row.name}" for row in failed)
+
+
+def to_json(rows: Sequence[Row]) -> dict[str, Any]:
+    """The rows as JSON types; numbers that JSON has none for become "nan", "inf" and "-inf"."""
+    return {
+        "passed": sum(row.passed for row in rows),
+        "failed": sum(not row.passed for row in rows),
+        "seconds": sum(row.seconds for row in rows),
+        "rows": [{key: _number(value) for key, value in asdict(row).items()} for row in rows],
+    }
+
+
+def _number(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write(rows: Sequence[Row], path: Path) -> Path:
+    """Write the rows as JSON; returns ``path``.
+
+    Raises:
+        ConfigError: It cannot be written there.
+    """
+    try:
+        atomic_files.write(path, json.dumps(to_json(rows), indent=2).encode())
+    except OSError as error:
+        raise errors.ConfigError(f"{path}: the stability table cannot be written: {error}") from error
+    return path

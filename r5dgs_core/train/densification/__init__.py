@@ -1,0 +1,1 @@
+"""Densification strategies: gradient-based cloning and splitting, and MCMC."""

@@ -1,0 +1,215 @@
+"""Densification: the face that all strategies keep, and the moves that they are made of.
+
+A strategy sees what each step drew, adds a penalty to the loss where it has one, and after each step changes the
+Gaussians in place, optimizer state included. What its next step depends on is in named tensors, so that a resumed run
+ends with the same numbers. Sizes are in normalised units, gradients per half image width, so that thresholds hold at
+any resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ...model.gaussians import Gaussians
+from ...motion import rotations
+from ...raster import RasterStats
+from ...scene.cameras import Camera
+
+SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this factor (0.8 N of 3DGS, N = 2)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a run tells its strategy.
+
+    Attributes:
+        cap: Largest number of Gaussians; a run starts with no more, and no step leaves more.
+        iterations: Steps of the whole run.
+        pixel_size: Typical size of a pixel at the objects, normalised units.
+        image_width: Typical width of an image, px.
+        extent: Radius of the cameras, normalised units (`extent_of`).
+        eyes: The distinct training cameras, in normalised coordinates.
+        generator: Source of the draws; its state is kept by the run.
+        white: Whether a fixed white background is behind everything.
+    """
+
+    cap: int
+    iterations: int
+    pixel_size: float
+    image_width: float
+    extent: float
+    eyes: Sequence[Camera]
+    generator: torch.Generator
+    white: bool = False
+
+
+class Strategy(Protocol):
+    """How the number of Gaussians changes while they are trained."""
+
+    def penalty(self, gaussians: Gaussians) -> Tensor | None:
+        """What is added to the loss of the coming step, or None."""
+        ...
+
+    def observe(self, stats: RasterStats, camera: Camera) -> None:
+        """Take note of what a step drew, after its backward pass."""
+        ...
+
+    def after_step(
+        self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, iteration: int, means_rate: float
+    ) -> None:
+        """Change the Gaussians after ``iteration`` steps; ``means_rate`` is the learning rate of the centres."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that its next step depends on, by name (``gradients.NAME``)."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `tensors`."""
+        ...
+
+
+class ScreenGradients:
+    """Running mean of the screen gradient of each Gaussian over the views that show it, and its largest radius, px."""
+
+    def __init__(self, count: int):
+        self.total = torch.zeros(count)
+        self.views = torch.zeros(count)
+        self.radii = torch.zeros(count)
+
+    def add(self, grad_norm: Tensor, visible: Tensor, radii: Tensor | None = None) -> None:
+        """Add one view: gradient norms per half image width [N], visibility [N] and radii in px [N]."""
+        self.total += torch.where(visible, grad_norm, 0.0)
+        self.views += visible
+        if radii is not None:
+            self.radii = torch.maximum(self.radii, torch.where(visible, radii.to(self.radii.dtype), 0.0))
+
+    def observe(self, stats: RasterStats, camera: Camera) -> None:
+        """Add the view that a step drew."""
+        if stats.grad_norm is not None and stats.visible is not None:
+            self.add(0.5 * camera.width * stats.grad_norm, stats.visible, stats.radii)
+
+    def mean(self) -> Tensor:
+        """Mean screen gradient. [N]"""
+        return self.total / self.views.clamp(min=1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its state by ``gradients.NAME``."""
+        return {f"gradients.{name}": getattr(self, name) for name in ("total", "views", "radii")}
+
+    @classmethod
+    def of(cls, tensors: dict[str, Tensor]) -> ScreenGradients:
+        """From `tensors`; radii that an earlier version did not keep start at 0."""
+        made = cls(len(tensors["gradients.total"]))
+        for name in ("total", "views", "radii"):
+            setattr(made, name, tensors.get(f"gradients.{name}", getattr(made, name)))
+        return made
+
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """1.1 times the largest distance of a camera to the mean of all, the extent of 3DGS; units of the cameras."""
+    centers = torch.stack([torch.from_numpy(camera.center) for camera in cameras])
+    return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+
+
+@torch.no_grad()
+def grow(
+    gaussians: Gaussians, optimizer: torch.optim.Optimizer, chosen: Tensor, split: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Clone some Gaussians, split others: each adds one once those that were split are removed.
+
+    Args:
+        gaussians: Changed in place, optimizer state included; new ones are appended and inherit the motion group.
+        optimizer: The optimizer that holds their parameters.
+        chosen: Rows that grow. [G]
+        split: Which of them are split: two smaller ones drawn from the Gaussian replace it. [G] bool
+        generator: Source of the draws.
+
+    Returns:
+        Rows that the split ones leave to be removed, of all after growing. [N] bool
+
+    Source: 3DGS (Kerbl et al. 2023), section 5.2.
+    """
+    n = len(gaussians)
+    cloned, halved = chosen[~split], chosen[split]
+    source = torch.cat([cloned, halved, halved])
+    new = {name: tensor[source].clone() for name, tensor in gaussians.params.items()}
+    first = len(cloned)
+    scales = new["log_scales"][first:].exp()
+    quats = rotations.normalize(new["quats"][first:])
+    noise = torch.randn(scales.shape, generator=generator) * scales
+    new["means"][first:] += rotations.rotate(quats, noise)
+    new["log_scales"][first:] -= torch.log(torch.tensor(SPLIT_SHRINK))
+    gaussians.extend(optimizer, new, gaussians.motion_ids[source])
+    remove = torch.zeros(n + len(source), dtype=torch.bool)
+    remove[halved] = True
+    return remove
+
+
+def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequence[str], rows: Tensor | None) -> None:
+    """Set the optimizer's moments of some parameters to zero, at some rows (None: at all)."""
+    for name in names:
+        state = optimizer.state.get(gaussians.params[name], {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key][slice(None) if rows is None else rows] = 0.0
+
+
+def single_view(gaussians: Gaussians, eyes: Sequence[Camera]) -> Tensor:
+    """Mask of the background Gaussians in the image of at most one camera: no parallax determines their depth.
+
+    Args:
+        gaussians: The Gaussians; those of group 0 are the background.
+        eyes: The distinct training cameras; with fewer than three, nothing is masked.
+
+    Returns:
+        Mask. [N] bool
+    """
+    found = torch.zeros(len(gaussians), dtype=torch.bool)
+    if len(eyes) < 3:
+        return found
+    means = gaussians.params["means"].detach()
+    rows = torch.nonzero(gaussians.motion_ids == 0)[:, 0]
+    count = torch.zeros(len(rows), dtype=torch.int64)
+    for camera in eyes:
+        k = camera.intrinsics
+        p_cam = _in_camera(means[rows], camera)
+        z = p_cam[:, 2].clamp(min=1e-6)
+        u = k[0, 0] * p_cam[:, 0] / z + k[0, 2]
+        v = k[1, 1] * p_cam[:, 1] / z + k[1, 2]
+        count += (p_cam[:, 2] > 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        rows, count = rows[count < 2], count[count < 2]
+    found[rows] = True
+    return found
+
+
+def floaters(gaussians: Gaussians, eyes: Sequence[Camera], distance: float) -> Tensor:
+    """Mask of the `single_view` Gaussians that lie close before a camera.
+
+    Args:
+        gaussians: The Gaussians.
+        eyes: The distinct training cameras.
+        distance: Largest distance that counts as close, normalised units; nothing is masked if it is 0.
+
+    Returns:
+        Mask. [N] bool
+    """
+    found = single_view(gaussians, eyes) if distance > 0 else torch.zeros(len(gaussians), dtype=torch.bool)
+    rows = torch.nonzero(found)[:, 0]
+    means = gaussians.params["means"].detach()[rows]
+    near = torch.zeros(len(rows), dtype=torch.bool)
+    for camera in eyes:
+        near |= _in_camera(means, camera).norm(dim=1) < distance
+    found[rows] = near
+    return found
+
+
+def _in_camera(means: Tensor, camera: Camera) -> Tensor:
+    """Return points [N, 3] in the frame of a camera. [N, 3]"""
+    T = torch.from_numpy(camera.T_cam_world).float()
+    return means @ T[:3, :3].T + T[:3, 3]

@@ -1,0 +1,173 @@
+"""Strategies of densification that follow the screen gradient: `Share`, and `Adaptive`, that of 3DGS; the choice.
+
+Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ...config.config import Config
+from ...config.sections import DensifyDefaultSection, DensifySection
+from ...model.gaussians import Gaussians
+from ...raster import RasterStats
+from ...scene.cameras import Camera
+from . import densifier, mcmc
+from .densifier import Conditions, ScreenGradients
+
+
+class _Gradients:
+    """What both strategies keep of the steps since their last round.
+
+    Args:
+        conditions: What the run tells.
+        count: Number of Gaussians.
+    """
+
+    def __init__(self, conditions: Conditions, count: int):
+        self.conditions = conditions
+        self.gradients = ScreenGradients(count)
+
+    def penalty(self, gaussians: Gaussians) -> Tensor | None:
+        """See `densifier.Strategy.penalty`."""
+        return None
+
+    def observe(self, stats: RasterStats, camera: Camera) -> None:
+        """See `densifier.Strategy.observe`."""
+        self.gradients.observe(stats, camera)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """See `densifier.Strategy.tensors`."""
+        return self.gradients.tensors()
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """See `densifier.Strategy.restore`."""
+        self.gradients = ScreenGradients.of(tensors)
+
+
+class Share(_Gradients):
+    """The largest gradients grow, at most a share of all in a round; no opacity resets. The default.
+
+    A small weight on the mean opacity lets fade what no image needs: Gaussians that no camera sees, or that repeat the
+    sky before the sky, would otherwise stay as chance left them, and show in views from elsewhere.
+
+    Args:
+        section: Thresholds.
+        conditions: What the run tells.
+        count: Number of Gaussians.
+    """
+
+    def __init__(self, section: DensifySection, conditions: Conditions, count: int):
+        super().__init__(conditions, count)
+        self.section = section
+        self.width_limit = section.prune_width * conditions.image_width * conditions.pixel_size
+
+    def penalty(self, gaussians: Gaussians) -> Tensor | None:
+        """Mean opacity, weighted."""
+        if self.section.opacity <= 0 or len(gaussians) == 0:
+            return None
+        return self.section.opacity * torch.sigmoid(gaussians.params["opacity_logits"]).mean()
+
+    def after_step(
+        self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, iteration: int, means_rate: float
+    ) -> None:
+        """See `densifier.Strategy.after_step`."""
+        section = self.section
+        if iteration % section.every == 0 and section.start <= iteration <= section.stop * self.conditions.iterations:
+            self.round(gaussians, optimizer)
+
+    @torch.no_grad()
+    def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+        """Grow where the image asks for it, then prune; Gaussians and optimizer are changed in place."""
+        section, conditions, n = self.section, self.conditions, len(gaussians)
+        score = self.gradients.mean()
+        room = max(0, conditions.cap - n)
+        count = int(min(section.share * n, room, int((score > section.gradient).sum())))
+        remove = torch.zeros(n, dtype=torch.bool)
+        if count > 0:
+            chosen = score.topk(count).indices
+            split = gaussians.log_scales[chosen].exp().amax(1) > section.split_pixels * conditions.pixel_size
+            remove = densifier.grow(gaussians, optimizer, chosen, split, conditions.generator)
+        remove |= torch.sigmoid(gaussians.opacity_logits) < section.prune_opacity
+        remove |= gaussians.log_scales.exp().amax(1) > self.width_limit
+        remove |= densifier.floaters(gaussians, conditions.eyes, section.prune_near)
+        gaussians.keep(optimizer, ~remove)
+        self.gradients = ScreenGradients(len(gaussians))
+
+
+class Adaptive(_Gradients):
+    """The default strategy of 3DGS, adaptive density control, under a hard cap; opacities are reset now and then.
+
+    Before a white background they are reset once more as growth begins, so that white Gaussians before white fade.
+
+    Args:
+        section: Thresholds.
+        conditions: What the run tells.
+        count: Number of Gaussians.
+    """
+
+    def __init__(self, section: DensifyDefaultSection, conditions: Conditions, count: int):
+        super().__init__(conditions, count)
+        self.section = section
+
+    def after_step(
+        self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, iteration: int, means_rate: float
+    ) -> None:
+        """See `densifier.Strategy.after_step`."""
+        section = self.section
+        if iteration >= section.stop * self.conditions.iterations:
+            return
+        if iteration > section.start and iteration % section.every == 0:
+            self.round(gaussians, optimizer, sizes=section.reset_every > 0 and iteration > section.reset_every)
+        begins = self.conditions.white and iteration == section.start
+        if section.reset_every > 0 and (begins or iteration % section.reset_every == 0):
+            self.reset(gaussians, optimizer)
+
+    @torch.no_grad()
+    def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, *, sizes: bool) -> None:
+        """Clone and split all whose gradient exceeds the threshold, largest first, then prune.
+
+        Args:
+            gaussians: Changed in place.
+            optimizer: Changed with them.
+            sizes: Whether large ones are removed too; not before opacities were reset for the first time.
+        """
+        section, conditions, n = self.section, self.conditions, len(gaussians)
+        score, radii = self.gradients.mean(), self.gradients.radii
+        count = min(max(0, conditions.cap - n), int((score >= section.gradient).sum()))
+        remove = torch.zeros(n, dtype=torch.bool)
+        if count > 0:
+            chosen = score.topk(count).indices
+            split = gaussians.log_scales[chosen].exp().amax(1) > section.percent_dense * conditions.extent
+            remove = densifier.grow(gaussians, optimizer, chosen, split, conditions.generator)
+        remove |= torch.sigmoid(gaussians.opacity_logits) < section.prune_opacity
+        if sizes:
+            remove |= gaussians.log_scales.exp().amax(1) > section.prune_extent * conditions.extent
+            remove[:n] |= radii > section.prune_radius
+        gaussians.keep(optimizer, ~remove)
+        self.gradients = ScreenGradients(len(gaussians))
+
+    @torch.no_grad()
+    def reset(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+        """Lower all opacities to ``reset_opacity``, so that only those that the images need come back."""
+        limit = self.section.reset_opacity
+        gaussians.params["opacity_logits"].clamp_(max=math.log(limit / (1 - limit)))
+        densifier.forget(gaussians, optimizer, ("opacity_logits",), None)
+
+
+def make(config: Config, conditions: Conditions, count: int) -> densifier.Strategy:
+    """The strategy that the configuration asks for.
+
+    Args:
+        config: The run's configuration.
+        conditions: What the run tells.
+        count: Number of Gaussians that it starts with.
+    """
+    if config.densify.strategy == "mcmc":
+        return mcmc.MCMC(config.densify_mcmc, conditions)
+    if config.densify.strategy == "default":
+        return Adaptive(config.densify_default, conditions, count)
+    return Share(config.densify, conditions, count)

@@ -1,0 +1,161 @@
+"""Densification as a Markov chain: dead Gaussians move onto live ones, a few are added each round, noise explores.
+
+Notation: o opacity, s standard deviation, N the number of Gaussians that take the place of one.
+
+Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ...config.sections import DensifyMcmcSection
+from ...model.gaussians import Gaussians
+from ...motion import rotations
+from ...raster import RasterStats
+from ...scene.cameras import Camera
+from . import densifier
+from .densifier import Conditions
+
+MOST = 51  # Gaussians that one may be divided into at a time
+GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # the noise fades over 1 / slope as the opacity rises past this one
+
+
+def divided(
+    opacities: Tensor,  # [R]
+    counts: Tensor,  # [R]
+) -> tuple[Tensor, Tensor]:
+    """Opacity and size of N equal Gaussians that together look like one.
+
+    At the centre they cover what the one covered, 1 - (1 - o')^N = o; and so they do along any line through it in
+    total: the integral of 1 - (1 - o' g')^N equals that of o g, with g the falloff of the one and g' that of the N.
+
+    Args:
+        opacities: Opacity o of the one, in (0, 1). [R]
+        counts: How many take its place, 1 to `MOST`. [R] integers
+
+    Returns:
+        Opacity o' of each of the N, and the factor by which its standard deviations change. [R], [R]
+
+    Source: Kheradmand et al. 2024, Eq. 9; its double sum of binomials taken over i first, sum_i C(i-1, k) = C(N, k+1).
+    """
+    o = opacities.double()
+    n = counts.double()
+    each = -torch.expm1(torch.log1p(-o) / n)
+    # sum over j = 1..N of C(N, j) (-1)^(j-1) o'^j / sqrt(j)
+    total = torch.zeros_like(o)
+    term = torch.ones_like(o)
+    for j in range(1, int(counts.max()) + 1 if len(counts) else 1):
+        term = term * (n - j + 1).clamp(min=0) / j * each
+        total += (1 if j % 2 else -1) * term / j**0.5
+    return each.to(opacities.dtype), (o / total).to(opacities.dtype)
+
+
+class MCMC:
+    """Relocation, growth up to the cap, noise, and the penalties that let Gaussians die.
+
+    Args:
+        section: Thresholds.
+        conditions: What the run tells.
+    """
+
+    def __init__(self, section: DensifyMcmcSection, conditions: Conditions):
+        self.section = section
+        self.conditions = conditions
+
+    def penalty(self, gaussians: Gaussians) -> Tensor | None:
+        """Mean opacity and mean standard deviation, weighted."""
+        if len(gaussians) == 0:
+            return None
+        opacity = self.section.opacity * torch.sigmoid(gaussians.params["opacity_logits"]).mean()
+        return opacity + self.section.scale * gaussians.params["log_scales"].exp().mean()
+
+    def observe(self, stats: RasterStats, camera: Camera) -> None:
+        """Nothing: opacities say all that this strategy wants to know."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Nothing: the draws' generator belongs to the run."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing is kept."""
+
+    @torch.no_grad()
+    def after_step(
+        self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, iteration: int, means_rate: float
+    ) -> None:
+        """See `densifier.Strategy.after_step`."""
+        section = self.section
+        within = section.start < iteration < section.stop * self.conditions.iterations
+        if within and iteration % section.every == 0:
+            self.relocate(gaussians, optimizer)
+            self.add(gaussians, optimizer)
+        if section.noise > 0 and len(gaussians):
+            self.shake(gaussians, section.noise * means_rate)
+
+    @torch.no_grad()
+    def relocate(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+        """Move each dead Gaussian onto a live one drawn by opacity; both become what the live one looked like."""
+        opacities = torch.sigmoid(gaussians.params["opacity_logits"])
+        dead = opacities <= self.section.dead_opacity
+        live = torch.where(dead, 0.0, opacities)
+        rows = torch.nonzero(dead)[:, 0]
+        if len(rows) == 0 or not (live > 0).any():
+            return
+        source = self._draw(live, len(rows))
+        self._divide(gaussians, source)
+        for tensor in gaussians.params.values():
+            tensor[rows] = tensor[source]
+        motion_ids = gaussians.motion_ids.clone()
+        motion_ids[rows] = motion_ids[source]
+        gaussians.motion_ids = motion_ids
+        densifier.forget(gaussians, optimizer, tuple(gaussians.params), torch.cat([rows, source]))
+
+    @torch.no_grad()
+    def add(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
+        """Add a share of new ones, drawn by opacity, as far as the cap allows."""
+        n = len(gaussians)
+        count = min(self.conditions.cap, int((1 + self.section.grow) * n)) - n
+        opacities = torch.sigmoid(gaussians.params["opacity_logits"])
+        if count > 0 and (opacities > 0).any():
+            source = self._draw(opacities, count)
+            self._divide(gaussians, source)
+            densifier.forget(gaussians, optimizer, tuple(gaussians.params), source)
+            new = {name: tensor[source].clone() for name, tensor in gaussians.params.items()}
+            gaussians.extend(optimizer, new, gaussians.motion_ids[source])
+
+    @torch.no_grad()
+    def shake(self, gaussians: Gaussians, size: float) -> None:
+        """Move centres by noise of the shape of the covariance; opaque ones stay.
+
+        Args:
+            gaussians: Changed in place.
+            size: Noise per variance, 1 / normalised units.
+
+        Source: Kheradmand et al. 2024, Eq. 8 and 11.
+        """
+        params = gaussians.params
+        opacities = torch.sigmoid(params["opacity_logits"])
+        gate = torch.sigmoid(GATE_SLOPE * (GATE_OPACITY - opacities))
+        draws = torch.randn(params["means"].shape, generator=self.conditions.generator)
+        quats = rotations.normalize(params["quats"])
+        own = rotations.rotate(rotations.conjugate(quats), draws)
+        noise = rotations.rotate(quats, own * (2 * params["log_scales"]).exp())
+        params["means"] += size * gate[:, None] * noise
+
+    def _draw(self, weights: Tensor, count: int) -> Tensor:
+        """Rows drawn by weight, with repetition. [count]"""
+        edges = weights.double().cumsum(0)
+        draws = torch.rand(count, generator=self.conditions.generator, dtype=torch.float64) * edges[-1]
+        rows = torch.searchsorted(edges, draws, right=True)
+        return rows.clamp(max=int(torch.nonzero(weights).max()))
+
+    def _divide(self, gaussians: Gaussians, source: Tensor) -> None:
+        """Give each drawn Gaussian the opacity and size that it has once all that were drawn share its place."""
+        opacities = torch.sigmoid(gaussians.params["opacity_logits"])
+        rows, times = source.unique(return_counts=True)
+        each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MOST))
+        each = each.clamp(min=self.section.dead_opacity, max=1 - 1e-6)
+        gaussians.params["opacity_logits"][rows] = torch.logit(each)
+        gaussians.params["log_scales"][rows] += factor.log()[:, None]

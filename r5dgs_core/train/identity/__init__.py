@@ -1,0 +1,1 @@
+"""Object identities: identity encodings, their losses and the labels of Gaussians."""

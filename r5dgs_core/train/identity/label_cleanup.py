@@ -1,0 +1,294 @@
+"""Which object each Gaussian shows, once its neighbours and its motion have had their say.
+
+The vote of the masks (`identity_training.votes`) leaves Gaussians undecided that lie on an outline, that few masks
+show, or that wrong masks claim. For these, and for none whose own votes are decided, what lies around them and what
+they move with decides. `regrouping` is the rule of the other label, the motion group.
+
+Notation: N Gaussians, C classes (0 the background); v the votes [N, C] in pixels of blending weight, p the shares of a
+Gaussian's votes, each divided by how sure its class is where nothing else is near (`certainty`: masks that miss an
+object in one image of five leave its very middle a share of 0.8), and t / (t + 1 px) the trust in t pixels of votes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import sparse, spatial
+from scipy.sparse import csgraph
+
+from ...motion import rotations
+from ...playback import visibility
+from ..observed_motion import GroupTrack
+
+log = logging.getLogger(__name__)
+
+CHANGES = "label_changes"  # name of the counts in a checkpoint: those of `Changes`, in its order
+
+NEIGHBOURS = 8
+OWN = 4.0  # a Gaussian's own votes count as much as so many neighbourhoods,
+MOTION = 0.5  # the group that it moves with as half of one
+DOUBT = 1.0  # pixels of votes that are trusted by half
+UNDECIDED = 0.55  # of the votes for its label and another one: a Gaussian with more for its label keeps it,
+UNDECIDED_BACKGROUND = 0.45  # and so does what would come from the background to an object, with more than this
+APART = 5.0  # of the spacing of an object's members: parts that lie further off are not joined to it
+SMALL = 0.05  # of an object's opacity: larger parts are its own
+SUPPORTED = 0.65  # share of the votes of a part with which it stays
+FEWEST = 9  # members of an object that can have parts
+MOVES = 0.1  # of its radius: an object that moves by less says nothing by its motion
+AGREED = 0.5  # share of the votes in the middle of the usual object: with less, masks do not agree on who is who
+AT_ONCE = 1 << 16  # Gaussians whose neighbours are asked at once; bounds memory
+
+
+@dataclass(frozen=True)
+class Changes:
+    """How many labels were changed, and by what.
+
+    Attributes:
+        neighbours: By what lies around a Gaussian.
+        motion: By what it moves with, where its neighbours alone would not have.
+        outliers: Because they lie apart from their object and little speaks for it.
+        gaussians: Of how many.
+    """
+
+    neighbours: int = 0
+    motion: int = 0
+    outliers: int = 0
+    gaussians: int = 0
+
+
+def clean(
+    votes: np.ndarray,
+    labels: np.ndarray,
+    points: np.ndarray,
+    opacities: np.ndarray,
+    going: np.ndarray | None = None,
+    moving: np.ndarray | None = None,
+) -> tuple[np.ndarray, Changes]:
+    """Labels after neighbours, motion and outliers.
+
+    An object is never left without Gaussians, and a Gaussian that cannot be seen does not come to an object. Where
+    masks contradict each other even about the middles of objects, nothing is changed.
+
+    Args:
+        votes: Of the masks. [N, C]
+        labels: Class of each Gaussian as these, or what stands for them, say. [N]
+        points: Centres in the bind state. [N, 3]
+        opacities: [N]
+        going: Class of the body that it moves with, 0 for none; None where that is not known. [N]
+        moving: Classes whose motion tells them from what rests. [C] bool
+
+    Returns:
+        Classes [N] int64, and what was changed.
+    """
+    start, count = labels.astype(np.int64), votes.shape[1]
+    if len(votes) < 2 or count < 2:
+        return start, Changes(gaussians=len(votes))
+    width = min(NEIGHBOURS, len(points) - 1) + 1
+    distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
+    votes = votes.astype(np.float32)
+    total = votes.sum(axis=1)
+    shares = votes / np.maximum(total, 1e-9)[:, None]
+    sure = certainty(shares, start, total, opacities, nearest)
+    measured = sure[1:][np.isfinite(sure[1:])]
+    if len(measured) and np.median(measured) < AGREED:
+        log.warning("masks do not agree on which object is which: labels are left as they voted")
+        return start, Changes(gaussians=len(votes))
+    shares /= np.where(np.isnan(sure), 1.0, np.maximum(sure, AGREED)).astype(np.float32)
+    shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
+    trust = total / (total + DOUBT)
+    pull = _pull(start, going, moving, count)
+    found, motion = start.copy(), np.zeros(len(votes), bool)
+    for first in range(0, len(votes), AT_ONCE):
+        rows = np.arange(first, min(first + AT_ONCE, len(votes)))
+        near = distances[rows], nearest[rows]
+        found[rows], motion[rows] = _decide(rows, shares, trust, start, opacities, *near, pull)
+    found = _keep_objects(start, found, count)
+    settled = found
+    found = _keep_objects(start, _without_outliers(votes, shares, total, settled, points, opacities), count)
+    changed = found != start
+    apart = changed & (found != settled)
+    by_motion, outliers = int((changed & ~apart & motion).sum()), int(apart.sum())
+    return found, Changes(int(changed.sum()) - by_motion - outliers, by_motion, outliers, len(votes))
+
+
+def certainty(
+    shares: np.ndarray, labels: np.ndarray, total: np.ndarray, opacities: np.ndarray, nearest: np.ndarray
+) -> np.ndarray:
+    """Share that a class has where all that is near has its label: 1 for clean masks, less for masks that miss it.
+
+    Args:
+        shares: Of the votes. [N, C]
+        labels: [N]
+        total: Votes, pixels. [N]
+        opacities: [N]
+        nearest: Rows of what is near each Gaussian, itself too. [N, k]
+
+    Returns:
+        The shares; nan for classes with fewer than nine such Gaussians. [C]
+    """
+    inner = (labels[nearest] == labels[:, None]).all(axis=1) & (total > DOUBT)
+    inner &= opacities > visibility.SEEN_OPACITY
+    result = np.full(shares.shape[1], np.nan)
+    for k in np.unique(labels[inner]):
+        own = shares[inner & (labels == k), k]
+        if len(own) >= FEWEST:
+            result[k] = np.median(own)
+    return result
+
+
+def changes_of(tensors: Mapping[str, Any]) -> dict[str, int] | None:
+    """The counts of a checkpoint by the names of `Changes`; None where labels were not cleaned."""
+    if CHANGES not in tensors:
+        return None
+    names = [field.name for field in dataclasses.fields(Changes)]
+    return dict(zip(names, map(int, tensors[CHANGES]), strict=True))
+
+
+def bound(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """Centres in the bind state, at the last knot of their groups' tracks. [N, 3]
+
+    Args:
+        groups: The motion groups.
+        motion_ids: Group of each Gaussian. [N]
+        means: Centres that the tracks start from. [N, 3]
+    """
+    points = means.astype(np.float64)
+    for g, group in enumerate(groups):
+        members = motion_ids == g
+        arms = points[members] - group.center
+        points[members] = group.center + rotations.rotate(group.quats[-1], arms) + group.displacements[-1]
+    return points
+
+
+def companions(
+    groups: Sequence[GroupTrack], motion_ids: np.ndarray, points: np.ndarray, object_ids: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each Gaussian moves with, for `clean`.
+
+    Args:
+        groups: The motion groups.
+        motion_ids: Group of each Gaussian. [N]
+        points: Centres in the bind state, in the coordinates of the groups. [N, 3]
+        object_ids: Object id of each class. [C]
+
+    Returns:
+        Class of the body that it goes with, 0 where it rests or follows as a shadow [N], and whether each class moves
+        by more than a tenth of its radius [C] bool.
+    """
+    rows = {int(object_id): row for row, object_id in enumerate(object_ids)}
+    owners, moving = np.zeros(len(groups), np.int64), np.zeros(len(object_ids), bool)
+    for g, group in enumerate(groups):
+        if group.role != "body":
+            continue
+        owners[g] = rows[group.object_id]
+        members = points[motion_ids == g]
+        if len(members) == 0:
+            continue
+        radius = np.quantile(np.linalg.norm(members - np.median(members, axis=0), axis=1), 0.9)
+        turned = rotations.multiply(group.quats, rotations.conjugate(group.quats[-1]))
+        chords = 2 * np.linalg.norm(turned[:, 1:], axis=1)  # 2 sin(angle / 2)
+        went = np.linalg.norm(group.displacements - group.displacements[-1], axis=1) + chords * radius
+        moving[owners[g]] |= bool(went.max() > MOVES * radius)
+    return owners[motion_ids], moving
+
+
+def _pull(
+    labels: np.ndarray, going: np.ndarray | None, moving: np.ndarray | None, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Class that motion speaks for, and with how much weight: none where what it moves with and its object rest."""
+    if going is None or moving is None:
+        return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)
+    told = np.append(moving, np.zeros(count - len(moving), bool))
+    told[0] = False
+    return going.astype(np.int64), (MOTION * np.where(going > 0, told[going], told[labels])).astype(np.float32)
+
+
+def _decide(
+    rows: np.ndarray,
+    shares: np.ndarray,
+    trust: np.ndarray,
+    labels: np.ndarray,
+    opacities: np.ndarray,
+    distances: np.ndarray,
+    nearest: np.ndarray,
+    pull: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of some Gaussians, and where it was motion that changed them. [n] and [n] bool
+
+    A Gaussian's votes are 4 p times trust, plus the mean p of its neighbours by distance, opacity and trust, plus a
+    half for the class that it moves with.
+    """
+    own = labels[rows]
+    spacing = np.maximum(np.median(distances[:, 1:], axis=1), 1e-30)
+    weights = np.exp(-((distances / spacing[:, None]) ** 2)) * opacities[nearest] * trust[nearest]
+    weights = np.where(nearest == rows[:, None], 0.0, weights).astype(np.float32)
+    around = np.zeros((len(rows), shares.shape[1]), np.float32)
+    for column, weight in zip(nearest.T, weights.T, strict=True):
+        around += weight[:, None] * shares[column]
+    whole = weights.sum(axis=1)
+    tally = OWN * trust[rows, None] * shares[rows] + around / np.maximum(whole, 1e-9)[:, None]
+    alone = tally.argmax(axis=1)
+    companion, weight = (values[rows] for values in pull)
+    tally[np.arange(len(rows)), companion] += weight
+    new = tally.argmax(axis=1)
+    said, other = shares[rows, own], shares[rows, new]
+    sure = trust[rows] * said / np.maximum(said + other, 1e-9)
+    take = (new != own) & (whole > 1e-6)
+    take &= sure < np.where(own == 0, UNDECIDED_BACKGROUND, UNDECIDED)
+    take &= (new == 0) | (opacities[rows] > visibility.SEEN_OPACITY)
+    return np.where(take, new, own), take & (new != alone)
+
+
+def _without_outliers(
+    votes: np.ndarray,
+    shares: np.ndarray,
+    total: np.ndarray,
+    labels: np.ndarray,
+    points: np.ndarray,
+    opacities: np.ndarray,
+) -> np.ndarray:
+    """Labels where small parts that lie apart from their object, and that little speaks for, go to what else their
+    votes say, else to the background. Arguments as of `clean`. [N]"""
+    result = labels.copy()
+    for k in range(1, votes.shape[1]):
+        rows = np.flatnonzero(labels == k)
+        if len(rows) < FEWEST:
+            continue
+        parts, count = _parts(points[rows], opacities[rows])
+        if count == 1:
+            continue
+        mass = np.bincount(parts, opacities[rows], count)
+        seen = np.bincount(parts, total[rows], count)
+        own = np.bincount(parts, total[rows] * shares[rows, k], count) / np.maximum(seen, 1e-9)
+        weak = own * seen / (seen + DOUBT) < SUPPORTED
+        for part in np.flatnonzero(weak & (mass < SMALL * mass.sum())):
+            members = rows[parts == part]
+            rest = votes[members].sum(axis=0)
+            rest[k] = 0.0
+            result[members] = rest.argmax()
+    return result
+
+
+def _parts(points: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, int]:
+    """Part of each point, where what lies within `APART` of the usual spacing hangs together, and their number."""
+    width = min(NEIGHBOURS + 1, len(points))
+    distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
+    shown = visibility.seen(opacities)
+    spacing = np.median(distances[shown if shown.any() else slice(None), width // 2])
+    near = distances <= APART * spacing
+    rows = np.repeat(np.arange(len(points)), width)[near.ravel()]
+    links = sparse.coo_matrix((np.ones(len(rows)), (rows, nearest.ravel()[near.ravel()])), (len(points),) * 2)
+    count, parts = csgraph.connected_components(links, directed=False)
+    return parts, int(count)
+
+
+def _keep_objects(before: np.ndarray, after: np.ndarray, count: int) -> np.ndarray:
+    """The labels, but those of before for objects that would be left without Gaussians. [N]"""
+    lost = (np.bincount(before, minlength=count) > 0) & (np.bincount(after, minlength=count) == 0)
+    lost[0] = False
+    return np.where(lost[before], before, after)

@@ -1,0 +1,52 @@
+"""Masks that were found rather than given, as one compressed tensor: a checkpoint keeps what a run began with."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import CheckpointError
+
+NAME = "discovery.masks"  # of the tensor in a checkpoint
+LABELS = "discovery.labels"  # of the one that stands there where Gaussians were sorted after the run instead
+
+
+def pack(masks: Sequence[np.ndarray]) -> Tensor:
+    """Masks as one row of bytes. [H, W] each -> [B] uint8"""
+    content = b"".join(np.ascontiguousarray(mask, "<u2").tobytes() for mask in masks)
+    return torch.from_numpy(np.frombuffer(zlib.compress(content), np.uint8).copy())
+
+
+def unpack(packed: Tensor, sizes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
+    """Masks out of `pack`.
+
+    Args:
+        packed: The bytes. [B] uint8
+        sizes: Height and width of each mask.
+
+    Returns:
+        Object ids per pixel. [H, W] uint8 where they fit, else uint16
+
+    Raises:
+        CheckpointError: The bytes are damaged, or are of masks of other sizes.
+    """
+    ends = np.cumsum([0, *(height * width for height, width in sizes)])
+    try:
+        inflate = zlib.decompressobj()
+        # One pixel more than expected is enough to notice that there are too many.
+        values = np.frombuffer(inflate.decompress(packed.numpy().tobytes(), 2 * int(ends[-1]) + 2), "<u2")
+        if not inflate.eof and not inflate.unconsumed_tail:
+            raise ValueError("incomplete")
+    except (zlib.error, ValueError) as error:
+        raise CheckpointError(f"'{NAME}': damaged ({error}); train again with --overwrite") from None
+    if len(values) != ends[-1]:
+        raise CheckpointError(
+            f"'{NAME}': expected {ends[-1]} pixels, found {len(values)}; train again with --overwrite"
+        )
+    kind = np.uint8 if values.max(initial=0) < 256 else np.uint16
+    values = values.astype(kind)
+    return [values[a:b].reshape(size) for a, b, size in zip(ends, ends[1:], sizes, strict=False)]

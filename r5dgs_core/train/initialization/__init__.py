@@ -1,0 +1,1 @@
+"""Initial Gaussians, object positions and sky from images, cameras and masks."""

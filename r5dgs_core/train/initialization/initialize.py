@@ -1,0 +1,254 @@
+"""The state that training starts from: Gaussians from hulls and the plane sweep, tracks from triangulated masks.
+
+Group numbering: 0 is the pinned background, 1..M the objects in the order of their ids, then one shadow per object.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...config.config import Config
+from ...model.gaussians import Gaussians
+from ..train_views import TrainView, nearest_knot, spread
+from . import evidence, place_gaussians, plane_sweep, scatter, shadows, triangulation, visual_hull
+
+log = logging.getLogger(__name__)
+
+MASKS = "Remedy: object_mask/train/IMAGE.png files"
+SAME_TIME = 0.1  # share of a camera's step in time within which the times of cameras are one
+FEWEST_EYES = 3  # cameras that place a scene from the images of one time
+SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
+
+
+@dataclass(frozen=True)
+class FirstTracks:
+    """Where bodies are before training, without rotation.
+
+    Attributes:
+        times: Knots, increasing. [S]
+        centers: Centres of the bodies, row 0 for the pinned group. [B, 3]
+        translations: Triangulated displacements at the knots. [B, S, 3]
+        casters: Body that each shadow group follows. [W]
+        plane_normal: Unit normal of the support plane, or None. [3]
+        slope: Slope of the shadows along it. [3]
+    """
+
+    times: np.ndarray
+    centers: np.ndarray
+    translations: np.ndarray
+    casters: np.ndarray
+    plane_normal: np.ndarray | None
+    slope: np.ndarray
+
+
+@dataclass(frozen=True)
+class Start:
+    """What training starts from.
+
+    Attributes:
+        gaussians: Canonical Gaussians; each body in its state at its reference time.
+        tracks: Where the bodies are at the observed times.
+        object_ids: Object id of each body; row 0 is the background. [B]
+        places: Where the masks put the objects.
+        first_time: Index of the time at which training begins.
+        plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
+        sky: Coefficients of the sky, or None where none was found. [9, 3]
+        evidence: What the images can tell of the objects' motion.
+    """
+
+    gaussians: Gaussians
+    tracks: FirstTracks
+    object_ids: np.ndarray
+    places: triangulation.Places
+    first_time: int
+    plane: tuple[np.ndarray, float] | None
+    sky: np.ndarray | None
+    evidence: evidence.Evidence
+
+
+def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
+    """Knots of the tracks: the distinct observed times.
+
+    Times of cameras that are a little out of step are one knot: those within a tenth of the step that each camera
+    takes. Where more than ``limit`` are left, a spread of them over their order, so that knots are dense where images
+    are. The first and the last observed time are knots.
+    """
+    of_camera: dict[bytes, set[float]] = {}
+    for view in views:
+        of_camera.setdefault(plane_sweep.camera_key(view.camera), set()).add(round(view.t, 9))
+    steps = [np.diff(sorted(found)) for found in of_camera.values() if len(found) > 1]
+    times = np.unique([t for found in of_camera.values() for t in found])
+    if steps:
+        together = SAME_TIME * float(np.median(np.concatenate(steps)))
+        starts = [0]
+        for k, t in enumerate(times):
+            if t - times[starts[-1]] > together:
+                starts.append(k)
+        parts = np.split(times, starts[1:])
+        inner = [part[0] if len(part) == 1 else part.mean() for part in parts]
+        times = np.array([times[0], *inner[1:-1], times[-1]]) if len(parts) > 1 else times[-1:]
+    return np.array(spread(list(times), limit))
+
+
+def start(
+    views: Sequence[TrainView],
+    config: Config,
+    find_sky: bool,
+    rng: np.random.Generator,
+    cloud: tuple[np.ndarray, np.ndarray] | None = None,
+    still: bool = False,
+) -> Start:
+    """Place Gaussians and tracks.
+
+    Args:
+        views: Training views in normalised coordinates.
+        config: Configuration of the run.
+        find_sky: Whether there may be sky behind the scene; not where the background's colour is given.
+        rng: Source of the draws.
+        cloud: Points and colours in [0, 1] of a reconstruction, normalised coordinates. [P, 3] each
+        still: Whether nothing moves, so that all images show one time.
+
+    Returns:
+        The start of the training.
+    """
+    init = config.init
+    times = observed_times(views)
+    if still and len(times) > 1:
+        log.info("nothing moves in any view: trained as a static scene")
+        times = times[-1:]
+    places = triangulation.locate(views, times, init.min_mask_pixels)
+    unmasked = all(v.mask is None for v in views)
+    by_field = config.train.representation == "field" and not still
+    if unmasked and not still:
+        if by_field:
+            log.warning("no masks: the field moves every Gaussian, objects are what moves as one in the end. %s", MASKS)
+        else:
+            log.warning(
+                "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS
+            )
+    elif len({view.t for view in views}) == 1:
+        log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
+    first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
+    if unmasked and by_field and config.curriculum.start != "first":
+        first = (len(times) - 1) // 2
+    bodies = len(places.object_ids) + 1
+    centers = np.zeros((bodies, 3))
+    translations = np.zeros((bodies, len(times), 3))
+    clouds = []
+    at_random = init.placement == "random"
+    for row, object_id in enumerate(places.object_ids):
+        reference = _reference_time(places.visibility[row], places.measured[row], first)
+        centers[row + 1] = places.centers[row, reference]
+        translations[row + 1] = places.centers[row] - centers[row + 1]
+        then = [v for v in views if v.mask is not None and nearest_knot(times, v.t) == reference]
+        count = 0 if at_random else init.object_points
+        carved = visual_hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
+        clouds.append((*carved, row + 1))
+    scenes = plane_sweep.backdrops(_at_once(views, times, first) if unmasked and by_field else views)
+    # Points at random need the sweep for the sky and the plane alone.
+    swept = min(init.background_points, 5000) if at_random else init.background_points
+    search = plane_sweep.Sweep(scenes, swept, init.sweep_depths)
+    eyes = np.stack([v.camera.center for v in views])
+    plane = supporting_plane(search.distinct_points(), places, eyes, rng)
+    placed = search.place(swept, plane, find_sky, rng)
+    where, shade = placed.points, placed.colors
+    if at_random:
+        where, shade = scatter.everywhere(scenes, init.background_points, rng)
+    elif cloud is not None:
+        known, hues = scatter.behind_objects(*cloud, views, init.background_points, rng)
+        fill = rng.permutation(len(where))[: max(0, init.background_points - len(known))]
+        where, shade = np.concatenate([known, where[fill]]), np.concatenate([hues, shade[fill]])
+    log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
+    if len(where) == 0:
+        log.warning(
+            "the background cannot be placed: too little of it is seen by two cameras (there %s). Remedy: more cameras "
+            "that look at the same place",
+            "is one" if len(scenes) == 1 else f"are {len(scenes)}",
+        )
+    parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]
+    casters = np.zeros(0, np.int64)
+    shadow_slope = np.zeros(3)
+    if plane is not None and config.train.shadows and init.shadow_points > 0 and not still:
+        casters = np.arange(1, bodies)
+        light = shadows.find_light(views, scenes, places, times, plane, rng)
+        shadow_slope = shadows.slope(light.direction, plane[0])
+        log.info("light travels along %s (darkening %.3f)", np.round(light.direction, 2), light.darkening)
+        for body in casters:
+            radius, group = float(places.radii[body - 1]), bodies + int(body) - 1
+            parts.append(
+                place_gaussians.shadow(centers[body], radius, light.direction, plane, group, init.shadow_points, rng)
+            )
+    gaussians = place_gaussians.gaussians_of(parts, config.train.sh_degree)
+    tracks = FirstTracks(times, centers, translations, casters, None if plane is None else plane[0], shadow_slope)
+    known = evidence.gather(views, places, times)
+    ids = np.concatenate([[0], places.object_ids])
+    return Start(gaussians, tracks, ids, places, first, plane, placed.sky, known)
+
+
+def supporting_plane(
+    background: np.ndarray, places: triangulation.Places, eyes: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, float] | None:
+    """The plane that carries the objects: the one with most background points, objects and cameras on one side of it.
+
+    Args:
+        background: Background points. [P, 3]
+        places: Where the objects are.
+        eyes: Centres of the cameras. [V, 3]
+        rng: Source of the draws (RANSAC).
+
+    Returns:
+        Unit normal towards the cameras and offset h in n . x = h, or None where no plane holds a fifth of the points.
+    """
+    tolerance = 0.05
+    if len(background) < 50:
+        return None
+    inside = np.concatenate([places.centers[places.measured], eyes])
+    best: np.ndarray | None = None
+    for _ in range(500):
+        a, b, c = background[rng.choice(len(background), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-6:
+            continue
+        normal /= length
+        side = (inside - a) @ normal
+        if np.median(side) < 0:
+            normal, side = -normal, -side
+        if (side < -tolerance).mean() > 0.05:
+            continue
+        near = np.abs((background - a) @ normal) < tolerance
+        if best is None or near.sum() > best.sum():
+            best = near
+    if best is None or best.sum() < 0.2 * len(background):
+        return None
+    inliers = background[best]
+    middle = np.median(inliers, axis=0)
+    normal = np.linalg.svd(inliers - inliers.mean(0), full_matrices=False)[2][2]
+    normal = normal if np.median((inside - middle) @ normal) > 0 else -normal
+    return normal, float(np.median(inliers @ normal))
+
+
+def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
+    """Views of one observed time, which show what moves at one place; all where few cameras look at that time."""
+    then = [v for v in views if nearest_knot(times, v.t) == knot]
+    return then if len({plane_sweep.camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
+
+
+def _first_time(places: triangulation.Places, count: int) -> int:
+    """The time at which most objects are well seen; of equal ones the middle one, so that drift is least."""
+    if len(places.object_ids) == 0:
+        return 0
+    total = np.where(places.measured, places.visibility + SEEN_AT_ALL, 0.0).sum(0)
+    good = np.flatnonzero(total >= 0.9 * total.max())
+    return int(good[np.argmin(np.abs(good - (count - 1) / 2))])
+
+
+def _reference_time(visibility: np.ndarray, measured: np.ndarray, first: int) -> int:
+    """The well-seen time of an object that is nearest to the first one."""
+    score = np.where(measured, visibility + SEEN_AT_ALL, 0.0)
+    good = np.flatnonzero(score >= 0.75 * score.max())
+    return int(good[np.argmin(np.abs(good - first))])

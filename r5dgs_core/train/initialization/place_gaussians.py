@@ -1,0 +1,133 @@
+"""Gaussians as they are first placed: of bodies, of the background, and of shadows on the plane that carries them.
+
+Notation: P points. Lengths are in normalised coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from ...model.gaussians import Gaussians
+from ...scene import sh_color
+from . import shadows
+
+SHADOW_OPACITY = 0.03
+SHADOW_LIFT = (0.02, 0.01)  # least height over the plane and its spread
+SHADOW_THICKNESS = 0.01
+SCALES = (0.005, 0.2)  # bounds of the first standard deviations
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points that become Gaussians.
+
+    Attributes:
+        means: Centres. [P, 3]
+        colors: Display-referred RGB in [0, 1]. [P, 3]
+        labels: Motion group. [P]
+        opacities: In (0, 1). [P]
+        log_scales: Logarithms of the standard deviations. [P, 3]
+        quats: Unit wxyz. [P, 4]
+    """
+
+    means: np.ndarray
+    colors: np.ndarray
+    labels: np.ndarray
+    opacities: np.ndarray
+    log_scales: np.ndarray
+    quats: np.ndarray
+
+
+def solid(clouds: Sequence[tuple[np.ndarray, np.ndarray, int]], opacity: float) -> Points:
+    """Round Gaussians as wide as their distance to each other, over all clouds.
+
+    Args:
+        clouds: Centres [P, 3], colours [P, 3] and motion group of each cloud.
+        opacity: Of all of them.
+    """
+    means = np.concatenate([where for where, _, _ in clouds])
+    return Points(
+        means,
+        np.concatenate([shade for _, shade, _ in clouds]),
+        np.concatenate([np.full(len(where), group) for where, _, group in clouds]),
+        np.full(len(means), opacity),
+        _neighbour_scales(means),
+        np.tile([1.0, 0, 0, 0], (len(means), 1)),
+    )
+
+
+def shadow(
+    center: np.ndarray,
+    radius: float,
+    light: np.ndarray,
+    plane: tuple[np.ndarray, float],
+    group: int,
+    count: int,
+    rng: np.random.Generator,
+) -> Points:
+    """Faint, flat, dark Gaussians on the plane where the light throws a body's shadow.
+
+    Args:
+        center: Of the body. [3]
+        radius: Of the body.
+        light: Unit direction that the light travels in. [3]
+        plane: Unit normal and offset of the supporting plane.
+        group: Motion group of the shadow.
+        count: Gaussians wanted.
+        rng: Source of the draws.
+    """
+    normal, _ = plane
+    jitter = rng.normal(size=(count, 3)) * 0.6 * radius
+    lift = SHADOW_LIFT[0] + SHADOW_LIFT[1] * rng.random(count)
+    jitter += (lift - jitter @ normal)[:, None] * normal
+    size = np.full((count, 3), 0.25 * radius)
+    size[:, 2] = SHADOW_THICKNESS
+    return Points(
+        shadows.cast(center, light, plane) + jitter,
+        np.zeros((count, 3)),
+        np.full(count, group),
+        np.full(count, SHADOW_OPACITY),
+        np.log(size),
+        np.tile(_quat_from_z(normal), (count, 1)),
+    )
+
+
+def gaussians_of(parts: Sequence[Points], sh_degree: int) -> Gaussians:
+    """Canonical Gaussians of all parts, in their order."""
+    means, colors, labels, opacities, log_scales, quats = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("means", "colors", "labels", "opacities", "log_scales", "quats")
+    )
+    params = {
+        "means": means,
+        "quats": quats,
+        "log_scales": log_scales,
+        "opacity_logits": np.log(opacities / (1 - opacities)),
+        "sh": sh_color.rgb_to_dc(colors)[:, None, :],
+        "sh_rest": np.zeros((len(means), (sh_degree + 1) ** 2 - 1, 3)),
+        "shading": np.zeros((len(means), 3)),
+    }
+    return Gaussians(
+        {name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in params.items()},
+        torch.from_numpy(labels.astype(np.int64)),
+    )
+
+
+def _neighbour_scales(points: np.ndarray) -> np.ndarray:
+    """Logarithm of the mean distance to the three nearest neighbours, bounded. [P, 3]"""
+    if len(points) < 4:
+        return np.full((len(points), 3), np.log(0.05))
+    distance, _ = KDTree(points).query(points, k=4)
+    return np.repeat(np.log(np.clip(distance[:, 1:].mean(1), *SCALES))[:, None], 3, axis=1)
+
+
+def _quat_from_z(normal: np.ndarray) -> np.ndarray:
+    """Rotation that takes the z axis to ``normal``, wxyz."""
+    axis = np.cross([0.0, 0, 1], normal)
+    quat = np.array([1 + normal[2], *axis])
+    return np.array([0.0, 1, 0, 0]) if np.linalg.norm(quat) < 1e-6 else quat / np.linalg.norm(quat)

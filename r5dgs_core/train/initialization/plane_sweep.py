@@ -1,0 +1,393 @@
+"""Initialisation of the static background: a plane sweep over what every camera sees behind the objects.
+
+Each camera's images are reduced to one picture without objects (median over time of the pixels that no mask covers).
+For a grid of its rays, a range of depths is tried; a depth is good where the other cameras see the same colour there.
+Rays on which infinity is as good as any depth show sky and place nothing: the learned background colour takes them.
+
+Notation: B backdrops, [h, w] a grid of rays, D depths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
+from scipy.spatial import ConvexHull, KDTree
+
+from ...data import masks
+from ...scene import cameras
+from ..train_views import TrainView, spread
+from . import sky
+
+MAX_BACKDROPS = 24
+MAX_NEIGHBOURS = 8
+MAX_FRAMES = 31  # of one camera, for the median
+MEDIAN_VALUES = 1 << 23  # colours that are sorted at a time
+COST_VALUES = 1 << 22  # depths of rays that are compared at a time
+NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
+INFINITE = 1e5
+PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
+SAME = 0.012  # colour difference that tells nothing
+GOOD = 0.12  # larger colour differences are no match
+CONFIRMATIONS = 2  # other cameras that must agree on a depth
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """What one camera sees without the objects: image [H, W, 3] in [0, 1] and where it is known [H, W]."""
+
+    camera: cameras.Camera
+    image: np.ndarray
+    known: np.ndarray
+
+
+def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
+    """Median over time of the unmasked pixels, one per distinct camera."""
+    result = []
+    for group in by_camera(views, MAX_BACKDROPS):
+        frames = spread(group, MAX_FRAMES)
+        free = _free(frames)
+        image = _median([v.image for v in frames], free)
+        result.append(Backdrop(group[0].camera, image, np.asarray(free.any(0))))
+    return result
+
+
+def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
+    """Median of the pixels that are free, 0 where none is, band by band so that little memory is taken.
+
+    Args:
+        images: F images. [H, W, 3] uint8
+        free: Which of their pixels count. [F, H, W] bool
+
+    Returns:
+        Colours in [0, 1]. [H, W, 3] float32
+    """
+    count, height, width = free.shape
+    result = np.zeros((height, width, 3), np.float32)
+    rows = max(1, MEDIAN_VALUES // (3 * count * width))
+    for top in range(0, height, rows):
+        band = slice(top, top + rows)
+        values = np.stack([image[band] for image in images]).astype(np.int16)
+        values[~free[:, band]] = 256  # after all colours
+        values.sort(axis=0)
+        free_count = free[:, band].sum(0)
+        low, high = (
+            np.take_along_axis(values, np.broadcast_to(k[None, ..., None], (1, *values.shape[1:])), 0)[0]
+            for k in (np.maximum(free_count - 1, 0) // 2, np.minimum(free_count // 2, count - 1))
+        )
+        middle = (low + high).astype(np.float32) / np.float32(510)
+        result[band] = np.where((free_count > 0)[..., None], middle, np.float32(0))
+    return result
+
+
+def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
+    """Views that share pose, lens and size; a spread of ``limit`` cameras where there are more."""
+    groups: dict[bytes, list[TrainView]] = {}
+    for view in views:
+        groups.setdefault(camera_key(view.camera), []).append(view)
+    return spread(list(groups.values()), limit)
+
+
+def camera_key(camera: cameras.Camera) -> bytes:
+    """Equal for cameras of the same pose, lens and image size."""
+    size = np.array([camera.width, camera.height])
+    return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()
+
+
+def _free(frames: Sequence[TrainView]) -> np.ndarray:
+    """Pixels that show the background in each frame of a camera. [F, H, W] bool
+
+    Of what a mask does not know is background what no mask of the camera ever knows.
+    """
+    free = np.ones((len(frames), *frames[0].image.shape[:2]), bool)
+    told = np.zeros(free.shape[1:], bool)
+    for k, view in enumerate(frames):
+        if view.mask is not None:
+            free[k] = np.logical_not(ndimage.binary_dilation(view.mask > 0))
+            told |= view.mask != masks.UNKNOWN
+        else:
+            told[:] = True
+    free |= ~told
+    for k, view in enumerate(frames):
+        if view.alpha is not None:
+            free[k] &= view.alpha > 127
+    return free
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Background points [P, 3], their colours [P, 3], and coefficients of the sky [9, 3] or None."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    sky: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Rays:
+    """What the sweep found along the rays of one backdrop.
+
+    Attributes:
+        backdrop: Index of the backdrop.
+        directions: Ray directions scaled to depth 1, world. [h, w, 3]
+        colors: Colour of each ray. [h, w, 3]
+        depths: Best depth of each ray. [h, w]
+        costs: Its colour difference to the other cameras, infinite where nothing was comparable. [h, w]
+        flat: Whether most depths are about as good, as on sky and on plain surfaces. [h, w] bool
+        sky: Whether infinity is about as good. [h, w] bool
+        known: Whether the colour is known. [h, w] bool
+        neighbours: Backdrops that it was compared with.
+    """
+
+    backdrop: int
+    directions: np.ndarray
+    colors: np.ndarray
+    depths: np.ndarray
+    costs: np.ndarray
+    flat: np.ndarray
+    sky: np.ndarray
+    known: np.ndarray
+    neighbours: tuple[int, ...]
+
+
+class Sweep:
+    """A plane sweep over all backdrops.
+
+    Args:
+        scenes: Backdrops of the cameras.
+        count: Number of points that will be asked for; sets how many rays are tried.
+        depths: Depths tried per ray, evenly spaced in inverse depth.
+    """
+
+    def __init__(self, scenes: Sequence[Backdrop], count: int, depths: int):
+        self.scenes = scenes
+        self._images = [
+            torch.from_numpy(ndimage.gaussian_filter(b.image, (0.7, 0.7, 0))).permute(2, 0, 1)[None] for b in scenes
+        ]
+        self._known = [torch.from_numpy(b.known.astype(np.float32))[None, None] for b in scenes]
+        inverse = np.linspace(1 / NEAREST, 1 / FARTHEST, depths)
+        self._step = float(inverse[0] - inverse[-1]) / max(1, depths - 1)
+        z = np.append(1 / inverse, INFINITE)
+        each = max(256, 5 * count // max(1, len(scenes)))
+        self.rays = [r for i in range(len(scenes)) if (r := self._sweep(i, z, each)) is not None]
+
+    def _sweep(self, i: int, z: np.ndarray, rays_each: int) -> Rays | None:
+        reference = self.scenes[i]
+        centers = np.stack([b.camera.center for b in self.scenes])
+        ahead = np.stack([b.camera.forward for b in self.scenes]) @ reference.camera.forward
+        order = np.argsort(np.linalg.norm(centers - centers[i], axis=1) - 2 * ahead)
+        neighbours = tuple(int(j) for j in order if j != i and ahead[j] > -0.2)[:MAX_NEIGHBOURS]
+        if not neighbours:
+            return None
+        height, width = reference.image.shape[:2]
+        stride = max(1, int(np.sqrt(height * width / rays_each)))
+        rows, cols = np.meshgrid(
+            np.arange(stride // 2, height, stride), np.arange(stride // 2, width, stride), indexing="ij"
+        )
+        directions = cameras.pixel_rays(reference.camera)[rows, cols]
+        directions = directions / (directions @ reference.camera.forward)[..., None]
+        colors = reference.image[rows, cols]
+        cost = _smooth(self._compare(i, directions, z, colors, neighbours))
+        best, at = cost[..., :-1].min(-1)
+        low = cost <= best[..., None] + SAME
+        comparable = torch.isfinite(cost[..., :-1]).sum(-1)
+        flat = low[..., :-1].sum(-1) > 0.5 * comparable
+        known = reference.known[rows, cols]
+        costs = np.where(known, best.numpy(), np.inf)
+        return Rays(i, directions, colors, z[at.numpy()], costs, flat.numpy(), low[..., -1].numpy(), known, neighbours)
+
+    def _compare(
+        self, i: int, directions: np.ndarray, depths: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]
+    ) -> torch.Tensor:
+        """Colour difference of rays [h, w, 3] at depths [D] or [h, w, D] to the neighbours, band by band. [h, w, D]"""
+        others = [(self.scenes[j].camera, self._images[j], self._known[j]) for j in neighbours]
+        height, width = directions.shape[:2]
+        rows = max(1, COST_VALUES // (width * depths.shape[-1] * max(1, len(others))))
+        bands = []
+        for top in range(0, height, rows):
+            band = slice(top, top + rows)
+            z = depths if depths.ndim == 1 else depths[band]
+            world = self.scenes[i].camera.center + directions[band][:, :, None] * z[..., None]
+            bands.append(_cost(torch.from_numpy(world).float(), torch.from_numpy(colors[band]), others))
+        return torch.cat(bands)
+
+    def distinct_points(self) -> np.ndarray:
+        """Points on rays with one clear depth, for finding planes. [P, 3]"""
+        found = [
+            self.scenes[r.backdrop].camera.center + (r.directions * r.depths[..., None])[good]
+            for r in self.rays
+            if (good := (r.costs < GOOD) & ~r.flat & ~r.sky).any()
+        ]
+        return np.concatenate(found) if found else np.zeros((0, 3))
+
+    def place(
+        self, count: int, plane: tuple[np.ndarray, float] | None, find_sky: bool, rng: np.random.Generator
+    ) -> Placed:
+        """Draw background points and find the sky.
+
+        Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
+        which it was found, and, where the sky is known, everywhere near that is not sky. Rays that show sky place
+        nothing, nor do those on which any depth will do. The others are placed at their best depth if other cameras
+        confirm it.
+
+        Args:
+            count: Number of points wanted.
+            plane: Unit normal and offset of the supporting plane, or None.
+            find_sky: Whether there may be sky; not where the background's colour is given.
+            rng: Source of the draws.
+
+        Returns:
+            At most ``count`` points; none where there is no parallax or nothing but sky.
+        """
+        if not self.rays:
+            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
+        eyes = [np.broadcast_to(self.scenes[r.backdrop].camera.center, r.directions.shape) for r in self.rays]
+        origin = _flatten(eyes)
+        direction, color = _flatten([r.directions for r in self.rays]), _flatten([r.colors for r in self.rays])
+        depth, cost = _flatten([r.depths for r in self.rays]), _flatten([r.costs for r in self.rays])
+        clear = (cost < GOOD) & ~_flatten([r.flat | r.sky for r in self.rays])
+        plane_depth, plane_cost = np.ones(len(cost)), np.full(len(cost), np.inf)
+        supported = np.zeros(len(cost), bool)
+        if plane is not None:
+            hits = [self._on_plane(r, plane) for r in self.rays]
+            plane_depth, plane_cost = (_flatten([hit[k] for hit in hits]) for k in (0, 1))
+            support = _Support(self.distinct_points(), plane)
+            supported = np.isfinite(plane_cost) & support(origin + direction * plane_depth[:, None])
+        candidates = _flatten([r.known for r in self.rays]) & ~supported & find_sky
+        unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        found = sky.fit(unit, color, candidates, self._up())
+        is_sky = found[1] if found is not None else np.zeros(len(cost), bool)
+        as_good = (plane_cost <= np.minimum(cost + 2 * SAME, GOOD)) & np.isfinite(cost)
+        on_plane = as_good & (supported | ((plane_depth < PLANE_REACH) & (found is not None)))
+        depth = np.where(on_plane, plane_depth, depth)
+        points = origin + direction * depth[:, None]
+        usable = (on_plane | (clear & self._confirmed(points, depth))) & ~is_sky
+        points = points[usable]
+        coefficients = found[0] if found is not None else None
+        if len(points) == 0:
+            return Placed(np.zeros((0, 3)), np.zeros((0, 3)), coefficients)
+        weights = 1 / (0.02 + cost[usable])
+        chosen = rng.choice(len(points), min(count, len(points)), replace=False, p=weights / weights.sum())
+        return Placed(points[chosen], color[usable][chosen], coefficients)
+
+    def _confirmed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Mask of points at whose depth other cameras found a surface, too. [P] bool
+
+        A match between repeated or smooth patterns gives a depth that no other camera's best match agrees with. This
+        is the geometric consistency check of multi-view stereo: at least `CONFIRMATIONS` other cameras (one, if there
+        are only two cameras) have a depth within one step of the sweep beside the point's pixel.
+
+        Args:
+            points: Points on all rays, in the order of the rays. [P, 3]
+            depth: Depth of each in its own camera. [P]
+        """
+        owner = np.concatenate([np.full(r.depths.size, k) for k, r in enumerate(self.rays)])
+        maps = np.split(depth, np.cumsum([r.depths.size for r in self.rays])[:-1])
+        agreed = np.zeros(len(points), int)
+        for k, (rays, values) in enumerate(zip(self.rays, maps, strict=True)):
+            camera = self.scenes[rays.backdrop].camera
+            T, (height, width) = camera.T_cam_world, rays.depths.shape
+            x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                column = (camera.intrinsics[0, 0] * x / z + camera.intrinsics[0, 2]) / camera.width * width
+                row = (camera.intrinsics[1, 1] * y / z + camera.intrinsics[1, 2]) / camera.height * height
+                visible = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height) & (owner != k)
+            row, column = row[visible].astype(int), column[visible].astype(int)
+            inverse = np.pad(1 / values.reshape(height, width), 1, mode="edge")
+            beside = sliding_window_view(inverse, (3, 3)).reshape(height, width, 9)[row, column]
+            agreed[visible] += (np.abs(beside - 1 / z[visible, None]) <= self._step).any(1)
+        return agreed >= min(CONFIRMATIONS, len(self.rays) - 1)
+
+    def _up(self) -> np.ndarray:
+        """Mean upward direction of the cameras, unit. [3]"""
+        up = -np.stack([b.camera.T_cam_world[1, :3] for b in self.scenes]).mean(0)
+        return up / max(float(np.linalg.norm(up)), 1e-9)
+
+    def _on_plane(self, rays: Rays, plane: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Depth at which each ray meets a plane, and the colour difference there (infinite where it does not)."""
+        normal, height = plane
+        center = self.scenes[rays.backdrop].camera.center
+        slope = rays.directions @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (height - center @ normal) / slope
+        hits = np.isfinite(depth) & (depth > NEAREST) & (depth < FARTHEST)
+        depth = np.where(hits, depth, 1.0)
+        compared = self._compare(rays.backdrop, rays.directions, depth[..., None], rays.colors, rays.neighbours)
+        cost = _smooth(compared)[..., 0].numpy()
+        return depth, np.where(hits, cost, np.inf)
+
+
+def _flatten(grids: Sequence[np.ndarray]) -> np.ndarray:
+    """Values of all rays in one row: grids [h, w, ...] to [P, ...]."""
+    return np.concatenate([grid.reshape(-1, *grid.shape[2:]) for grid in grids])
+
+
+def plane_axes(normal: np.ndarray) -> np.ndarray:
+    """Two unit vectors that span the plane of a unit normal, perpendicular to each other. [2, 3]"""
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(normal, u)])
+
+
+class _Support:
+    """The part of a plane that distinct points outline: their convex hull in the plane, stray ones left out."""
+
+    def __init__(self, points: np.ndarray, plane: tuple[np.ndarray, float]):
+        normal, height = plane
+        self._axes = plane_axes(normal)
+        flat = points[np.abs(points @ normal - height) < 0.1] @ self._axes.T
+        if len(flat) > 4000:
+            flat = flat[:: len(flat) // 4000]
+        if len(flat) >= 10:
+            near = KDTree(flat).query(flat, k=10)[0][:, -1]
+            flat = flat[near <= 3 * np.median(near)]
+        self._sides = ConvexHull(flat).equations if len(flat) >= 10 else None
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Whether points [..., 3] near the plane lie in that part. [...]"""
+        if self._sides is None:
+            return np.zeros(points.shape[:-1], bool)
+        # The sides' half-planes; searching a triangulation takes seconds where many points lie outside.
+        flat = points @ self._axes.T
+        return np.logical_and.reduce([flat @ side[:2] + side[2] <= 0 for side in self._sides])
+
+
+def _cost(world: torch.Tensor, color: torch.Tensor, others) -> torch.Tensor:
+    """Colour difference to the better half of the neighbours that see the point. [h, w, D]"""
+    gaps = []
+    for camera, image, known in others:
+        T = torch.from_numpy(camera.T_cam_world).float()
+        p_cam = world @ T[:3, :3].T + T[:3, 3]
+        depth = p_cam[..., 2]
+        k = camera.intrinsics
+        u = (k[0, 0] * p_cam[..., 0] / depth + k[0, 2]) / camera.width * 2 - 1
+        v = (k[1, 1] * p_cam[..., 1] / depth + k[1, 2]) / camera.height * 2 - 1
+        h, w, d = depth.shape
+        grid = torch.stack([u, v], -1).reshape(1, h, w * d, 2).clamp(-2, 2)
+        sample = F.grid_sample(image, grid, align_corners=False, padding_mode="border")[0].reshape(3, h, w, d)
+        free = F.grid_sample(known, grid, align_corners=False)[0, 0].reshape(h, w, d)
+        gap = (sample.permute(1, 2, 3, 0) - color[:, :, None]).abs().mean(-1)
+        seen = (depth > 1e-3) & (u.abs() < 1) & (v.abs() < 1) & (free > 0.5)
+        gaps.append(torch.where(seen, gap, torch.inf))
+    ranked = torch.stack(gaps).sort(0).values
+    seen = torch.isfinite(ranked)
+    counts = seen.sum(0)
+    half = torch.maximum((counts + 1) // 2, counts.clamp(max=2))
+    use = torch.arange(len(gaps))[:, None, None, None] < half
+    total = torch.where(use & seen, ranked, 0.0).sum(0) / half.clamp(min=1)
+    return torch.where(counts >= min(2, len(gaps)), total, torch.inf)
+
+
+def _smooth(cost: torch.Tensor) -> torch.Tensor:
+    """Mean of the finite costs in a 3 x 3 block of rays: a surface is smooth across neighbouring rays. [h, w, D]"""
+    finite = torch.isfinite(cost)
+    volume = torch.where(finite, cost, 0.0).permute(2, 0, 1)[:, None]
+    weight = finite.float().permute(2, 0, 1)[:, None]
+    box = torch.ones(1, 1, 3, 3)
+    mean = F.conv2d(volume, box, padding=1) / F.conv2d(weight, box, padding=1).clamp(min=1)
+    return torch.where(finite, mean[:, 0].permute(1, 2, 0), torch.inf)

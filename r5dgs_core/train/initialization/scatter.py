@@ -1,0 +1,75 @@
+"""Backgrounds that need no matching of images: points at random where cameras look, and those of a reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...data import masks
+from ...scene import cameras
+from ..normalization import TARGET_DISTANCE
+from ..train_views import TrainView
+from .plane_sweep import Backdrop
+from .visual_hull import pixel_indices
+
+REACH = 1.5  # half the side of the cube that points are drawn from, in distances of the cameras from their focus
+BATCHES = 64
+
+
+def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw points that at least two cameras see, or one where there is only one.
+
+    Args:
+        scenes: What each camera sees; normalised coordinates.
+        count: Points wanted; fewer where the cameras see hardly any of the space about their focus.
+        rng: Source of the draws.
+
+    Returns:
+        Points [P, 3] and colours near middle grey [P, 3].
+    """
+    needed = min(2, len(scenes))
+    kept, found = [np.zeros((0, 3))], 0
+    for _ in range(BATCHES):
+        points = rng.uniform(-REACH * TARGET_DISTANCE, REACH * TARGET_DISTANCE, (count, 3))
+        seen = np.zeros(len(points), np.int64)
+        for scene in scenes:
+            pixels, depth = cameras.project(scene.camera, points)
+            with np.errstate(invalid="ignore"):
+                inside = (pixels >= 0).all(1) & (pixels < [scene.camera.width, scene.camera.height]).all(1)
+            seen += inside & (depth > 0)
+        kept.append(points[seen >= needed])
+        found += len(kept[-1])
+        if found >= count:
+            break
+    where = np.concatenate(kept)[:count]
+    return where, np.clip(0.5 + 0.1 * rng.standard_normal(where.shape), 0, 1)
+
+
+def behind_objects(
+    points: np.ndarray, colors: np.ndarray, views: Sequence[TrainView], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a reconstruction that belong to the background.
+
+    Args:
+        points: Points, normalised coordinates. [P, 3]
+        colors: Their colours. [P, 3]
+        views: Training views.
+        count: Most points that are wanted.
+        rng: Source of the draws.
+
+    Returns:
+        Those that masks put on objects in less than a third of the views that have them in the frame. [Q, 3] each
+    """
+    shown, covered = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        if view.mask is None:
+            continue
+        columns, rows, valid = pixel_indices(view, points)
+        ids = view.mask[rows, columns]
+        valid &= ids != masks.UNKNOWN
+        shown += valid
+        covered += valid & (ids > 0)
+    free = np.flatnonzero(covered <= shown / 3)
+    kept = np.sort(rng.permutation(free)[:count])
+    return points[kept], colors[kept]

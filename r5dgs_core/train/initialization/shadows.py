@@ -1,0 +1,127 @@
+"""Where shadows start: the direction of the light, found from how the support darkens while objects move above it.
+
+A point x at height above the supporting plane n . x = h, lit along the direction l, throws its shadow on
+x - ((n . x - h) / (n . l)) l. For a moving object the support is darker there than it usually is; the direction along
+which this holds best, over all objects, times and cameras, is the light's.
+
+Notation: L candidate directions, M objects, S times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ..train_views import TrainView, nearest_knot
+from .plane_sweep import Backdrop, camera_key, plane_axes
+from .triangulation import Places
+from .visual_hull import pixel_indices
+
+CANDIDATES = 400
+LOWEST_SINE = 0.25  # light from under 15 degrees throws shadows too long to follow
+MIN_DARKENING = 0.01  # share of brightness; less is no evidence of a direction
+SAMPLES = 9  # points of a shadow's disc that are looked at
+
+
+@dataclass(frozen=True)
+class Light:
+    """Direction in which light travels, unit [3], and the darkening that supports it (0 where it was assumed)."""
+
+    direction: np.ndarray
+    darkening: float
+
+
+def find_light(
+    views: Sequence[TrainView],
+    scenes: Sequence[Backdrop],
+    places: Places,
+    times: np.ndarray,
+    plane: tuple[np.ndarray, float],
+    rng: np.random.Generator,
+) -> Light:
+    """Find the direction of the light.
+
+    Args:
+        views: Training views.
+        scenes: What each camera usually sees behind the objects.
+        places: Where the objects are at each time.
+        times: The observed times. [S]
+        plane: Unit normal and offset of the supporting plane.
+        rng: Source of the sampled points.
+
+    Returns:
+        The direction that the images support best; straight down where none is supported.
+    """
+    normal, height = plane
+    directions = _directions(normal)
+    score = np.zeros(len(directions))
+    count = np.zeros(len(directions))
+    backdrop_of = {camera_key(b.camera): b for b in scenes}
+    offsets = _disc(normal, rng)
+    for view in views:
+        backdrop = backdrop_of.get(camera_key(view.camera))
+        if backdrop is None:
+            continue
+        darkening, known = _darkening(view, backdrop)
+        s = nearest_knot(times, view.t)
+        for row in np.flatnonzero(places.measured[:, s]):
+            center = places.centers[row, s]
+            above = center @ normal - height
+            if above <= 0:
+                continue
+            shadow = center - above / (directions @ normal)[:, None] * directions
+            points = shadow[:, None] + 0.6 * places.radii[row] * offsets
+            columns, rows, valid = pixel_indices(view, points.reshape(-1, 3))
+            seen = (valid & known[rows, columns]).reshape(len(directions), -1)
+            values = np.where(seen, darkening[rows, columns].reshape(seen.shape), 0.0)
+            score += values.sum(1)
+            count += seen.sum(1)
+    enough = count >= 0.2 * max(count.max(), 1)
+    mean = np.where(enough, score / np.maximum(count, 1), -np.inf)
+    best = int(np.argmax(mean))
+    if mean[best] < MIN_DARKENING:
+        return Light(-normal, 0.0)
+    return Light(directions[best], float(mean[best]))
+
+
+def cast(points: np.ndarray, light: np.ndarray, plane: tuple[np.ndarray, float]) -> np.ndarray:
+    """Shadows of points on the plane along the light. [..., 3]"""
+    normal, height = plane
+    return points - ((points @ normal - height) / (light @ normal))[..., None] * light
+
+
+def slope(light: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """How far a shadow shifts in the plane per unit that its caster rises. [3]"""
+    return normal - light / (light @ normal)
+
+
+def _directions(normal: np.ndarray) -> np.ndarray:
+    """Directions against the normal, evenly spread, straight down first. [L, 3]"""
+    k = np.arange(CANDIDATES) + 0.5
+    sine = 1 - (1 - LOWEST_SINE) * k / CANDIDATES
+    angle = np.pi * (1 + 5**0.5) * k
+    u, v = plane_axes(normal)
+    cosine = np.sqrt(1 - sine**2)
+    spread = cosine[:, None] * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v) - sine[:, None] * normal
+    return np.concatenate([-normal[None], spread])
+
+
+def _disc(normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    points = rng.normal(size=(SAMPLES, 3))
+    points -= (points @ normal)[:, None] * normal
+    points *= np.sqrt(rng.random((SAMPLES, 1))) / np.linalg.norm(points, axis=1, keepdims=True)
+    points[0] = 0.0
+    return points
+
+
+def _darkening(view: TrainView, backdrop: Backdrop) -> tuple[np.ndarray, np.ndarray]:
+    """Share of brightness that a view lacks, and where this can be said. [H, W] each"""
+    usual = backdrop.image.mean(-1)
+    now = view.image.mean(-1) / 255
+    known = backdrop.known & (usual > 0.02)
+    if view.mask is not None:
+        known &= np.logical_not(ndimage.binary_dilation(view.mask > 0))
+    return np.where(known, 1 - now / np.maximum(usual, 0.02), 0.0), known

@@ -1,0 +1,237 @@
+"""Where each object is at each observed time, from its masks alone.
+
+A mask's centroid gives a ray per view. One path per object is fitted to the rays of all times: near them, and with
+little acceleration. Where several views see the object the rays decide; where one does, or none, the path goes on
+smoothly, and at constant velocity beyond the last sighting.
+
+Notation: M objects, S observed times, V views. The path's time u runs from 0 to 1 over the observed span.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ...data import masks
+from ..train_views import TrainView, nearest_knot
+
+log = logging.getLogger(__name__)
+
+RAY_NOISE = 0.01  # distance of a centroid's ray from the object's middle, normalised units
+ACCELERATION = 10.0  # standard deviation of the path's acceleration, units per squared span: about that of a throw
+VELOCITY = 30.0  # the same of its velocity: brings a path to rest, slowly, where nothing is seen for long
+DEPTH_NOISE = 3.0  # what is known of an object's depth beforehand: it is about that of the cameras' focus
+CUT_OFF = 0.003  # weight of masks that the image's border cuts
+PLACED = 0.05  # standard deviation of a place that counts as measured, normalised units
+ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places of the objects over time.
+
+    Attributes:
+        object_ids: Ids that occur in the masks. [M]
+        centers: Centres, along a smooth path where they could not be measured. [M, S, 3]
+        measured: Times at which the masks tell the centre. [M, S] bool
+        visibility: Share of the views at that time that show the whole object, weighted by its area. [M, S]
+        radii: Radius of a ball that holds the object. [M]
+        evidence: Area that the masks of that time show, as a share of what is usual for the object, at most 1. [M, S]
+    """
+
+    object_ids: np.ndarray
+    centers: np.ndarray
+    measured: np.ndarray
+    visibility: np.ndarray
+    radii: np.ndarray
+    evidence: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Sighting:
+    knot: int
+    origin: np.ndarray
+    ray: np.ndarray
+    area: int
+    weight: float
+    angular_radius: float
+    whole: bool
+
+
+def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> Places:
+    """Find every object at every observed time.
+
+    Args:
+        views: Training views; those without a mask are passed over.
+        times: Observed times, increasing. [S]
+        min_share: Smaller masks do not vote, as a share of the image.
+
+    Returns:
+        The places. An object that is never seen from two sides gets the depth of the cameras' focus. One that a single
+        mask shows is left out: its place is unknown, and most often that mask is wrong.
+    """
+    found = _sightings(views, times, min_share)
+    ids = np.array(sorted(found), np.int64)
+    m, count = len(ids), len(times)
+    centers = np.zeros((m, count, 3))
+    measured = np.zeros((m, count), bool)
+    visibility, evidence = np.zeros((m, count)), np.zeros((m, count))
+    radii = np.zeros(m)
+    for row, object_id in enumerate(ids):
+        seen = found[int(object_id)]
+        for x in seen:
+            visibility[row, x.knot] += x.weight * x.whole
+            evidence[row, x.knot] += x.area
+        used = _votes(seen)
+        centers[row], measured[row] = _path(used, times)
+        if not measured[row].any():
+            log.warning(
+                "object %d is never seen whole enough from two sides: its depth is a guess. "
+                "Remedy: more cameras at the same times, or masks that follow it",
+                object_id,
+            )
+            measured[row, [x.knot for x in seen]] = True
+        sizes = [x.angular_radius * np.linalg.norm(centers[row, x.knot] - x.origin) for x in used]
+        radii[row] = np.quantile(sizes, 0.8)
+        evidence[row] /= np.median(evidence[row][evidence[row] > 0])
+    peak = visibility.max(axis=1, keepdims=True) if m else visibility
+    return Places(ids, centers, measured, visibility / np.maximum(peak, 1e-12), radii, np.minimum(evidence, 1.0))
+
+
+def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> dict[int, list[_Sighting]]:
+    """Sightings of each object that more than one mask shows."""
+    found: dict[int, list[_Sighting]] = {}
+    masked = [v for v in views if v.mask is not None]
+    for view in masked:
+        s = nearest_knot(times, view.t)
+        assert view.mask is not None
+        for object_id in np.unique(view.mask):
+            if object_id > 0 and object_id != masks.UNKNOWN:
+                sighting = _sight(view, s, int(object_id), min_share)
+                if sighting is not None:
+                    found.setdefault(int(object_id), []).append(sighting)
+    for object_id in [i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1]:
+        del found[object_id]
+        log.warning(
+            "object %d is shown by one mask only: it is left to the background. Remedy: correct the id in that mask, "
+            "or give masks of the object in other views",
+            object_id,
+        )
+    return found
+
+
+def _sight(view: TrainView, knot: int, object_id: int, min_share: float) -> _Sighting | None:
+    assert view.mask is not None
+    mask = view.mask == object_id
+    area = int(mask.sum())
+    if area < max(6, min_share * mask.size):
+        return None
+    rows, cols = np.nonzero(mask)
+    height, width = mask.shape
+    whole = rows.min() > 0 and cols.min() > 0 and rows.max() < height - 1 and cols.max() < width - 1
+    k = view.camera.intrinsics
+    u = (cols.mean() + 0.5 - k[0, 2]) / k[0, 0]
+    v = (rows.mean() + 0.5 - k[1, 2]) / k[1, 1]
+    ray = np.array([u, v, 1.0]) @ view.camera.T_cam_world[:3, :3]
+    reach = np.hypot((cols - cols.mean()) / k[0, 0], (rows - rows.mean()) / k[1, 1]).max() + 0.5 / k[0, 0]
+    norm = np.linalg.norm(ray)
+    weight = float(np.sqrt(area) * (1 - _touching(view.mask, object_id, rows, cols)) ** 2)
+    return _Sighting(knot, view.camera.center, ray / norm, area, weight, float(reach / norm), bool(whole))
+
+
+def _touching(mask: np.ndarray, object_id: int, rows: np.ndarray, cols: np.ndarray) -> float:
+    """Share of an outline at which another object begins, in front of it or behind; 0 to 1."""
+    part = mask[max(rows.min() - 1, 0) : rows.max() + 2, max(cols.min() - 1, 0) : cols.max() + 2]
+    here = part == object_id
+    ring = ndimage.binary_dilation(here) & ~here
+    return float((part[ring] > 0).mean()) if ring.any() else 0.0
+
+
+def _votes(seen: Sequence[_Sighting]) -> list[_Sighting]:
+    """The sightings that say where the object is: those of the whole object, where a time has two of them."""
+    whole = np.zeros(max(x.knot for x in seen) + 1, np.int64)
+    for x in seen:
+        whole[x.knot] += x.whole
+    return [x for x in seen if x.whole or whole[x.knot] < 2]
+
+
+def _path(seen: Sequence[_Sighting], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The path that is nearest to the sightings' rays.
+
+    Rays that miss it by much more than the others weigh less (masks that something in front cuts), and so does
+    an acceleration that is much larger than expected (an impact).
+
+    Returns:
+        Centres [S, 3] and the times at which rays tell them [S] bool.
+    """
+    count = len(times)
+    at = np.array([x.knot for x in seen])
+    origins, rays = np.stack([x.origin for x in seen]), np.stack([x.ray for x in seen])
+    weights = np.array([x.weight * (1.0 if x.whole else CUT_OFF) for x in seen])
+    weights = weights / weights.max()
+    projectors = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    guesses = origins + rays * np.linalg.norm(origins, axis=1, keepdims=True)
+    bends, bend_weights = _bends(times)
+    robust, kinks = _agreement(seen, weights, projectors, origins), np.ones(len(bends))
+    path = covariance = np.zeros(0)
+    for _ in range(ROUNDS):
+        precision = (weights * robust)[:, None, None] * projectors / RAY_NOISE**2
+        near = np.eye(3) * (weights / DEPTH_NOISE**2)[:, None, None]
+        smooth = bends.T @ ((bend_weights * kinks)[:, None] * bends)
+        system = np.zeros((count, 3, count, 3))
+        right = np.zeros((count, 3))
+        for axis in range(3):
+            system[:, axis, :, axis] += smooth
+        diagonal = np.zeros((count, 3, 3))
+        np.add.at(diagonal, at, precision + near)
+        system[np.arange(count), :, np.arange(count), :] += diagonal
+        np.add.at(right, at, np.einsum("nij,nj->ni", precision, origins) + np.einsum("nij,nj->ni", near, guesses))
+        covariance = np.linalg.inv(system.reshape(3 * count, 3 * count))
+        path = (covariance @ right.reshape(-1)).reshape(count, 3)
+        gaps = np.linalg.norm(np.einsum("nij,nj->ni", projectors, path[at] - origins), axis=1)
+        robust = 1 / (1 + (gaps / max(2 * 1.48 * np.median(gaps), RAY_NOISE)) ** 2)
+        kinks = 1 / (1 + bend_weights * ((bends @ path) ** 2).sum(1) / 9)
+    blocks = covariance.reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count), :]
+    measured = np.zeros(count, bool)
+    ahead = ((path[at] - origins) * rays).sum(1) > 0
+    measured[at] = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])[at] < PLACED
+    measured[at[~ahead]] = False
+    return path, measured
+
+
+def _bends(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Accelerations and velocities of a path as linear maps of its places [B, S], and their precisions [B]."""
+    count = len(times)
+    if count < 2:
+        return np.zeros((0, count)), np.zeros(0)
+    u = (times - times[0]) / (times[-1] - times[0])
+    h = np.diff(u)
+    secants = (np.eye(count)[1:] - np.eye(count)[:-1]) / h[:, None]
+    middle = 0.5 * (h[1:] + h[:-1])
+    accelerations = np.diff(secants, axis=0) / middle[:, None]
+    share = np.concatenate([middle, h]) * (count - 1)  # of the span that each stands for
+    noise = np.repeat([ACCELERATION, VELOCITY], [count - 2, count - 1])
+    return np.concatenate([accelerations, secants]), share / noise**2
+
+
+def _agreement(
+    seen: Sequence[_Sighting], weights: np.ndarray, projectors: np.ndarray, origins: np.ndarray
+) -> np.ndarray:
+    """How well each ray agrees with the others of its time, in (0, 1]; 1 where they leave the point open. [n]"""
+    at = np.array([x.knot for x in seen])
+    agreement = np.ones(len(seen))
+    for s in np.unique(at):
+        rows = np.flatnonzero(at == s)
+        for _ in range(4):
+            w = weights[rows] * agreement[rows]
+            system = np.einsum("n,nij->ij", w, projectors[rows])
+            if len(rows) < 3 or np.linalg.eigvalsh(system / w.sum())[0] < 1e-4:
+                break
+            point = np.linalg.solve(system, np.einsum("n,nij,nj->i", w, projectors[rows], origins[rows]))
+            gaps = np.linalg.norm(np.einsum("nij,nj->ni", projectors[rows], point - origins[rows]), axis=1)
+            agreement[rows] = 1 / (1 + (gaps / (2 * 1.48 * np.median(gaps) + 1e-9)) ** 2)
+    return agreement

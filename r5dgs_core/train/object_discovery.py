@@ -1,0 +1,232 @@
+"""Objects without masks: a short run of a field shows what moves, and what moves rigidly together is an object.
+
+The field's Gaussians that move are sorted into rigidly moving parts (`motion_clusters.py`), and each part's picture in
+each view is its mask. From there a run of tracks starts as one with masks does; the masks found serve its start alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from ..config import training_needs
+from ..config.config import Config
+from ..data.dataset import Dataset
+from ..motion import rotations
+from ..raster import rasterize_splats
+from . import motion_clusters
+from .representations import gating, representation
+from .representations.field import FieldRepresentation
+from .representations.fused_posing import Splats
+from .train_views import TrainView, spread
+from .trainer import Trainer
+
+log = logging.getLogger(__name__)
+
+JUDGES = 20  # views that say whether a part has to move
+GAIN = 2.0  # by how much worse they are drawn where it rests, dB
+OPAQUE = 0.3  # fainter Gaussians do not say what moves
+TOLERANCE = 0.02  # distance from a rigid motion that points which hardly travel may have, normalised units
+SPECK = 0.1  # smaller pieces of a mask are dropped, as a share of its largest piece
+NAME = "discovery"  # of its events
+CAP = 12000  # Gaussians of the short run
+
+
+def find(
+    dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
+) -> list[np.ndarray] | None:
+    """Masks of what moves, for the training views.
+
+    Args:
+        dataset: The data set.
+        config: Configuration of the run that the masks are for.
+        progress: Called with an event when it begins, now and then, and when it ends.
+
+    Returns:
+        Ids per pixel, 0 for what rests [H, W], for each training view; None where `training_needs.discovery`
+        says no or nothing moves.
+
+    Raises:
+        DatasetError, TrainingError: As of a run.
+    """
+    if not training_needs.discovery(dataset, config):
+        return None
+    progress = progress or (lambda event: None)
+    progress({"event": "prepare", "text": "no masks: looking for what moves"})
+    trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
+    if trainer.motion.name == representation.STILL:
+        return None
+    while not trainer.done:
+        trainer.step()
+        if trainer.iteration % config.train.log_every == 0 or trainer.done:
+            total = trainer.config.train.iterations
+            progress({"event": NAME, "done": trainer.iteration, "total": total, "unit": "steps"})
+    labels = parts(trainer, config)
+    count = int(labels.max(initial=-1)) + 1
+    progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
+    return masks(trainer, labels) if count > 0 else None
+
+
+def _short(config: Config, last: float) -> Config:
+    """The configuration of the short run: a small field on few Gaussians, without what only pictures need.
+
+    Args:
+        config: That of the run that it is for.
+        last: The last observed time, up to which the field reaches.
+    """
+    cap = config.densify.max_gaussians
+    return config.replace(
+        **{
+            "train.representation": "field",
+            "train.iterations": config.discovery.iterations,
+            "train.sh_degree": 0,
+            "train.shading": False,
+            "train.shadows": False,
+            "init.placement": "scene",
+            "densify.strategy": "share",
+            "densify.max_gaussians": min(cap, CAP) if cap else 0,
+            "field.size": "small",
+            "field.horizon": max(round(last, 9), 0.0),
+            "field.trd_share": 0.0,
+            "field.trd_steps": 0,
+            "field.place_steps": 0,
+            "field.tracks_share": 0.0,
+            "field.movers": "measured",
+            "field.gate": config.discovery.gate,
+            "field.still": config.discovery.still,
+            "identity.training": "off",
+        }
+        | {f"needs.{f.name}": "auto" for f in dataclasses.fields(config.needs)}
+    )
+
+
+def parts(trainer: Trainer, config: Config) -> np.ndarray:
+    """Rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
+    rows, opacities = _movers(trainer)
+    rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
+    return _labelled(trainer, config, rows, opacities, _paths(trainer, rows))
+
+
+def sort(trainer: Trainer) -> np.ndarray:
+    """Rigidly moving part of each Gaussian of a trained field, -1 for none: `parts`, with faint ones that go along. [N]
+
+    Args:
+        trainer: A finished run of a field.
+    """
+    rows, opacities = _movers(trainer)
+    paths, opaque = _paths(trainer, rows), opacities > OPAQUE
+    labels = _labelled(trainer, trainer.config, rows[opaque], opacities[opaque], paths[opaque])
+    labels[rows] = motion_clusters.attach(paths, opacities, TOLERANCE, labels[rows])
+    return labels
+
+
+def _labelled(
+    trainer: Trainer, config: Config, rows: np.ndarray, opacities: np.ndarray, paths: np.ndarray
+) -> np.ndarray:
+    """Part of each Gaussian of a field, by the paths of some rows; -1 for others and for none. [N]"""
+    rng = np.random.default_rng(config.train.seed)
+    labels = np.full(len(trainer.gaussians), -1)
+    labels[rows] = motion_clusters.find(paths, opacities, TOLERANCE, config.discovery.fewest, rng)
+    return needed(trainer, labels)
+
+
+@torch.no_grad()
+def _movers(trainer: Trainer) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians that a field moves, and their opacities. [R], [R]"""
+    motion, gaussians = trainer.motion, trainer.gaussians
+    assert isinstance(motion, FieldRepresentation)
+    rows = motion.movers(gaussians)
+    return rows.numpy(), torch.sigmoid(gaussians.opacity_logits[rows]).double().numpy()
+
+
+@torch.no_grad()
+def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
+    """Where a field's Gaussians are at the observed times. [R, S, 3]"""
+    motion = trainer.motion
+    assert isinstance(motion, FieldRepresentation)
+    means = trainer.gaussians.means[torch.from_numpy(rows)]
+    return (
+        torch.stack([means + motion.motion.deltas(means, float(t)).offsets for t in trainer.times], 1).double().numpy()
+    )
+
+
+@torch.no_grad()
+def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
+    """The labels without parts that might as well rest: fields also move what looks the same wherever it is. [N]
+
+    Each part is drawn as it moves and in its mean place; where it shows in either, the images decide.
+    """
+    count = int(labels.max(initial=-1)) + 1
+    errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)
+    motion, gaussians = trainer.motion, trainer.gaussians
+    assert isinstance(motion, FieldRepresentation)
+    mean = gating.rest(motion.motion, gaussians.means, gaussians.log_scales, trainer.times)
+    means, scales = gaussians.means + mean.offsets, (gaussians.log_scales + mean.log_scales).exp()
+    quats = rotations.multiply(mean.quats, gaussians.quats)
+    for view in spread(trainer.views, JUDGES):
+        moving = trainer.splats(view.camera, view.t)
+        error, ids = _drawn(trainer, view, moving, parts_of)
+        for k in range(count):
+            rests = (parts_of == k)[:, None]
+            resting = dataclasses.replace(
+                moving,
+                means=torch.where(rests, means, moving.means),
+                quats=torch.where(rests, quats, moving.quats),
+                scales=torch.where(rests, scales, moving.scales),
+            )
+            error_at_rest, ids_at_rest = _drawn(trainer, view, resting, parts_of)
+            region = (ids == k) | (ids_at_rest == k)
+            errors[:, k] += float(error[region].sum()), float(error_at_rest[region].sum())
+    gains = 10 * np.log10(np.maximum(errors[1], 1e-12) / np.maximum(errors[0], 1e-12))
+    log.info("parts: %s dB by moving", np.round(gains, 1))
+    kept = gains > GAIN
+    ranks = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+    return ranks[labels]
+
+
+def _drawn(trainer: Trainer, view: TrainView, splats: Splats, parts_of: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared error of a view's pixels, and the part that each of them shows. [H, W], [H, W]"""
+    shown = rasterize_splats(
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        splats.colors,
+        view.camera,
+        trainer.background.image(view.camera),
+        labels=parts_of,
+    )
+    assert shown.ids is not None
+    truth = torch.from_numpy(view.image).float() / 255
+    return (shown.image - truth).square().mean(-1), shown.ids
+
+
+@torch.no_grad()
+def masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
+    """Picture of the parts in each training view: the part k shows as k + 1, what rests as 0. [H, W]"""
+    kind = np.uint8 if labels.max() < 255 else np.uint16
+    result = []
+    for view in trainer.views:
+        _, ids = _drawn(trainer, view, trainer.splats(view.camera, view.t), torch.from_numpy(labels))
+        result.append(_without_specks((ids.numpy() + 1).clip(min=0).astype(kind)))
+    return result
+
+
+def _without_specks(mask: np.ndarray) -> np.ndarray:
+    """The mask without small pieces that lie apart from the largest of their id. [H, W]"""
+    kept = np.zeros_like(mask)
+    for k in range(1, int(mask.max()) + 1):
+        pieces = np.zeros(mask.shape, np.int32)
+        ndimage.label(mask == k, output=pieces)
+        sizes = np.bincount(pieces.ravel())
+        good = sizes >= SPECK * sizes[1:].max(initial=0)
+        good[0] = False
+        kept[good[pieces]] = k
+    return kept

@@ -1,0 +1,1 @@
+"""Motion representations of training: tracks, field and static, with residuals and regrouping."""

@@ -1,0 +1,350 @@
+"""The representation `field`: a deformation field for the observed time and the TRD for what follows (5DGS, R5DGS).
+
+Notation: N Gaussians, R of them moved by the networks, T the horizon of the deformation field. Network times are scene
+times moved and scaled so that the observed ones lie in [0, 1]; where they do already, they are used as they are.
+
+Within the horizon a training step draws a start t' = t -+ h, lets the field bring the Gaussians there and the TRD carry
+them to t in one step; past it, the TRD carries them from T to t. The TRD starts at positions without gradient: it is
+taught by its displacement, the field by the position itself.
+
+Source: TRACE's training scheme; movers alone, fits to places and to motion without images, and the cross-Gaussian twist
+loss are ours.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...config.config import Config
+from ...errors import CheckpointError, ConfigError
+from ...model import deformation, group_poses
+from ...model.gaussians import Gaussians
+from ...model.tracks import Tracks
+from ...model.trd import SHAPES as TRD_SHAPES
+from ...model.trd import TRD
+from ...motion import rotations
+from ...raster import shade
+from ...scene import sh_color
+from ...scene.cameras import Camera
+from ..observed_motion import ObservedMotion
+from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
+from .field_motion import Clock, Motion
+
+log = logging.getLogger(__name__)
+
+HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Moved Gaussians at a time.
+
+    Attributes:
+        rows: Which ones. [R]
+        before: Canonical centres. [R, 3]
+        offsets: Added to them. [R, 3]
+        quats: Rotations after the canonical ones, unit wxyz. [R, 4]
+        log_scales: Added to the log scales. [R, 3]
+    """
+
+    rows: Tensor
+    before: Tensor
+    offsets: Tensor
+    quats: Tensor
+    log_scales: Tensor
+
+
+class FieldRepresentation:
+    """Gaussians moved one by one by `Motion`, with shading that follows their rotations.
+
+    Args:
+        tracks: Where the masks put the objects, or tracks that were trained; the field may be fitted to them.
+        first: Knot of the tracks at which the Gaussians are canonical.
+        config: The run's configuration.
+    """
+
+    name = "field"
+
+    def __init__(self, tracks: Tracks, first: int, config: Config):
+        self.times = tracks.times
+        self.motion = _motion_of(self.times, config)
+        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
+        self._config = config
+        self._tracks = tracks
+        self._first = first
+        self._last: Moved | None = None
+        self._iteration = config.field.warm_up  # of training; a field that is only looked at is past the warm-up
+
+    @property
+    def params(self) -> dict[str, Tensor]:
+        """Weights of both networks, and the light of the shading."""
+        return {**_parameters(self.motion), "light": self.light}
+
+    @property
+    def _measured(self) -> bool:
+        return gating.kind(self._tracks.bodies, self._config) == "measured"
+
+    def movers(self, gaussians: Gaussians) -> Tensor:
+        """Rows that the networks move, none while training warms up. [R] int64"""
+        if self._iteration < self._config.field.warm_up:
+            return torch.zeros(0, dtype=torch.int64)
+        return gating.movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
+
+    def splats(
+        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
+    ) -> fused_posing.Splats:
+        """See `Representation.splats`."""
+        params = gaussians.params
+        moved = self.move(gaussians, t, draw)
+        self._last = moved
+        rows = moved.rows
+        means = params["means"].index_add(0, rows, moved.offsets)
+        log_scales = params["log_scales"].index_add(0, rows, moved.log_scales)
+        turned = rotations.multiply(moved.quats, rotations.normalize(params["quats"][rows]))
+        quats = params["quats"].index_copy(0, rows, turned)
+        if params["sh_rest"].shape[1] == 0:
+            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+        else:
+            colors = shade.seen_colors(
+                means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
+            )
+            # The harmonics of what moves live in its own frame and turn with it.
+            seen = means.detach()[rows] - torch.from_numpy(np.asarray(camera.center)).float()
+            seen = rotations.rotate(rotations.conjugate(moved.quats.detach()), seen / seen.norm(dim=1, keepdim=True))
+            both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
+            colors = colors.index_copy(0, rows, sh_color.to_rgb(both, seen))
+        if self._config.train.shading:
+            change = rotations.rotate(rotations.conjugate(moved.quats), self.light) - self.light
+            factor = 1 + (change * params["shading"][rows]).sum(-1, keepdim=True)
+            lit = colors[rows].clamp(min=0) * factor.clamp(min=0)
+            colors = colors.index_copy(0, rows, lit)
+        return fused_posing.pose(
+            means,
+            quats,
+            log_scales,
+            params["opacity_logits"],
+            colors,
+            torch.zeros(len(gaussians), 3),
+            torch.zeros(3),
+            torch.zeros(len(gaussians), dtype=torch.int64),
+            group_poses.at_rest(1),
+            torch.zeros(1, 3),
+        )
+
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """Fit field and TRD to the places of the objects, before the first image is looked at."""
+        section = self._config.field
+        self._iteration = 0
+        gating.release(gaussians, self._tracks, self._config)
+        if self._tracks.bodies < 2 or section.place_steps == 0:
+            return
+        self.fit(gaussians, self._tracks, section.place_steps, section.trd_steps, draw)
+
+    def fit(
+        self, gaussians: Gaussians, tracks: Tracks, field_steps: int, trd_steps: int, draw: torch.Generator
+    ) -> None:
+        """Fit field and TRD to the motion of tracks, without images; what belongs to no body is fitted to rest."""
+        rows = self.movers(gaussians)
+        means, ids = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
+        groups = gating.bodies_of(ids, tracks, 0)
+        field_fitting.fit_field(self.motion, means, groups, tracks, self._first, field_steps, draw)
+        groups = gating.bodies_of(ids, tracks, field_fitting.ALONE)
+        field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
+
+    def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> Moved:
+        """Where the movers are at a time: in training by a drawn path through field and TRD, else by the rule."""
+        rows = self.movers(gaussians)
+        before = gaussians.params["means"].detach()[rows]
+        deltas = self._train_path(before, t, draw) if draw is not None else self.motion.at(before, t)
+        return Moved(rows, before, deltas.offsets, deltas.quats, deltas.log_scales)
+
+    def _train_path(self, means: Tensor, t: float, draw: torch.Generator) -> deformation.Deltas:
+        motion, h = self.motion, self.motion.step
+        if t > motion.horizon:
+            return motion.through(means, motion.horizon, t, h)
+        through, sign = torch.rand(2, generator=draw).tolist()
+        if t < motion.start + h or through >= self._config.field.trd_share:
+            return motion.deltas(means, t)
+        start = min(max(t - h if sign < 0.5 else t + h, motion.start), motion.horizon)
+        return motion.through(means, start, t, h)
+
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
+        """Distance from rest until the gate closes, stiffness of the groups, and L_rigid in the variant that has it."""
+        moved, self._last = self._last, None
+        if moved is None or len(moved.rows) == 0:
+            return None
+        terms: list[Tensor] = []
+        calm = self._config.field.calm
+        if calm > 0 and self._measured and iteration < gating.gate_step(self._config):
+            terms.append(calm * gating.restlessness(moved.offsets, moved.quats, moved.log_scales))
+        if self._tracks.bodies < 2:
+            return terms[0] if terms else None
+        groups = gating.bodies_of(gaussians.motion_ids[moved.rows], self._tracks, 0)
+        if self._config.field.stiffness > 0:
+            after = moved.before + moved.offsets
+            bent = rigidity.stiffness(moved.before, after, moved.quats, moved.log_scales, groups)
+            terms.append(self._config.field.stiffness * bent)
+        losses = self._config.losses
+        started = iteration >= losses.rigid_start * self._config.train.iterations
+        if self._config.field.variant == "r5dgs_extra" and losses.rigid > 0 and started:
+            opacities = gaussians.opacity_logits.detach()[moved.rows].sigmoid()
+            anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities)
+            terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
+        return sum(terms[1:], terms[0]) if terms else None
+
+    def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
+        """A field reaches all times already."""
+
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
+        """Set still what rests, once, where movers are measured; fit the TRD to the motion that there is by now."""
+        section = self._config.field
+        self._iteration = iteration
+        if self._measured and iteration == gating.gate_step(self._config):
+            rows = self.movers(gaussians)
+            still = gating.settle(gaussians, rows, self.motion, self.times, section.still)
+            log.info("step %d: %d of %d Gaussians rest", iteration, len(still), len(gaussians))
+        every = round(section.trd_every * self._config.train.iterations)
+        if section.trd_steps > 0 and every > 0 and iteration % every == 0:
+            rows = self.movers(gaussians)
+            means = gaussians.means.detach()[rows]
+            groups = gating.bodies_of(gaussians.motion_ids[rows], self._tracks, field_fitting.ALONE)
+            field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Weights by ``field.NAME`` and ``trd.NAME``, and the times."""
+        named = {n: p.detach() for n, p in self.params.items()}
+        tracks = self._tracks
+        named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
+        named["field.iteration"] = torch.tensor(self._iteration)
+        return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `tensors`."""
+        _load(self.motion, tensors)
+        self.light = tensors["light"].clone().requires_grad_(True)
+        self._iteration = int(tensors["field.iteration"])
+
+    @staticmethod
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """See `Representation.group_classes`: a body's object; those of a shadow or of no body are background."""
+        others = len(tensors["field.casters"]) + 1
+        return np.concatenate([np.arange(int(tensors["field.bodies"])), np.zeros(others, np.int64)])
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
+        """See `Representation.observed_motion`: groups are the classes and the shadows."""
+        motion = _motion_of(tensors["field.times"].numpy(), config)
+        _load(motion, tensors)
+        gaussians = {n.removeprefix("gaussians."): p for n, p in tensors.items() if n.startswith("gaussians.")}
+        return field_to_groups.observed_motion(
+            motion,
+            gaussians,
+            gating.movers(
+                gaussians["motion_ids"], int(tensors["field.bodies"]), tensors["field.times"].numpy(), config
+            ),
+            labels,
+            object_ids,
+            int(tensors["field.bodies"]) + len(tensors["field.casters"]),
+            observed,
+            tensors["field.times"].numpy(),
+            tensors["field.casters"].tolist(),
+            tensors["field.plane_normal"].numpy().astype(np.float64),
+            tensors["light"].numpy().astype(np.float64),
+            config.needs.regrouping,
+        )
+
+
+def _motion_of(times: np.ndarray, config: Config) -> Motion:
+    """Networks as they start, on the clock of the observed times."""
+    section = config.field
+    first, last = float(times[0]), float(times[-1])
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    clock = Clock.of(times)
+    if section.horizon and len(times) > 1 and not first < section.horizon <= last:
+        raise ConfigError(
+            f"field.horizon: expected a time after the first observed one, {first:g}, and up to the last, {last:g}; "
+            f"got {section.horizon:g}"
+        )
+    generator = torch.Generator().manual_seed(config.train.seed)
+    return Motion(
+        deformation.DeformationField(deformation.SHAPES[section.size], generator),
+        TRD(TRD_SHAPES[section.size], generator),
+        clock,
+        first,
+        min(section.horizon or first + HORIZON * (last - first), last),
+        section.step * clock.scale or 2 * spacing,
+        section.chunk,
+    )
+
+
+def _parameters(motion: Motion) -> dict[str, Tensor]:
+    """Weights of both networks, by ``field.NAME`` and ``trd.NAME``."""
+    named: dict[str, Tensor] = {f"field.{n}": p for n, p in motion.field.named_parameters()}
+    named.update({f"trd.{n}": p for n, p in motion.trd.named_parameters()})
+    return named
+
+
+@torch.no_grad()
+def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
+    for name, parameter in _parameters(motion).items():
+        if name not in tensors or tensors[name].shape != parameter.shape:
+            raise CheckpointError(f"the checkpoint's '{name}': expected a tensor of shape {list(parameter.shape)}")
+        parameter.copy_(tensors[name])
+
+
+def from_tracks(
+    tracks: Tracks, light: Tensor, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
+) -> FieldRepresentation:
+    """A field that goes on from tracks: fitted to their motion, with the Gaussians brought to one time.
+
+    Args:
+        tracks: The trained tracks.
+        light: The trained light of the shading. [3]
+        gaussians: Changed in place: each body from its own canonical state to where it is at ``first``.
+        first: Knot at which the field's Gaussians are canonical.
+        config: The run's configuration.
+        draw: Source of the draws.
+    """
+    made = FieldRepresentation(tracks, first, config)
+    with torch.no_grad():
+        made.light.copy_(light)
+    bring_together(gaussians, tracks, first, light.detach())
+    gating.release(gaussians, tracks, config)
+    made.fit(gaussians, tracks, config.field.distill_steps, config.field.distill_steps, draw)
+    return made
+
+
+def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor | None = None) -> None:
+    """Move each group of Gaussians, which start where they were seen best, to where it is at one knot, in place.
+
+    Args:
+        gaussians: The Gaussians.
+        tracks: The tracks that they moved by.
+        knot: The knot.
+        light: Light of their shading, where there is some. [3]
+    """
+    with torch.no_grad():
+        poses = tracks.poses(float(tracks.times[knot]))
+        ids, centers = gaussians.motion_ids, tracks.group_centers()
+        means, quats = gaussians.means, gaussians.quats
+        arm = (means - centers[ids])[..., None]
+        means.copy_((poses.rotmats[ids] @ arm)[..., 0] + centers[ids] + poses.displacements[ids])
+        quats.copy_(rotations.multiply(poses.quats[ids], quats))
+        if light is None:
+            return
+        sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
+        vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
+        sh = sh_color.rotate(sh, turns)
+        # What is unlit at that time starts dark; training goes on from there with factors of 1 at rest.
+        sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
+        gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
+        gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))
+        gaussians.shading.copy_(torch.from_numpy(vectors))

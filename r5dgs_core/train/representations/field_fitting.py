@@ -1,0 +1,161 @@
+"""Fits of the deformation field and the TRD to motion alone, without images: quick, and what images leave open.
+
+Images show a Gaussian's velocity at its own place only, v + w x p: its spin w is free, and a field puts rotation into
+velocities that depend on the place. The cross-Gaussian twist loss closes that: the twist of one Gaussian must carry
+another Gaussian of the same group too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+
+from ...model.tracks import Tracks
+from ...model.trd import MotionState
+from ...motion import rotations
+from .field_motion import Motion
+from .rigidity import QUAT_WEIGHT
+
+ROWS = 512  # Gaussians per step of a fit
+RATE = 2e-3
+ALONE = -1  # group of Gaussians that move each on its own: none carries another
+
+
+def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tensor]) -> None:
+    """Adam with a rate that falls to a twentieth; gradients are left as they were found."""
+    named = [p for p in parameters if p.requires_grad]
+    optimizer = torch.optim.Adam(named, lr=RATE, fused=True)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / max(steps, 1)))
+    for _ in range(steps):
+        optimizer.zero_grad(set_to_none=True)
+        loss().backward()
+        optimizer.step()
+        schedule.step()
+    optimizer.zero_grad(set_to_none=True)
+
+
+def _sample(count: int, generator: torch.Generator) -> Tensor:
+    """Rows of a step. [<= ROWS] int64"""
+    return torch.randint(0, count, (min(ROWS, count),), generator=generator)
+
+
+def fit_field(
+    motion: Motion, means: Tensor, groups: Tensor, tracks: Tracks, first: int, steps: int, generator: torch.Generator
+) -> None:
+    """Fit the field to the motion of the tracks, relative to the knot that canonical Gaussians are at.
+
+    Args:
+        motion: Changed in place.
+        means: Canonical centres of the movers. [R, 3]
+        groups: Their motion groups. [R]
+        tracks: Tracks; all knots up to the horizon are fitted.
+        first: Knot at which the Gaussians are canonical.
+        steps: Steps; each looks at four times.
+        generator: Source of the draws.
+    """
+    if len(means) == 0 or steps == 0:
+        return
+    with torch.no_grad():
+        home = tracks.poses(float(tracks.times[first]))
+        centers = tracks.group_centers()
+        here = centers[groups] + home.displacements[groups]
+        arm = means - here
+    times = [float(t) for t in tracks.times if t <= motion.horizon + 1e-9]
+
+    def loss() -> Tensor:
+        total = torch.zeros(())
+        for k in torch.randint(0, len(times), (4,), generator=generator).tolist():
+            rows = _sample(len(means), generator)
+            with torch.no_grad():
+                poses = tracks.poses(times[k])
+                turn = rotations.multiply(poses.quats, rotations.conjugate(home.quats))[groups[rows]]
+                goal = centers[groups[rows]] + poses.displacements[groups[rows]] + rotations.rotate(turn, arm[rows])
+                goal = goal - means[rows]
+            deltas = motion.deltas(means[rows], times[k])
+            sign = torch.where((deltas.quats * turn).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+            off = (deltas.offsets - goal).square().sum(-1).mean()
+            total = total + off + QUAT_WEIGHT * (deltas.quats - sign * turn).square().sum(-1).mean()
+            total = total + deltas.log_scales.square().mean()
+        return total
+
+    _optimise(motion.field.parameters(), steps, loss)
+
+
+def fit_trd(
+    motion: Motion, means: Tensor, groups: Tensor, steps: int, twist: float, generator: torch.Generator
+) -> None:
+    """Fit the TRD to the motion of the field between times that are a step apart, forwards and backwards.
+
+    Args:
+        motion: Its TRD is changed in place.
+        means: Canonical centres of the movers. [R, 3]
+        groups: Their motion groups, for the twist loss; `ALONE` where one is in none. [R]
+        steps: Steps of the fit.
+        twist: Weight of the cross-Gaussian twist loss.
+        generator: Source of the draws.
+    """
+    first = motion.start
+    if len(means) == 0 or steps == 0 or motion.horizon <= first:  # at a single time nothing moves
+        return
+
+    def loss() -> Tensor:
+        rows = _sample(len(means), generator)
+        at, sign, reach = torch.rand(3, generator=generator).tolist()
+        start = first + at * (motion.horizon - first)
+        span = (0.5 + reach) * motion.step * (1 if sign < 0.5 else -1)
+        end = min(max(start + span, first), motion.horizon)
+        with torch.no_grad():
+            before, after = motion.deltas(means[rows], start), motion.deltas(means[rows], end)
+            begin, goal = means[rows] + before.offsets, means[rows] + after.offsets
+            turn = rotations.multiply(after.quats, rotations.conjugate(before.quats))
+        state = motion.state(begin, start)
+        there, turned = motion.carry(begin, state, end - start, motion.step)
+        sign_q = torch.where((turned * turn).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        total = (there - goal).square().sum(-1).mean()
+        total = total + QUAT_WEIGHT * (turned - sign_q * turn).square().sum(-1).mean()
+        if twist > 0:
+            total = total + twist * cross_twist(motion, begin, goal, state, end - start, groups[rows], generator)
+        return total
+
+    _optimise(motion.trd.parameters(), steps, loss)
+
+
+def cross_twist(
+    motion: Motion,
+    begin: Tensor,
+    goal: Tensor,
+    state: MotionState,
+    span: float,
+    groups: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Mean squared distance by which the twist of each Gaussian misses where another of its group went.
+
+    Args:
+        motion: Integrates.
+        begin: Where the Gaussians were. [R, 3]
+        goal: Where they went. [R, 3]
+        state: Their twists.
+        span: Scene time between the two.
+        groups: Their motion groups. [R]
+        generator: Draws the partners.
+    """
+    partner = _partners(groups, generator)
+    crossed, _ = motion.carry(begin[partner], state, span, motion.step)
+    return (crossed - goal[partner]).square().sum(-1).mean()
+
+
+def _partners(groups: Tensor, generator: torch.Generator) -> Tensor:
+    """For each row a row of the same group, drawn by a random shift within the group; itself if alone. [R] int64"""
+    order = torch.argsort(groups, stable=True)
+    partner = torch.arange(len(groups))
+    start = int((groups == ALONE).sum())
+    counts = torch.bincount(groups[groups != ALONE])
+    for count in counts[counts > 0].tolist():
+        rows = order[start : start + count]
+        shift = int(torch.randint(0, count, (1,), generator=generator))
+        partner[rows] = rows.roll(shift)
+        start += count
+    return partner

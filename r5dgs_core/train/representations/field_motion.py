@@ -1,0 +1,100 @@
+"""Field and TRD together: where Gaussians are at any time, in the observed interval and past it.
+
+Notation: R moved Gaussians, T the horizon of the deformation field. Network times are scene times moved and scaled so
+that the observed ones lie in [0, 1]; where they do already, they are used as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from ...model import deformation
+from ...model.trd import TRD, MotionState
+from ...motion import point_dynamics, rotations
+
+
+@dataclass(frozen=True)
+class Clock:
+    """From scene time to the networks' time: (t - origin) / scale."""
+
+    origin: float
+    scale: float
+
+    @staticmethod
+    def of(times: np.ndarray) -> Clock:
+        """The clock of the observed times: the identity where they lie in [0, 1] and fill a quarter of it."""
+        first, last = float(times[0]), float(times[-1])
+        scale = point_dynamics.time_unit(first, last)
+        return Clock(0.0 if scale == 1.0 else first, scale)
+
+    def __call__(self, t: float) -> float:
+        return (t - self.origin) / self.scale
+
+
+class Motion:
+    """Field and TRD with the clock that they share.
+
+    Args:
+        field: The deformation field.
+        trd: The TRD network.
+        clock: From scene time to theirs.
+        start: First observed scene time.
+        horizon: Scene time T.
+        step: Scene time h that the TRD bridges in training.
+        chunk: Gaussians that pass the networks at once.
+    """
+
+    def __init__(
+        self,
+        field: deformation.DeformationField,
+        trd: TRD,
+        clock: Clock,
+        start: float,
+        horizon: float,
+        step: float,
+        chunk: int,
+    ):
+        self.field = field
+        self.trd = trd
+        self.clock = clock
+        self.start = start
+        self.horizon = horizon
+        self.step = step
+        self.chunk = chunk
+
+    def deltas(self, means: Tensor, t: float) -> deformation.Deltas:
+        """The field at a scene time, held past the horizon."""
+        return self.field(means, self.clock(min(t, self.horizon)), self.chunk)
+
+    def state(self, positions: Tensor, t: float) -> MotionState:
+        """The TRD's answer for Gaussians that are somewhere at a scene time, per unit of network time."""
+        return self.trd(positions, self.clock(t), self.chunk)
+
+    def carry(self, positions: Tensor, state: MotionState, duration: float, step: float) -> tuple[Tensor, Tensor]:
+        """Positions and rotations after a signed scene time, by TRACE's integrator. [R, 3], [R, 4]"""
+        return point_dynamics.rk2(
+            positions,
+            state.equiv_velocity,
+            state.angular_velocity,
+            state.equiv_acceleration,
+            state.angular_acceleration,
+            duration / self.clock.scale,
+            step / self.clock.scale,
+        )
+
+    def at(self, means: Tensor, t: float) -> deformation.Deltas:
+        """Where Gaussians are at any time: by the field up to T, by the TRD from there on."""
+        deltas = self.deltas(means, t)
+        step = point_dynamics.TRACE_STEP * self.clock.scale
+        return deltas if t <= self.horizon else self.through(means, self.horizon, t, step)
+
+    def through(self, means: Tensor, start: float, t: float, step: float) -> deformation.Deltas:
+        """By the field to ``start``, by the TRD from there to ``t``. The TRD's start has no gradient."""
+        deltas = self.deltas(means, start)
+        begin = (means + deltas.offsets).detach()
+        end, turns = self.carry(begin, self.state(begin, start), t - start, step)
+        quats = rotations.multiply(turns, deltas.quats)
+        return deformation.Deltas(deltas.offsets + (end - begin), quats, deltas.log_scales)

@@ -1,0 +1,211 @@
+"""What a trained field hands to baking: states of its Gaussians at the knots, group motions fitted to them, dynamics.
+
+Notation: N Gaussians, R of them moved, S knots up to the horizon T, B classes (0 the background). Bind state: at T.
+The motion of a group is the robust Kabsch fit of its members' centres from T to each knot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...motion import rigid_fit, rotations, se3
+from ...motion_fit import model_selection
+from ...scene import sh_color
+from ..observed_motion import GroupTrack, ObservedMotion, PointMotion
+from . import regrouping as regroup
+from . import shading
+from .field_motion import Motion
+
+SHADOW_RIDGE = 0.05  # pull of a shadow's map towards the projection onto the plane, as a share of the caster's motion
+
+
+def knots(times: np.ndarray, horizon: float) -> np.ndarray:
+    """Times at which the field is sampled: the observed ones up to the horizon, and the horizon. [S]"""
+    before = times[times < horizon - 1e-9 * max(1.0, abs(horizon))]
+    return np.concatenate([before, [horizon]])
+
+
+@torch.no_grad()
+def observed_motion(
+    motion: Motion,
+    gaussians: dict[str, Tensor],
+    movers: Tensor,
+    labels: np.ndarray,
+    object_ids: np.ndarray,
+    alone: int,
+    seen: np.ndarray,
+    times: np.ndarray,
+    shadows: Sequence[int],
+    normal: np.ndarray,
+    light: np.ndarray,
+    regrouping: str = "auto",
+) -> ObservedMotion:
+    """Sample a field at the knots and fit its groups.
+
+    Args:
+        motion: Field and TRD.
+        gaussians: Canonical parameters by name.
+        movers: Rows that the networks move. [R]
+        labels: Class of each Gaussian. [N]
+        object_ids: Object id of each class. [B]
+        alone: Motion id of movers that belong to no group.
+        seen: Knots of the training at which each object was placed by its masks. [B - 1, K] bool
+        times: These knots. [K]
+        shadows: Caster, a class, of each group from B on.
+        normal: Normal of the plane that carries shadows. [3]
+        light: Light of the shading. [3]
+        regrouping: ``off`` leaves Gaussians in the groups that they were made for.
+    """
+    at = knots(times, motion.horizon)
+    rows, means = movers, gaussians["means"][movers]
+    quats = rotations.normalize(gaussians["quats"][movers])
+    states = [motion.deltas(means, float(t)) for t in at]
+    path = torch.stack([means + s.offsets for s in states], 1).numpy().astype(np.float64)
+    turns = torch.stack([rotations.multiply(s.quats, quats) for s in states], 1).numpy().astype(np.float64)
+    sizes = torch.stack([gaussians["log_scales"][movers] + s.log_scales for s in states], 1).numpy()
+    state = motion.state(means + states[-1].offsets, motion.horizon)
+    dynamics = np.zeros((len(gaussians["means"]), 12))
+    dynamics[rows.numpy()] = _about_own_centre(path[:, -1], state, motion.clock.scale)
+    bind = {name: tensor.numpy().copy() for name, tensor in gaussians.items()}
+    canonical = bind["means"].copy()
+    for name, value in (("means", path[:, -1]), ("quats", turns[:, -1]), ("log_scales", sizes[:, -1])):
+        bind[name][rows.numpy()] = value
+    sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1).astype(np.float64)[rows.numpy()]
+    since = states[-1].quats.numpy().astype(np.float64)
+    sh = sh_color.rotate(sh, since)
+    ones = np.ones(len(sh))
+    sh, vectors, lit = shading.rebind(sh, bind["shading"][rows.numpy()].astype(np.float64), ones, since, light)
+    bind["shading_rest"] = np.ones(len(labels))
+    bind["shading_rest"][rows.numpy()] = lit
+    for name, value in (("sh", sh[:, :1]), ("sh_rest", sh[:, 1:]), ("shading", vectors)):
+        bind[name][rows.numpy()] = value
+    motion_ids = np.zeros(len(labels), np.int64)
+    own = gaussians["motion_ids"].numpy()[rows.numpy()]
+    own = np.where(own == alone, labels[rows.numpy()], own)
+    if not own.any():  # nobody said what belongs to what before training: the labels do
+        own = labels[rows.numpy()].astype(np.int64)
+    motion_ids[rows.numpy()] = own
+    resting = ~np.isin(labels, own)  # objects of which nothing moves are groups all the same,
+    resting[rows.numpy()] = False  # but what moves goes with its group even where the masks call it background
+    motion_ids[resting] = labels[resting]
+    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
+    nearest = np.abs(times[None] - at[:, None]).argmin(1)
+    observed = np.concatenate([np.ones((1, len(times)), bool), seen])[:, nearest]
+    observed[:, -1] = True
+
+    def fit(ids: np.ndarray) -> list[GroupTrack]:
+        return _groups(path, ids, opacities, object_ids, observed, shadows, normal)
+
+    groups, moves = fit(own), None
+    if regrouping != "off":
+        made_for = own
+        own, groups, moves = regroup.tidy(path, own, opacities, fit)
+        if len(shadows) == 0:  # none was made in training, yet the floor may imitate some
+            casters = regroup.imitators(path, own, opacities, groups, normal)
+            shadows = np.unique(casters[casters > 0]).tolist()
+            if shadows:
+                own = np.where(casters > 0, len(object_ids) + np.searchsorted(shadows, casters), own)
+                own, groups, moves = regroup.tidy(path, own, opacities, fit, made_for)
+        motion_ids[rows.numpy()] = own
+    points = PointMotion(rows.numpy(), path, turns, sizes.astype(np.float64), dynamics, canonical)
+    return ObservedMotion(at, tuple(groups), light, bind, motion_ids, points, moves=moves)
+
+
+def _groups(
+    path: np.ndarray,
+    ids: np.ndarray,
+    opacities: np.ndarray,
+    object_ids: np.ndarray,
+    observed: np.ndarray,
+    shadows: Sequence[int],
+    normal: np.ndarray,
+) -> list[GroupTrack]:
+    """The groups fitted to their members: the pinned one, a body per object, the shadows.
+
+    Args:
+        path: Centres of what moves, at the knots. [R, S, 3]
+        ids: Its groups. [R]
+        opacities: [R]
+        object_ids: Object id of each class. [B]
+        observed: Knots at which each class was placed by its masks. [B, S] bool
+        shadows: Caster, a class, of each group from B on.
+        normal: Normal of the plane that carries shadows. [3]
+    """
+    still = rotations.identity(path.shape[1]), np.zeros((path.shape[1], 3))
+    groups = [GroupTrack(0, "pinned", np.zeros(3), *still, observed[0])]
+    for row in range(1, len(object_ids)):
+        members = ids == row
+        center, quat, shift = _track(path[members], regroup.voters(path[members, -1], opacities[members]))
+        groups.append(GroupTrack(int(object_ids[row]), "body", center, quat, shift, observed[row]))
+    for k, caster in enumerate(shadows):
+        members = ids == len(object_ids) + k
+        leader, weights = groups[caster], regroup.voters(path[members, -1], opacities[members])
+        matrix = _follow(path[members], weights, leader.displacements, normal)
+        if not follows(path[members], weights, leader.displacements, normal):
+            matrix = np.zeros((3, 3))
+        center = np.average(path[members, -1], axis=0, weights=weights) if members.any() else leader.center
+        shift = leader.displacements @ matrix.T
+        groups.append(GroupTrack(leader.object_id, "shadow", center, still[0], shift, leader.observed, caster, matrix))
+    return groups
+
+
+def _track(path: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre at the last knot, rotations [S, 4] and displacements of the centre [S, 3] since then."""
+    count = path.shape[1]
+    quats, shifts = rotations.identity(count), np.zeros((count, 3))
+    if len(path) == 0:
+        return np.zeros(3), quats, shifts
+    center = np.average(path[:, -1], axis=0, weights=weights)
+    for k in range(count - 2, -1, -1):
+        fit = rigid_fit.fit_rigid(path[:, -1], path[:, k], weights, hint=quats[k + 1])
+        quats[k], shifts[k] = fit.quat, fit.displacement_at(center)
+    return center, quats, shifts
+
+
+def _follow(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Linear map from a caster's displacements to its shadow's, near the projection onto the plane. [3, 3]"""
+    flat = np.eye(3) - np.outer(normal, normal)
+    if len(path) == 0:
+        return flat
+    moved = np.average(path - path[:, -1:], axis=0, weights=weights)
+    gram = leader.T @ leader
+    ridge = SHADOW_RIDGE * np.trace(gram) / 3 + 1e-9
+    return np.linalg.solve(gram + ridge * np.eye(3), leader.T @ moved + ridge * flat.T).T
+
+
+def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> bool:
+    """Whether a shadow went on with its caster, better than if it had stayed: learned early, judged at the last knots.
+
+    Args:
+        path: Centres of its Gaussians at the knots. [n, S, 3]
+        weights: Of these. [n]
+        leader: Displacements of the caster. [S, 3]
+        normal: Of the plane. [3]
+    """
+    last = len(leader) - 1 - max(2, round(model_selection.HELD_OUT * len(leader)))
+    if last < 2 or len(path) == 0:
+        return True
+    matrix = _follow(path[:, : last + 1], weights, leader[: last + 1] - leader[last], normal)
+    moved = path[:, last + 1 :] - path[:, last : last + 1]
+    missed = moved - (leader[last + 1 :] - leader[last]) @ matrix.T
+    went, stayed = (np.average(np.linalg.norm(x, axis=-1).mean(1), weights=weights) for x in (missed, moved))
+    return bool(went <= stayed)
+
+
+def _about_own_centre(points: np.ndarray, state, scale: float) -> np.ndarray:
+    """Velocity, angular velocity and their rates per scene time, about each Gaussian's own centre. [R, 12]"""
+    v, w, a, e = (
+        x.numpy().astype(np.float64)
+        for x in (
+            state.equiv_velocity,
+            state.angular_velocity,
+            state.equiv_acceleration,
+            state.angular_acceleration,
+        )
+    )
+    v, a = se3.recentre(w, v, e, a, points)
+    return np.concatenate([v / scale, w / scale, a / scale**2, e / scale**2], axis=-1)

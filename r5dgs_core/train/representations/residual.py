@@ -1,0 +1,129 @@
+"""Residuals of flexible bodies: their tensors in a checkpoint, lighting, baking, and their row of the needs table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...config.config import Config
+from ...model.residual_field import Change, ResidualField
+from ...model.tracks import Tracks
+from ...motion import rotations
+from .. import checkpoint_content
+from ..observed_motion import PointMotion
+from . import shading as shading_vectors
+
+PREFIX = "residual."
+GAINS = checkpoint_content.RESIDUAL_GAINS
+
+
+def tensors_of(field: ResidualField) -> dict[str, Tensor]:
+    """A field as named tensors of a checkpoint."""
+    named = {"nodes": field.nodes, "owners": field.owners, "values": field.values.detach()}
+    return {f"{PREFIX}{name}": tensor for name, tensor in named.items()}
+
+
+def residual_of(tensors: Mapping[str, Tensor]) -> ResidualField | None:
+    """The field in a checkpoint's named tensors, None where all bodies are rigid."""
+    if f"{PREFIX}values" not in tensors:
+        return None
+    nodes, owners, values = (tensors[f"{PREFIX}{name}"].clone() for name in ("nodes", "owners", "values"))
+    return ResidualField(nodes, owners, values)
+
+
+def relight(
+    change: Change, colors: Tensor, shading: Tensor, light: Tensor, rotmats: Tensor, groups: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colours and shading vectors in which what turns on its own is lit by its own rotation.
+
+    Args:
+        change: The members of flexible bodies and how they turn.
+        colors: Colours of all Gaussians, before the shading. [N, 3]
+        shading: The vectors g. [N, 3]
+        light: The vector l. [3]
+        rotmats: Rotations of the motion groups. [G, 3, 3]
+        groups: Group of each member. [n]
+
+    Returns:
+        Colours with the members' shading in them [N, 3], and vectors that are zero for the members [N, 3].
+    """
+    seen = rotations.rotate(rotations.conjugate(change.quats), (light @ rotmats)[groups])  # l from the member's frame
+    factor = (1 + (shading[change.rows] * (seen - light)).sum(1, keepdim=True)).clamp(min=0)
+    lit = colors[change.rows].clamp(min=0) * factor
+    return colors.index_copy(0, change.rows, lit), shading.index_fill(0, change.rows, 0.0)
+
+
+@torch.no_grad()
+def point_motion(
+    field: ResidualField, tracks: Tracks, tensors: Mapping[str, Tensor]
+) -> tuple[PointMotion, dict[str, np.ndarray]]:
+    """States of the members of flexible bodies at the knots, and the Gaussians that all tracks start from.
+
+    Args:
+        field: Their residuals.
+        tracks: Tracks of the bodies.
+        tensors: The checkpoint's, with all Gaussians.
+
+    Returns:
+        States at the knots in training coordinates; and parameters by name in which members have their shape of the
+        last knot, moved back to the canonical state.
+    """
+    names = ("means", "quats", "log_scales", "sh", "sh_rest", "shading")
+    g = {name: tensors[f"gaussians.{name}"].double() for name in names}
+    ids, centers = tensors["gaussians.motion_ids"], tracks.group_centers().double()
+    opacities = torch.sigmoid(tensors["gaussians.opacity_logits"])
+    bind = {name: tensor.numpy().copy() for name, tensor in g.items()}
+    rows = np.zeros(0, np.int64)
+    states: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for s, t in enumerate(tracks.times):
+        change = field.change(
+            tensors["gaussians.means"], tensors["gaussians.quats"], opacities, ids, tracks.knot_weights(float(t))
+        )
+        rows, group = change.rows.numpy(), ids[change.rows]
+        means = g["means"][change.rows] + change.offsets
+        quats = rotations.multiply(change.quats.double(), rotations.normalize(g["quats"][change.rows]))
+        sizes = g["log_scales"][change.rows] + change.log_scales
+        if s == len(tracks.times) - 1:
+            sh = np.concatenate([bind["sh"], bind["sh_rest"]], axis=1)[rows]
+            since, light = change.quats.numpy().astype(np.float64), tensors["light"].numpy().astype(np.float64)
+            ones = np.ones(len(rows))
+            sh, vectors, lit = shading_vectors.rebind(sh, bind["shading"][rows], ones, since, light)
+            bind["shading_rest"] = np.ones(len(bind["means"]))
+            bind["shading_rest"][rows] = lit
+            state = {"means": means.numpy(), "quats": quats.numpy(), "log_scales": sizes.numpy()}
+            for name, value in (state | {"sh": sh[:, :1], "sh_rest": sh[:, 1:], "shading": vectors}).items():
+                bind[name][rows] = value
+        turn = tracks.knot_quats()[:, s].double()[group]
+        shift = centers[group] + tracks.params["translations"][:, s].double()[group]
+        moved = shift + rotations.rotate(turn, means - centers[group])
+        states.append((moved.numpy(), rotations.multiply(turn, quats).numpy(), sizes.numpy()))
+    means, quats, sizes = (np.stack(parts, 1) for parts in zip(*states, strict=True))
+    return PointMotion(rows, means, quats, sizes), bind
+
+
+def need(
+    tensors: Mapping[str, Tensor], names: Mapping[int, str], config: Config, there: bool
+) -> tuple[float, float, bool, str]:
+    """What the needs table says of residuals: largest gain, threshold, whether there are any, and the reason.
+
+    Args:
+        tensors: The checkpoint's.
+        names: Names of the objects by id.
+        config: The run's configuration.
+        there: Whether the scene has residuals.
+    """
+    threshold, field = config.residual.threshold, residual_of(tensors)
+    if GAINS not in tensors:
+        reason = "every Gaussian moves by the deformation field" if there else "gain by bending, dB; none was tried"
+        return 0.0, threshold, there, reason
+    gains, ids = tensors[GAINS].numpy(), tensors["object_ids"].numpy()
+    kept = [] if field is None else field.bodies
+    largest = float(np.nanmax(gains)) if np.isfinite(gains).any() else 0.0
+    bent = ", ".join(f"{names.get(int(ids[b]), f'object {ids[b]}')} ({gains[b - 1]:+.1f})" for b in kept)
+    rigid = f"{len(gains) - len(kept)} of {len(gains)} objects are rigid"
+    if kept and not there and config.needs.residuals != "off":
+        bent += ", too little to be stored"
+    return largest, threshold, there, "gain by bending, dB: " + (f"{bent}; {rigid}" if bent else rigid)

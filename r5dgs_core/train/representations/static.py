@@ -1,0 +1,145 @@
+"""`still`: nothing moves, so that there are no tracks, no networks and nothing to learn but the Gaussians.
+
+Whether that is so is seen in the images: no view changes from one time to another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...config.config import Config
+from ...model import group_poses
+from ...model.gaussians import Gaussians
+from ...motion import rotations
+from ...raster import shade
+from ...scene import sh_color
+from ...scene.cameras import Camera
+from ..initialization import initialize, plane_sweep
+from ..observed_motion import GroupTrack, ObservedMotion
+from ..train_views import TrainView
+from . import fused_posing
+
+BLOCK = 4  # pixels that are averaged before images are compared
+CHANGE = 3.0  # levels of 255 by which a block has to change
+NOISE = 8.0  # and standard deviations of the change that all blocks show
+NOTHING = 0.3  # levels, the least noise of 8-bit images
+
+
+class StillRepresentation:
+    """Gaussians that never move.
+
+    Args:
+        start: What training starts from.
+    """
+
+    name = "still"
+    params: dict[str, Tensor] = {}
+
+    def __init__(self, start: initialize.Start):
+        self.centers = torch.from_numpy(start.tracks.centers.astype(np.float32))
+        self.time = float(start.tracks.times[-1])
+
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """Nothing."""
+
+    def splats(
+        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
+    ) -> fused_posing.Splats:
+        """See `representation.Representation.splats`; the same at all times."""
+        params = gaussians.params
+        if params["sh_rest"].shape[1] == 0:
+            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+        else:
+            eye, means = np.asarray(camera.center)[None], params["means"].detach()
+            colors = shade.seen_colors(means, params["sh"], eye, rest=params["sh_rest"])
+        return fused_posing.pose(
+            params["means"],
+            params["quats"],
+            params["log_scales"],
+            params["opacity_logits"],
+            colors,
+            params["shading"].detach(),
+            torch.tensor([0.0, 0.0, 1.0]),
+            gaussians.motion_ids,
+            group_poses.at_rest(len(self.centers)),
+            torch.zeros_like(self.centers),
+        )
+
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
+        """Nothing."""
+        return None
+
+    def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
+        """Nothing: there is one knot."""
+
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
+        """Nothing."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Centres of the objects, and the last observed time."""
+        return {"still.centers": self.centers, "still.time": torch.tensor(self.time, dtype=torch.float64)}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `tensors`."""
+        self.centers, self.time = tensors["still.centers"], float(tensors["still.time"])
+
+    @staticmethod
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """See `representation.Representation.group_classes`."""
+        return np.arange(len(tensors["still.centers"]))
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
+        """See `representation.Representation.observed_motion`: one knot, at which every group is where it is."""
+        centers = tensors["still.centers"].numpy().astype(np.float64)
+        rest, nowhere = rotations.identity(1), np.zeros((1, 3))
+        groups = [GroupTrack(0, "pinned", centers[0], rest, nowhere, np.ones(1, bool))]
+        for body in range(1, len(centers)):
+            seen = observed[body - 1].any(keepdims=True)
+            groups.append(GroupTrack(int(object_ids[body]), "body", centers[body], rest, nowhere, seen))
+        return ObservedMotion(np.array([float(tensors["still.time"])]), tuple(groups), np.zeros(3), smooth=True)
+
+
+def applies(views: Sequence[TrainView], config: Config) -> bool:
+    """Whether a run needs no motion: the user says so (``needs.tracks``), or nothing moves in the training views."""
+    return config.needs.tracks == "off" or (config.needs.tracks == "auto" and nothing_moves(views))
+
+
+def nothing_moves(views: Sequence[TrainView]) -> bool:
+    """Whether all images show one time, or each camera shows the same at all of its times.
+
+    A camera that shows one time alone, as one that moves, leaves it open: then the answer is no.
+    """
+    if len({view.t for view in views}) <= 1:
+        return True
+    of_camera: dict[bytes, list[TrainView]] = {}
+    for view in views:
+        of_camera.setdefault(plane_sweep.camera_key(view.camera), []).append(view)
+    if any(len({view.t for view in group}) < 2 for group in of_camera.values()):
+        return False
+    for first, *others in of_camera.values():
+        blocks = _blocks(first.image)
+        if any(_changes(blocks, _blocks(view.image)) for view in others):
+            return False
+    return True
+
+
+def _changes(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two images of one camera, as blocks, differ by more than noise in a block."""
+    difference = np.abs(first - second)
+    noise = max(1.4826 * float(np.median(difference)), NOTHING)
+    return bool((difference > max(CHANGE, NOISE * noise)).any())
+
+
+def _blocks(image: np.ndarray) -> np.ndarray:
+    """Means of blocks, those at the right and lower border left out where they are not whole. [H, W, 3]"""
+    height, width = (max(1, size // BLOCK) for size in image.shape[:2])
+    tall, wide = (min(BLOCK, size) for size in image.shape[:2])
+    whole = image[: height * tall, : width * wide].astype(np.float32)
+    return whole.reshape(height, tall, width, wide, 3).mean((1, 3))

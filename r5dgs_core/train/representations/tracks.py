@@ -1,0 +1,237 @@
+"""`tracks`: Gaussians move by one SE(3) track per object, with turning shading and shadows that follow."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...config.config import Config
+from ...model import track_state
+from ...model.gaussians import Gaussians
+from ...model.residual_field import ResidualField
+from ...model.tracks import Tracks
+from ...motion import rotations
+from ...raster import shade
+from ...scene import sh_color
+from ...scene.cameras import Camera
+from ..initialization import initialize
+from ..observed_motion import GroupTrack, ObservedMotion
+from ..train_views import nearest_knot
+from . import fused_posing, residual
+
+ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
+REBASE_EVERY = 100
+
+
+class TracksRepresentation:
+    """One SE(3) track per object, with shading that turns in fixed light and shadows that follow their caster.
+
+    Args:
+        start: What training starts from: its tracks, and where the masks put the objects, for knots that enter.
+        config: The run's configuration.
+    """
+
+    name = "tracks"
+
+    def __init__(self, start: initialize.Start, config: Config):
+        self.tracks = first_tracks(start.tracks)
+        self.light = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
+        self._places = start.places
+        self._absent = start.evidence.absent
+        self._stiffness = tuple(
+            torch.from_numpy(a).float() for a in (start.evidence.shift_stiffness, start.evidence.turn_stiffness)
+        )
+        self._entered = (start.first_time, start.first_time)
+        self.residuals: ResidualField | None = None
+        self._gains: Tensor | None = None  # of the residuals by body, once they were tried
+        self._config = config
+
+    @property
+    def params(self) -> dict[str, Tensor]:
+        """Tracks, light direction, and residuals where bodies have any."""
+        residuals = {} if self.residuals is None else {"residual": self.residuals.values}
+        return {**self.tracks.params, "light": self.light, **residuals}
+
+    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
+        """Nothing: the tracks start where the masks put them."""
+
+    def splats(
+        self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
+    ) -> fused_posing.Splats:
+        """See `Representation.splats`."""
+        poses = self.tracks.poses(t)
+        centers = self.tracks.group_centers()
+        params = gaussians.params
+        if params["sh_rest"].shape[1] == 0:
+            colors = sh_color.dc_to_rgb(params["sh"][:, 0])
+        else:
+            # The harmonics live in each group's own frame, so the eye is taken back into it.
+            with torch.no_grad():
+                arm = centers + poses.displacements - torch.from_numpy(camera.center).float()
+                eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
+            colors = shade.seen_colors(
+                params["means"].detach(),
+                params["sh"],
+                eyes.numpy(),
+                rest=params["sh_rest"],
+                pose_ids=gaussians.motion_ids,
+            )
+        means, quats, log_scales = params["means"], params["quats"], params["log_scales"]
+        shading = params["shading"]
+        if self.residuals is not None:
+            weights, opacities = self.tracks.knot_weights(t), torch.sigmoid(params["opacity_logits"])
+            change = self.residuals.change(means, quats, opacities, gaussians.motion_ids, weights)
+            means = means.index_add(0, change.rows, change.offsets)
+            log_scales = log_scales.index_add(0, change.rows, change.log_scales)
+            quats = quats.index_copy(0, change.rows, rotations.multiply(change.quats, quats[change.rows]))
+            group = gaussians.motion_ids[change.rows]
+            colors, shading = residual.relight(change, colors, shading, self.light, poses.rotmats, group)
+        splats = fused_posing.pose(
+            means,
+            quats,
+            log_scales,
+            params["opacity_logits"],
+            colors,
+            shading,
+            self.light,
+            gaussians.motion_ids,
+            poses,
+            centers,
+        )
+        gone = self._absent[:, nearest_knot(self.tracks.times, t)]
+        if not gone.any():
+            return splats
+        there = torch.from_numpy(np.concatenate([[1.0], ~gone])).float()
+        there = torch.cat([there, there[self.tracks.casters]])
+        return dataclasses.replace(splats, opacities=splats.opacities * there[gaussians.motion_ids])
+
+    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
+        """Roughness of the tracks, most where little is seen; now and then, with the weight of the steps in between."""
+        weight, section = self._config.losses.roughness, self._config.residual
+        if iteration % ROUGHNESS_EVERY or (weight <= 0 and self.residuals is None):
+            return None
+        total = weight * self.tracks.roughness(self._entered, *self._stiffness)
+        if self.residuals is not None:
+            total = total + self.residuals.penalty(section.size, section.roughness)
+        return ROUGHNESS_EVERY * total
+
+    @torch.no_grad()
+    def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
+        """Start a knot's poses: rotations go on steadily, displacements along the path that the masks tell.
+
+        Beyond the last mask of an object its displacement goes on steadily too: the images may show it all the same.
+        """
+        self.tracks.rebase()
+        self._entered = (min(entered[0], knot), max(entered[1], knot))
+        near, next_near = knot + towards, knot + 2 * towards
+        quats, shifts = self.tracks.base_quats, self.tracks.params["translations"]
+        steady = entered[0] <= next_near <= entered[1]
+        ratio, turns = 0.0, torch.zeros(self.tracks.bodies, 3)
+        if steady:
+            ratio = (self.tracks.times[knot] - self.tracks.times[near]) / (
+                self.tracks.times[near] - self.tracks.times[next_near]
+            )
+            turns = rotations.quats_to_rotvecs(
+                rotations.multiply(quats[:, near], rotations.conjugate(quats[:, next_near]))
+            )
+        quats[:, knot] = rotations.multiply(rotations.rotvecs_to_quats(ratio * turns), quats[:, near])
+        for row, (path, measured, gone) in enumerate(
+            zip(self._places.centers, self._places.measured, self._absent, strict=True), start=1
+        ):
+            beyond = not (measured[: knot + 1] if towards > 0 else measured[knot:]).any()
+            if beyond and steady and not gone[[knot, near]].any():
+                shifts[row, knot] = shifts[row, near] + ratio * (shifts[row, near] - shifts[row, next_near])
+            else:
+                shifts[row, knot] = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float()
+
+    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
+        """Fold learned rotations into the base."""
+        if iteration % REBASE_EVERY == 0:
+            self.tracks.rebase()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tracks by ``tracks.NAME`` and the light direction."""
+        named = track_state.tensors_of(self.tracks)
+        named["tracks.entered"] = torch.tensor(self._entered)
+        named["light"] = self.light.detach()
+        if self._gains is not None:
+            named["residual.gains"] = self._gains
+        return named if self.residuals is None else named | residual.tensors_of(self.residuals)
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `tensors`."""
+        self.tracks = track_state.tracks_of(tensors)
+        first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
+        self._entered = (first, last)
+        self.light = tensors["light"].clone().requires_grad_(True)
+        self._gains = tensors.get("residual.gains")
+        self.residuals = residual.residual_of(tensors)
+
+    @staticmethod
+    def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
+        """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
+        bodies, shadows = len(tensors["tracks.centers"]), len(tensors["tracks.casters"])
+        return np.concatenate([np.arange(bodies), np.zeros(shadows, np.int64)])
+
+    @staticmethod
+    def observed_motion(
+        tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
+    ) -> ObservedMotion:
+        """See `Representation.observed_motion`: the pinned group, one body per object, then the shadows."""
+        tracks = track_state.tracks_of(tensors)
+        quats = tracks.knot_quats().detach().numpy().astype(np.float64)
+        displacements = tracks.params["translations"].detach().numpy().astype(np.float64)
+        centers = tracks.centers.numpy().astype(np.float64)
+        follow = tracks.follow_matrix().detach().numpy().astype(np.float64)
+        still, nowhere = rotations.identity(len(tracks.times)), np.zeros((len(tracks.times), 3))
+        groups = [GroupTrack(0, "pinned", centers[0], still, nowhere, np.ones(len(tracks.times), bool))]
+        for body in range(1, tracks.bodies):
+            groups.append(
+                GroupTrack(
+                    int(object_ids[body]),
+                    "body",
+                    centers[body],
+                    quats[body],
+                    displacements[body],
+                    observed[body - 1],
+                )
+            )
+        for caster in tracks.casters.tolist():
+            groups.append(
+                GroupTrack(
+                    int(object_ids[caster]),
+                    "shadow",
+                    centers[caster],
+                    still,
+                    displacements[caster] @ follow.T,
+                    observed[caster - 1],
+                    caster,
+                    follow,
+                )
+            )
+        light, field = tensors["light"].numpy().astype(np.float64), residual.residual_of(tensors)
+        if field is None:
+            return ObservedMotion(tracks.times, tuple(groups), light, smooth=True)
+        points, bind = residual.point_motion(field, tracks, tensors)
+        return ObservedMotion(tracks.times, tuple(groups), light, bind, points=points, smooth=True)
+
+
+def first_tracks(first: initialize.FirstTracks) -> Tracks:
+    """Tracks that start where the masks put the bodies, without rotation."""
+    base = torch.zeros(*first.translations.shape[:2], 4)
+    base[..., 0] = 1.0
+    tracks = Tracks(
+        first.times,
+        torch.from_numpy(first.centers.astype(np.float32)),
+        torch.from_numpy(first.translations.astype(np.float32)),
+        base,
+        torch.from_numpy(first.casters),
+        None if first.plane_normal is None else torch.from_numpy(first.plane_normal.astype(np.float32)),
+    )
+    with torch.no_grad():
+        tracks.params["slope"].copy_(torch.from_numpy(first.slope))
+    return tracks

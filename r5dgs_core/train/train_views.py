@@ -1,0 +1,91 @@
+"""Training views in memory: normalised camera, time, 8-bit image and mask."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from ..config.config import Config
+from ..data import dataset as datasets
+from ..errors import DatasetError
+from ..scene.cameras import Camera
+from .normalization import Normalization
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class TrainView:
+    """One image of the training split.
+
+    Attributes:
+        name: Name in the data set.
+        camera: Camera in normalised coordinates.
+        t: Scene time.
+        image: sRGB. [H, W, 3] uint8
+        mask: Object ids, or None. [H, W] uint8 where they fit, else uint16
+        alpha: Opacity of the pixels, or None where the image has none. [H, W] uint8
+    """
+
+    name: str
+    camera: Camera
+    t: float
+    image: np.ndarray
+    mask: np.ndarray | None
+    alpha: np.ndarray | None
+
+
+def load(dataset: datasets.Dataset, normalization: Normalization, background: np.ndarray | None) -> list[TrainView]:
+    """Load the training split.
+
+    Args:
+        dataset: The data set.
+        normalization: From world to training coordinates.
+        background: Colour behind transparent pixels, or None where images are opaque. [3]
+
+    Raises:
+        DatasetError: There is no training view.
+    """
+    if not dataset.train:
+        raise DatasetError(f"{dataset.root}: transforms_train.json lists no frames; nothing to train on")
+    views = []
+    for view in dataset.train:
+        alpha = None
+        if dataset.has_alpha:
+            rgba = datasets.load_rgba(view)
+            alpha = np.round(rgba[..., 3] * 255).astype(np.uint8)
+        image = np.round(datasets.load_image(view, background) * 255).astype(np.uint8)
+        camera = normalization.camera(view.camera)
+        mask = datasets.load_mask(view)
+        small = None if mask is None else np.clip(mask, 0, 65535).astype(np.uint8 if mask.max() < 256 else np.uint16)
+        views.append(TrainView(view.name, camera, view.t, image, small, alpha))
+    return views
+
+
+def behind(dataset: datasets.Dataset, config: Config) -> np.ndarray | None:
+    """Colour behind transparent pixels that a run trains with, or None where it learns what lies behind. [3]"""
+    kind = config.train.background
+    if kind == "auto":
+        kind = "white" if dataset.has_alpha else "learned"
+    return {"learned": None, "white": np.ones(3), "black": np.zeros(3)}[kind]
+
+
+def with_masks(views: Sequence[TrainView], masks: Sequence[np.ndarray]) -> list[TrainView]:
+    """The views with other masks. Of [H, W]"""
+    return [dataclasses.replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
+
+
+def spread(items: Sequence[Item], limit: int) -> list[Item]:
+    """The items, or ``limit`` of them evenly over their order where there are more."""
+    if len(items) <= limit:
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]
+
+
+def nearest_knot(times: np.ndarray, t: float) -> int:
+    """Index of the observed time that is nearest to ``t``. [S]"""
+    return int(np.argmin(np.abs(times - t)))

@@ -1,0 +1,121 @@
+"""Edited points of the worker's scenes: what `points` requests hand over, and the scenes that hold them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import dataclasses
+import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import errors
+from ..editing import point_edits
+from ..editing.point_edits import Place, PointEdit
+from ..scene.scene import Scene
+from . import requests as asked
+
+if TYPE_CHECKING:
+    from ..render import scene_renderer
+
+Places = dict[tuple[int, str], Place]  # by number of the scene and key of the edit
+_WIDTHS = {"means": 3, "quats": 4, "scales": 3, "base": 4}  # columns of each array; "sh" has any multiple of 3
+
+
+class EditedPoints:
+    """Holds point edits by key, and extends scenes by those that a picture shows."""
+
+    def __init__(self) -> None:
+        self._edits: dict[str, PointEdit] = {}
+        self._shown: tuple[list[Scene], list[tuple[int, str]]] = [], []  # scenes and edits that were extended last
+        self._extended: tuple[list[Scene], Places] = [], {}
+
+    def keep(self, request: dict[str, Any]) -> None:
+        """Hold the edits of ``keep``, a list of keys, and forget all others.
+
+        ``new`` has those that the worker does not hold yet: by key an object of base64 strings, ``rows`` (int32) and
+        any of ``means quats scales base sh`` (float32).
+
+        Raises:
+            ConfigError: A key is neither held nor new, or an edit cannot be read.
+        """
+        keys, new = asked.need(request, "keep", list), asked.need(request, "new", dict)
+        decoded = {key: _edit_of(value) for key, value in new.items()}
+        missing = [key for key in keys if not isinstance(key, str) or key not in decoded and key not in self._edits]
+        if missing:
+            raise errors.ConfigError(f"worker: 'points' needs the edits {missing!r}, which it does not hold")
+        self._edits = {key: decoded[key] if key in decoded else self._edits[key] for key in keys}
+
+    def extend(self, scenes: list[Scene], wanted: list[tuple[int, str]]) -> tuple[list[Scene], Places]:
+        """Extend scenes by the edits that a picture shows; the result is kept until scenes or edits change.
+
+        Args:
+            scenes: The loaded scenes.
+            wanted: Number of the scene and key of each edit, each once.
+
+        Returns:
+            The scenes, the same list as long as nothing changes, and the place of each edit.
+
+        Raises:
+            ConfigError: An edit is not held, or does not fit its scene.
+        """
+        lost = [key for _, key in wanted if key not in self._edits]
+        if lost:
+            raise errors.ConfigError(f"worker: the edits {lost!r} of points are not held; send 'points' first")
+        before, edits = self._shown
+        if edits == wanted and len(before) == len(scenes) and all(map(operator.is_, before, scenes)):
+            return self._extended
+        self._shown = [], []
+        extended, places = list(scenes), {}
+        for number, scene in enumerate(scenes):
+            keys = [key for other, key in wanted if other == number]
+            try:
+                extended[number], found = point_edits.extend(scene, [self._edits[key] for key in keys])
+            except ValueError as error:
+                raise errors.ConfigError(f"worker: {error}") from error
+            places |= {(number, key): place for key, place in zip(keys, found, strict=True)}
+        self._shown, self._extended = (list(scenes), list(wanted)), (extended, places)
+        return self._extended
+
+
+def wanted(entries: Sequence[Any], numbers: list[int]) -> list[tuple[int, str]]:
+    """Number of the scene and key of each edit that entries of ``instances`` show, each once."""
+    edited = [entry for entry in entries if isinstance(entry, dict) and entry.get("points") is not None]
+    found = [(asked.number_of(entry, numbers), entry["points"]) for entry in edited]
+    for _, key in found:
+        if not isinstance(key, str):
+            raise errors.ConfigError(f"worker: the 'points' of an instance have to be a key, found {key!r}")
+    return list(dict.fromkeys(found))
+
+
+def instance_of(entry: dict[str, Any], numbers: list[int], places: Places) -> scene_renderer.Instance:
+    """An entry of ``instances``, which has either ``start`` and ``count`` or the key of an edit as ``points``."""
+    if not isinstance(entry, dict) or entry.get("points") is None:
+        return asked.instance_of(entry, numbers)
+    place = places[asked.number_of(entry, numbers), entry["points"]]
+    found = asked.instance_of({**entry, "start": place.start, "count": place.count}, numbers)
+    return dataclasses.replace(found, matrix=found.matrix @ place.matrix)
+
+
+def _edit_of(value: Any) -> PointEdit:
+    if not isinstance(value, dict) or "rows" not in value or set(value) - {"rows", "sh", *_WIDTHS}:
+        raise errors.ConfigError(f"worker: edited points need 'rows' and any of {', '.join(_WIDTHS)} and sh")
+    rows = _array(value, "rows", "<i4")
+    arrays = {name: _array(value, name, "<f4", width) for name, width in _WIDTHS.items() if name in value}
+    if "sh" in value and len(rows):
+        coefficients = _array(value, "sh", "<f4", 3)
+        if len(coefficients) % len(rows):
+            raise errors.ConfigError("worker: edited points have harmonics of another number of points")
+        arrays["sh"] = coefficients.reshape(len(rows), -1, 3)
+    return PointEdit(rows, **arrays)
+
+
+def _array(value: dict[str, Any], name: str, dtype: str, width: int = 1) -> np.ndarray:
+    """An array of a request. [n] or [n, width]"""
+    try:
+        found = np.frombuffer(base64.b64decode(value[name], validate=True), dtype)
+        return found.reshape(-1, width) if width > 1 else found
+    except (TypeError, ValueError, binascii.Error):
+        raise errors.ConfigError(f"worker: '{name}' of edited points has to be base64 of {dtype}") from None

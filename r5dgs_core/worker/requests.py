@@ -1,0 +1,323 @@
+"""Fields of a request to the worker, checked: each function returns a value, or raises a ConfigError that names it."""
+
+from __future__ import annotations
+
+import math
+import os
+import reprlib
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeGuard
+
+import numpy as np
+
+from .. import errors, strict_json
+from ..scene import cameras
+from ..scene.cameras import Camera
+from ..search import prompts
+
+if TYPE_CHECKING:
+    from ..render import scene_renderer
+
+MOST_LINE = 512 << 20  # bytes of a request; edited points are large
+MOST_ENTRIES = 100_000  # of a list
+_MOST_PATH = 4096  # letters
+_MOST_TINT = 1e6
+_PIXEL_BYTES, _GAUSSIAN_BYTES = 100, 600  # of memory while a picture is drawn, about
+_ASSUMED_MEMORY = 4 << 30  # bytes, on systems that do not report theirs
+_FIELDS = {
+    "hello": (),
+    "load": ("paths",),
+    "points": ("keep", "new"),
+    "render": ("camera", "instances", "t", "scene", "sky", "near", "distance", "want", "coverage"),
+    "query": ("text", "scene", "encoder"),
+    "embed": ("texts", "encoder"),
+    "warm_up": (),
+    "check": (),
+    "shutdown": (),
+}
+_INSTANCE_FIELDS = ("scene", "start", "count", "points", "holdout", "matrix", "world", "tint", "t")
+
+
+def read_line(stream: BinaryIO) -> bytes:
+    """Read the next line, b"" at the end of the stream.
+
+    Raises:
+        ConfigError: The line is longer than `MOST_LINE`; it is skipped.
+    """
+    line = stream.readline(MOST_LINE + 1)
+    if len(line) <= MOST_LINE:
+        return line
+    while line and not line.endswith(b"\n"):
+        line = stream.readline(1 << 20)
+    raise errors.ConfigError(f"worker: a request has more than {MOST_LINE >> 20} MiB")
+
+
+def parse(line: bytes) -> dict[str, Any]:
+    """Parse a request."""
+    request = strict_json.parse(
+        line, "worker: a request", errors.ConfigError, "send one JSON object a line", size=MOST_LINE
+    )
+    if not isinstance(request, dict):
+        raise errors.ConfigError("worker: a request has to be a JSON object")
+    return request
+
+
+def id_of(request: dict[str, Any]) -> int | str | None:
+    """Number or name of a request, which its answer repeats; None if it has none that can be repeated."""
+    number = request.get("id")
+    return number if _is_whole(number) or (isinstance(number, str) and len(number) <= 100) else None
+
+
+def command_of(request: dict[str, Any]) -> str:
+    """Command of a request whose fields are all known."""
+    command = request.get("command")
+    if not isinstance(command, str) or command not in _FIELDS:
+        known = ", ".join(_FIELDS)
+        raise errors.ConfigError(f"worker: unknown command {_short(command)}; known are {known}")
+    _refuse_others(request, ("id", "command", *_FIELDS[command]), f"'{command}'")
+    return command
+
+
+def need(request: dict[str, Any], key: str, kind: type) -> Any:
+    """A value of some type; lists have at most `MOST_ENTRIES`."""
+    value = request.get(key)
+    if not isinstance(value, kind):
+        raise errors.ConfigError(f"worker: '{request.get('command')}' needs '{key}', found {_short(value)}")
+    if isinstance(value, list) and len(value) > MOST_ENTRIES:
+        raise errors.ConfigError(f"worker: '{key}' has {len(value)} entries; expected at most {MOST_ENTRIES}")
+    return value
+
+
+def time_of(request: dict[str, Any]) -> float:
+    """Scene time of a picture."""
+    return _number(request.get("t"), "worker: 'render' needs 't'")
+
+
+def texts_of(request: dict[str, Any]) -> list[str]:
+    """Phrases to embed."""
+    texts = need(request, "texts", list)
+    if not all(isinstance(text, str) and len(text) <= prompts.MOST_LETTERS for text in texts):
+        raise errors.ConfigError(
+            f"worker: 'embed' needs texts of at most {prompts.MOST_LETTERS} letters, found {_short(texts)}"
+        )
+    return texts
+
+
+def path_of(path: Any, command: str) -> str:
+    """A path in a request."""
+    if not isinstance(path, str) or not 0 < len(path) <= _MOST_PATH or "\0" in path:
+        raise errors.ConfigError(f"worker: '{command}' needs paths, found {_short(path)}")
+    return path
+
+
+def stamp_of(path: Any) -> tuple[str, int, int]:
+    """Path, time and size of a scene file, which change when the file does."""
+    path = path_of(path, "load")
+    try:
+        status = Path(path).stat()
+    except OSError as error:
+        raise errors.SceneFileError(
+            f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
+            "'Scene File' in the R5DGS tab"
+        ) from error
+    if not stat.S_ISREG(status.st_mode):  # reading a pipe or a device may never end
+        raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found something that is no file")
+    return path, status.st_mtime_ns, status.st_size
+
+
+def number_of(value: dict[str, Any], numbers: list[int]) -> int:
+    """Number of a loaded scene, from its place among the paths; the first one by default."""
+    number = value.get("scene", 0)
+    if not _is_whole(number) or not 0 <= number < len(numbers):
+        raise errors.ConfigError(f"worker: 'scene' has to be a number below {len(numbers)}, found {_short(number)}")
+    return numbers[number]
+
+
+def matrix_of(value: Any, size: int, what: str) -> np.ndarray:
+    """A square matrix of finite numbers, float64."""
+    try:
+        matrix = np.asarray(value)
+        if matrix.dtype.kind not in "if":
+            raise TypeError
+        matrix = matrix.astype(np.float64).reshape(size, size)
+    except (TypeError, ValueError, OverflowError):
+        raise errors.ConfigError(f"worker: {what} has to hold {size} x {size} numbers") from None
+    if not (np.abs(matrix) <= cameras.FARTHEST).all():
+        raise errors.ConfigError(f"worker: {what} holds values that are not finite or above {cameras.FARTHEST:g}")
+    return matrix
+
+
+def camera_of(value: dict[str, Any]) -> Camera:
+    """A camera that an image can be drawn with."""
+    _refuse_others(value, ("width", "height", "intrinsics", "T_cam_world"), "a camera")
+    width, height = value.get("width"), value.get("height")
+    if not (_is_whole(width) and _is_whole(height) and 0 < width <= 32768 and 0 < height <= 32768):
+        raise errors.ConfigError(
+            f"worker: a camera needs width and height from 1 to 32768, found {_short(width)} x {_short(height)}"
+        )
+    intrinsics = matrix_of(value.get("intrinsics"), 3, "the camera's intrinsics")
+    camera = Camera(width, height, intrinsics, matrix_of(value.get("T_cam_world"), 4, "the camera's T_cam_world"))
+    try:
+        cameras.check(camera)
+    except ValueError as error:
+        raise errors.ConfigError(f"worker: {error}") from error
+    return camera
+
+
+def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_renderer.Instance:
+    """An entry of ``instances``."""
+    from ..render import scene_renderer  # late: it needs torch
+
+    start, count = (value.get(name) for name in ("start", "count")) if isinstance(value, dict) else (None, None)
+    if not (_is_whole(start) and _is_whole(count) and start >= 0 and count >= 0):
+        raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {_short(value)}")
+    _refuse_others(value, _INSTANCE_FIELDS, "an instance")
+    world = value.get("world")
+    if world is not None:
+        world = matrix_of(world, 4, f"the world of rows {start}")
+    matrix = matrix_of(value.get("matrix"), 4, f"the matrix of rows {start}")
+    t = value.get("t")
+    if t is not None:
+        t = _number(t, "worker: the time of an instance has to be a number")
+    holdout = value.get("holdout", False)
+    if not isinstance(holdout, bool):
+        raise errors.ConfigError(f"worker: 'holdout' of an instance has to be true or false, found {_short(holdout)}")
+    return scene_renderer.Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t, holdout)
+
+
+def check_rows(instances: Sequence[scene_renderer.Instance], lengths: Sequence[int]) -> None:
+    """Refuse instances with rows that their scene does not have.
+
+    Args:
+        instances: The instances.
+        lengths: Number of Gaussians of each scene.
+    """
+    for one in instances:
+        if one.start + one.count > lengths[one.scene]:
+            raise errors.ConfigError(
+                f"worker: an instance shows rows {one.start} to {one.start + one.count} of a scene of "
+                f"{lengths[one.scene]} Gaussians"
+            )
+
+
+def check_size(camera: Camera, gaussians: int, ranks: int = 0) -> None:
+    """Refuse a picture that needs more memory than is free.
+
+    Args:
+        camera: Its camera.
+        gaussians: Number of Gaussians that are drawn.
+        ranks: Groups of a coverage that each pixel keeps.
+    """
+    needed = camera.width * camera.height * (_PIXEL_BYTES + 16 * ranks) + gaussians * _GAUSSIAN_BYTES
+    free = free_memory()
+    if needed > free:
+        raise errors.ConfigError(
+            f"worker: a picture of {camera.width} x {camera.height} pixels with {gaussians} Gaussians needs about "
+            f"{needed / 2**30:.1f} GiB of memory, of which {free / 2**30:.1f} are free; render it smaller or in parts"
+        )
+
+
+def free_memory() -> int:
+    """Memory that a picture may take, bytes: the available memory, or half of all memory if that is unknown."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as stream:
+            return next(int(line.split()[1]) << 10 for line in stream if line.startswith("MemAvailable:"))
+    except (OSError, ValueError, IndexError, StopIteration):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, OSError, ValueError):
+        return _ASSUMED_MEMORY
+
+
+def sky_of(request: dict[str, Any], numbers: list[int]) -> tuple[int, np.ndarray] | None:
+    """Scene and matrix of the sky behind instances; None for black."""
+    sky = request.get("sky")
+    if sky is None:
+        return None
+    if not isinstance(sky, dict):
+        raise errors.ConfigError(f"worker: 'sky' has to be null or scene and matrix, found {_short(sky)}")
+    _refuse_others(sky, ("scene", "matrix"), "'sky'")
+    return number_of(sky, numbers), matrix_of(sky.get("matrix"), 4, "the matrix of the sky")
+
+
+def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
+    tint = value.get("tint")
+    if tint is None:
+        return None
+    if not (isinstance(tint, list) and len(tint) == 3 and all(map(_is_number, tint))):
+        raise errors.ConfigError(f"worker: a tint has to hold three factors, found {_short(tint)}")
+    if not all(0 <= factor <= _MOST_TINT for factor in tint):
+        raise errors.ConfigError(f"worker: a tint has to hold factors from 0 to {_MOST_TINT:g}, found {tint}")
+    red, green, blue = map(float, tint)
+    return red, green, blue
+
+
+def distance_of(request: dict[str, Any]) -> float:
+    """Depth at which depths begin to count."""
+    return _number(request.get("distance", 0.0), "worker: 'distance' has to be a number")
+
+
+def near_of(request: dict[str, Any]) -> float | None:
+    """Nearest depth that is drawn; None for the scenes' own."""
+    near = request.get("near")
+    if near is not None and not (_is_number(near) and 0 < near <= cameras.FARTHEST):
+        raise errors.ConfigError(f"worker: 'near' has to be a depth > 0, found {_short(near)}")
+    return near
+
+
+def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
+    """Names of the arrays to send."""
+    want = request.get("want", [])
+    if not isinstance(want, list) or not all(isinstance(name, str) for name in want):
+        raise errors.ConfigError(f"worker: 'want' has to be a list of names, found {_short(want)}")
+    unknown = set(want) - set(known)
+    if unknown:
+        raise errors.ConfigError(f"worker: cannot render {_short(sorted(unknown))}; known are {', '.join(known)}")
+    return want
+
+
+def coverage_of(request: dict[str, Any]) -> tuple[list[int], int] | None:
+    """The group of each instance, and the number of groups that each pixel keeps; None without 'coverage'."""
+    asked = request.get("coverage")
+    if asked is None:
+        return None
+    count = len(need(request, "instances", list))
+    groups = asked.get("groups") if isinstance(asked, dict) else None
+    if not isinstance(groups, list) or len(groups) != count or not all(_is_whole(one) for one in groups):
+        raise errors.ConfigError(f"worker: 'coverage' needs 'groups', a number for each of {count} instances")
+    if not all(-1 <= one < 1 << 31 for one in groups):
+        raise errors.ConfigError("worker: 'coverage' needs 'groups' from -1 to 2147483647")
+    ranks = asked.get("ranks")
+    if not _is_whole(ranks) or not 0 < ranks <= 64:
+        raise errors.ConfigError(f"worker: 'coverage' needs 'ranks' from 1 to 64, found {_short(ranks)}")
+    return groups, ranks
+
+
+def _refuse_others(value: dict[str, Any], known: Sequence[str], what: str) -> None:
+    others = [name for name in value if name not in known]
+    if others:
+        raise errors.ConfigError(
+            f"worker: {what} has unknown fields {_short(others)}; known are {', '.join(known) or 'none'}"
+        )
+
+
+def _number(value: Any, problem: str) -> float:
+    if not _is_number(value) or abs(value) > cameras.FARTHEST:
+        raise errors.ConfigError(f"{problem}, found {_short(value)}")
+    return float(value)
+
+
+def _is_number(value: Any) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_whole(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _short(value: Any) -> str:
+    """A value in a message, cut if it is long."""
+    return reprlib.repr(value)
