@@ -51,7 +51,7 @@ class Clock:
 def measure(path: Path, rounds: int, package: str) -> dict[str, float]:
     """The round of a scene that took the processor least."""
     reading = importlib.import_module(f"{package}.r5dgs_core.scene.scene_file")
-    keying = importlib.import_module(f"{package}.r5dgs_addon.keyframes")
+    keying = importlib.import_module(f"{package}.r5dgs_addon.motion.keyframes")
     found = []
     for _ in range(rounds):
         with Clock(reading, "read") as read, Clock(keying, "animate") as keys:

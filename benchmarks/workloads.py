@@ -263,7 +263,7 @@ def describe(workload: Workload) -> dict[str, float]:
     """How heavy a workload is.
 
     Returns:
-        ``gaussians`` and how many of them are ``visible`` (their alpha_min ellipse's box meets the image); three
+        ``gaussians`` and how many of them are ``visible_clouds`` (their alpha_min ellipse's box meets the image); three
         standard deviations along the long axis of those, px: ``radius_median`` and ``radius_p95``; ``tile_pairs``:
         boxes times tiles of 16 x 16 px; ``pairs``: contributions of at least alpha_min to pixels that are not yet
         finished; ``pairs_per_px``; ``finished``: share of the pixels that stop early.

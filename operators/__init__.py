@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import running
+from ..r5dgs_addon.ui import stepwise_operator
 from . import (
     add_alias,
     allow_scene_file,
@@ -102,7 +102,7 @@ def register():
 
 def unregister():
     """Undo `register` in reverse order; what still runs is stopped first."""
-    running.stop_all(bpy.context)
+    stepwise_operator.stop_all(bpy.context)
     for menu, draw in MENUS:
         menu.remove(draw)
     for module in reversed(MODULES):

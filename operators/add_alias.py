@@ -3,10 +3,10 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..r5dgs_addon import actions, loaded_scenes, table
+from ..r5dgs_addon.scene import loaded_scenes, object_names, polls
 
 
-class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
+class R5DGS_OT_add_alias(polls.OfObject, bpy.types.Operator):
     """Add another word that finds the active object"""
 
     bl_idname = "r5dgs.add_alias"
@@ -23,7 +23,7 @@ class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
 
     def execute(self, context):
         found = self.found(context)
-        entry = None if found is None else table.entry_of(*found)
+        entry = None if found is None else object_names.entry_of(*found)
         if entry is None or not loaded_scenes.is_own(found[0]):
             self.report({"WARNING"}, "Select an object of a scene that was loaded into this file first")
             return {"CANCELLED"}
@@ -32,7 +32,7 @@ class R5DGS_OT_add_alias(actions.OfObject, bpy.types.Operator):
             self.report({"WARNING"}, "Type a word first")
             return {"CANCELLED"}
         if word in [alias.name for alias in entry.aliases]:
-            self.report({"INFO"}, f"'{word}' finds {table.names(found[0])[found[1]]} already")
+            self.report({"INFO"}, f"'{word}' finds {object_names.names(found[0])[found[1]]} already")
             return {"CANCELLED"}
         entry.aliases.add().name = word
         return {"FINISHED"}

@@ -3,10 +3,13 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ..r5dgs_addon import actions, loaded_scenes, motion_exact, preferences, trust, windows
+from ..r5dgs_addon import preferences
+from ..r5dgs_addon.motion import exact_mode
+from ..r5dgs_addon.scene import loaded_scenes, polls, trust
+from ..r5dgs_addon.ui import status_bar
 
 
-class R5DGS_OT_allow_scene_file(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_allow_scene_file(polls.NeedsScene, bpy.types.Operator):
     """Let the scene file be read that this .blend names, though it lies neither beside nor below the .blend"""
 
     bl_idname = "r5dgs.allow_scene_file"
@@ -26,8 +29,8 @@ class R5DGS_OT_allow_scene_file(actions.NeedsScene, bpy.types.Operator):
         trust.allow(found.asked)
         if self.always:
             preferences.trust(str(found.asked.parent))
-        motion_exact.refresh()
-        windows.redraw()
+        exact_mode.refresh()
+        status_bar.redraw()
         self.report({"INFO"}, f"{found.asked}: may be read")
         return {"FINISHED"}
 

@@ -5,15 +5,16 @@ import dataclasses
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import amounts, capture, capture_objects, capture_views, running
-from ..r5dgs_addon.capture_settings import CaptureSettings
+from ..r5dgs_addon.capture import cameras, capture, captured_objects
+from ..r5dgs_addon.capture.settings import CaptureSettings
+from ..r5dgs_addon.ui import plural, stepwise_operator
 
 
 def _items(identifiers, descriptions):
     return [(name, name.replace("_", " ").title(), text) for name, text in zip(identifiers, descriptions, strict=True)]
 
 
-class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
+class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
     """Render this scene from many cameras into a data set that R5DGS trains on"""
 
     bl_idname = "r5dgs.capture_dataset"
@@ -53,7 +54,7 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
     rig: EnumProperty(
         name="Rig",
         items=_items(
-            capture_views.RIGS,
+            cameras.RIGS,
             (
                 "An arc about the scene camera where the scene has fewer than three cameras",
                 "Only the scene's cameras",
@@ -81,7 +82,7 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
     objects: EnumProperty(
         name="Objects",
         items=_items(
-            capture_objects.CHOICES,
+            captured_objects.CHOICES,
             (
                 "By pass index where any is set, else what is animated, else what is selected",
                 "Everything with a pass index above 0",
@@ -109,8 +110,8 @@ class R5DGS_OT_capture_dataset(running.Running, bpy.types.Operator):
         result = yield from capture.steps(context, self.settings())
         counts = ", ".join(f"{number} {split}" for split, number in result.images.items())
         unseen = [f"No image shows: {', '.join(result.unseen)}"] if result.unseen else []
-        return running.Outcome(
-            f"{result.directory}: {counts} images of {amounts.of(len(result.objects), 'object')}", unseen
+        return stepwise_operator.Outcome(
+            f"{result.directory}: {counts} images of {plural.of(len(result.objects), 'object')}", unseen
         )
 
 

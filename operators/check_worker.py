@@ -4,13 +4,15 @@ import time
 
 import bpy
 
-from ..r5dgs_addon import preferences, waiting, worker, worker_check
+from ..r5dgs_addon import preferences
+from ..r5dgs_addon.ui import worker_status
+from ..r5dgs_addon.worker import jobs, worker_operator
 from ..r5dgs_core import errors
 
 KEY = "check"
 
 
-class R5DGS_OT_check_worker(waiting.Waiting, bpy.types.Operator):
+class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
     """Start the worker anew, with the Python chosen in the preferences or found, and say its versions, device and \
 speed (the first time it compiles, 10 s)"""
 
@@ -20,40 +22,40 @@ speed (the first time it compiles, 10 s)"""
 
     @classmethod
     def poll(cls, context):
-        if worker.busy():
+        if jobs.busy():
             cls.poll_message_set("The worker is rendering; wait for it, or stop it with Esc")
             return False
         return True
 
     def _begin(self, context):
         self._began = time.monotonic()
-        worker.stop()
+        jobs.stop()
         preferences.forget()
-        job = worker.submit(KEY, [("measuring its speed", "check", {})])
-        worker_check.begin(job)
+        job = jobs.submit(KEY, [("measuring its speed", "check", {})])
+        worker_status.begin(job)
         return job
 
     def modal(self, context, event):
         if event.type == "TIMER":
-            worker_check.redraw()
-        return waiting.Waiting.modal(self, context, event)
+            worker_status.redraw()
+        return worker_operator.Waiting.modal(self, context, event)
 
     def cancel(self, context):
-        waiting.Waiting.cancel(self, context)
-        worker_check.end("Stopped", "CANCEL")
+        worker_operator.Waiting.cancel(self, context)
+        worker_status.end("Stopped", "CANCEL")
 
     def _answered(self, context):
         try:
             text = self._summary(self._job.answer())
         except errors.R5dgsError as error:
-            worker_check.end(str(error), "ERROR")
+            worker_status.end(str(error), "ERROR")
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        worker_check.end(text, "CHECKMARK")
+        worker_status.end(text, "CHECKMARK")
         self.report({"INFO"}, text)
         return {"FINISHED"}
 
-    def _summary(self, answer: worker.Answer) -> str:
+    def _summary(self, answer: jobs.Answer) -> str:
         found, _ = answer
         versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
         seconds = time.monotonic() - self._began

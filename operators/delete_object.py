@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ..r5dgs_addon import motion_objects
+from ..r5dgs_addon.motion import duplicate_delete
 from ..r5dgs_core import errors
 
 
@@ -18,11 +18,11 @@ class R5DGS_OT_delete_object(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return motion_objects.poll_chosen(cls, context)
+        return duplicate_delete.poll_chosen(cls, context)
 
     def execute(self, context):
         try:
-            _, names = motion_objects.delete(context, motion_objects.chosen(context), self.shadows)
+            _, names = duplicate_delete.delete(context, duplicate_delete.chosen(context), self.shadows)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, FloatVectorProperty
 
-from ..r5dgs_addon import motion_objects, motion_physics
+from ..r5dgs_addon.motion import duplicate_delete, physics
 from ..r5dgs_core import errors
 
 
@@ -25,15 +25,15 @@ class R5DGS_OT_duplicate_object(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return motion_objects.poll_chosen(cls, context)
+        return duplicate_delete.poll_chosen(cls, context)
 
     def execute(self, context):
-        anchors = motion_objects.chosen(context)
+        anchors = duplicate_delete.chosen(context)
         if not self.properties.is_property_set("offset"):
-            reach = max(motion_physics.key_error(anchor)[1] for anchor in anchors)
+            reach = max(physics.key_error(anchor)[1] for anchor in anchors)
             self.offset = (2.2 * reach, 0.0, 0.0)
         try:
-            copies = motion_objects.duplicate(context, anchors, tuple(self.offset), self.shadows)
+            copies = duplicate_delete.duplicate(context, anchors, tuple(self.offset), self.shadows)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -3,7 +3,9 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, amounts, loaded_scenes, motion_exact
+from ..r5dgs_addon.motion import exact_mode
+from ..r5dgs_addon.scene import loaded_scenes, polls
+from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
 ACTIONS = (
@@ -13,7 +15,7 @@ ACTIONS = (
 )
 
 
-class R5DGS_OT_exact_mode(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_exact_mode(polls.NeedsScene, bpy.types.Operator):
     """Play points that bend before the last observed time, read from the scene file on every frame change"""
 
     bl_idname = "r5dgs.exact_mode"
@@ -32,16 +34,16 @@ class R5DGS_OT_exact_mode(actions.NeedsScene, bpy.types.Operator):
     def execute(self, context):
         collection = loaded_scenes.active_collection(context)
         if self.action == "OFF" or (self.action == "TOGGLE" and collection.r5dgs_exact.enabled):
-            motion_exact.switch_off(context, collection)
+            exact_mode.switch_off(context, collection)
             self.report({"INFO"}, f"{collection.name}: objects move as wholes")
             return {"FINISHED"}
         try:
-            count = motion_exact.switch_on(context, collection)
+            count = exact_mode.switch_on(context, collection)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         self.report(
-            {"INFO"}, f"{amounts.of(count, 'Gaussian', 'bend')}; Lock Interface is on, so that renders stay in step"
+            {"INFO"}, f"{plural.of(count, 'Gaussian', 'bend')}; Lock Interface is on, so that renders stay in step"
         )
         return {"FINISHED"}
 

@@ -3,10 +3,11 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_cameras, export_frames, export_gaussians, running
+from ..r5dgs_addon.export import cameras, frame_range, gaussians
+from ..r5dgs_addon.ui import stepwise_operator
 
 
-class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
+class R5DGS_OT_export_cameras(stepwise_operator.Running, bpy.types.Operator):
     """Write cameras with lens, pose and time for radiance-field tools"""
 
     bl_idname = "r5dgs.export_cameras"
@@ -17,11 +18,11 @@ class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
         name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    which: EnumProperty(name="Cameras", description="What is exported", items=export_cameras.WHICH)
-    format: EnumProperty(name="Format", description="What is written", items=export_cameras.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES, default="RANGE")
+    which: EnumProperty(name="Cameras", description="What is exported", items=cameras.WHICH)
+    format: EnumProperty(name="Format", description="What is written", items=cameras.FORMATS)
+    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES, default="RANGE")
     frame_step: IntProperty(name="Frame Step", description="Frames from one view to the next", default=1, min=1)
-    axes: EnumProperty(name="Axes", description="World that the cameras are in", items=export_gaussians.AXES)
+    axes: EnumProperty(name="Axes", description="World that the cameras are in", items=gaussians.AXES)
 
     @classmethod
     def poll(cls, context):
@@ -31,7 +32,7 @@ class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
         return True
 
     def steps(self, context):
-        return export_cameras.steps(
+        return cameras.steps(
             context,
             self.target_folder(),
             self.which,
@@ -42,7 +43,7 @@ class R5DGS_OT_export_cameras(running.Running, bpy.types.Operator):
         )
 
     def draw(self, context):
-        export_frames.draw_properties(self, "which", "format", "frames", "frame_step", "axes")
+        frame_range.draw_properties(self, "which", "format", "frames", "frame_step", "axes")
 
 
 CLASSES = (R5DGS_OT_export_cameras,)

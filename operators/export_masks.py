@@ -3,10 +3,12 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import actions, export_frames, export_masks, running
+from ..r5dgs_addon.export import frame_range, masks
+from ..r5dgs_addon.scene import polls
+from ..r5dgs_addon.ui import stepwise_operator
 
 
-class R5DGS_OT_export_masks(running.Running, actions.NeedsCamera, bpy.types.Operator):
+class R5DGS_OT_export_masks(stepwise_operator.Running, polls.NeedsCamera, bpy.types.Operator):
     """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
 
     bl_idname = "r5dgs.export_masks"
@@ -17,17 +19,17 @@ class R5DGS_OT_export_masks(running.Running, actions.NeedsCamera, bpy.types.Oper
         name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    format: EnumProperty(name="Format", description="What is written", items=export_masks.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES, default="RANGE")
+    format: EnumProperty(name="Format", description="What is written", items=masks.FORMATS)
+    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES, default="RANGE")
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
 
     def steps(self, context):
-        return export_masks.steps(
+        return masks.steps(
             context, self.target_folder(), format=self.format, every=self.frames == "RANGE", step=self.frame_step
         )
 
     def draw(self, context):
-        export_frames.draw_properties(self, "format", "frames", "frame_step")
+        frame_range.draw_properties(self, "format", "frames", "frame_step")
 
 
 CLASSES = (R5DGS_OT_export_masks,)

@@ -5,10 +5,12 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import export_frames, export_gaussians, loaded_scenes, running, selection
+from ..r5dgs_addon.export import frame_range, gaussians
+from ..r5dgs_addon.scene import loaded_scenes, selection
+from ..r5dgs_addon.ui import stepwise_operator
 
 
-class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
+class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
     """Write Gaussians where they are now, edits included, as PLY files that other splat tools read"""
 
     bl_idname = "r5dgs.export_ply"
@@ -18,10 +20,10 @@ class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
     filepath: StringProperty(name="File", description="The .ply file", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
-    which: EnumProperty(name="Objects", description="What is exported", items=export_gaussians.WHICH, default="VISIBLE")
-    frames: EnumProperty(name="Frames", description="When it is exported", items=export_frames.FRAMES)
+    which: EnumProperty(name="Objects", description="What is exported", items=gaussians.WHICH, default="VISIBLE")
+    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES)
     frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
-    axes: EnumProperty(name="Axes", description="World that the positions are in", items=export_gaussians.AXES)
+    axes: EnumProperty(name="Axes", description="World that the positions are in", items=gaussians.AXES)
     plain: BoolProperty(
         name="Plain",
         description="Leave out object ids and identity encodings, for tools that refuse columns they do not know",
@@ -42,7 +44,7 @@ class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
         return False
 
     def steps(self, context):
-        return export_gaussians.ply_steps(
+        return gaussians.ply_steps(
             context,
             self.target_file(".ply"),
             self.which,
@@ -53,7 +55,7 @@ class R5DGS_OT_export_ply(running.Running, bpy.types.Operator):
         )
 
     def draw(self, context):
-        export_frames.draw_properties(self, "which", "frames", "frame_step", "axes", "plain")
+        frame_range.draw_properties(self, "which", "frames", "frame_step", "axes", "plain")
 
 
 CLASSES = (R5DGS_OT_export_ply,)

@@ -3,11 +3,14 @@
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
-from ..r5dgs_addon import actions, export_scene, loaded_scenes, picture, running
+from ..r5dgs_addon.engine import render_request
+from ..r5dgs_addon.export import scene
+from ..r5dgs_addon.scene import loaded_scenes, polls
+from ..r5dgs_addon.ui import stepwise_operator
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Operator):
+class R5DGS_OT_export_scene(polls.NeedsScene, stepwise_operator.Running, bpy.types.Operator):
     """Write the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
 
     bl_idname = "r5dgs.export_scene"
@@ -26,7 +29,7 @@ class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Opera
     def suggest(self, context):
         if not self.filepath:
             try:
-                source = picture.scene_path(loaded_scenes.active_collection(context))
+                source = render_request.scene_path(loaded_scenes.active_collection(context))
                 self.filepath = str(source.with_name(f"{source.stem}_edited.r5dgs"))
             except errors.R5dgsError:
                 self.filepath = "edited.r5dgs"
@@ -34,7 +37,7 @@ class R5DGS_OT_export_scene(actions.NeedsScene, running.Running, bpy.types.Opera
 
     def steps(self, context):
         target = self.target_file(".r5dgs")
-        return export_scene.steps(context, loaded_scenes.active_collection(context), target, exact=self.exact)
+        return scene.steps(context, loaded_scenes.active_collection(context), target, exact=self.exact)
 
 
 CLASSES = (R5DGS_OT_export_scene,)

@@ -3,11 +3,13 @@
 import bpy
 from bpy.props import BoolProperty, FloatProperty
 
-from ..r5dgs_addon import actions, amounts, loaded_scenes, motion_extrapolate, motion_physics
+from ..r5dgs_addon.motion import extrapolate, physics
+from ..r5dgs_addon.scene import loaded_scenes, polls
+from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_extrapolate_until(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_extrapolate_until(polls.NeedsScene, bpy.types.Operator):
     """Extend or shorten the future of the whole scene; edited physics are obeyed, keys edited by hand stay"""
 
     bl_idname = "r5dgs.extrapolate_until"
@@ -29,17 +31,17 @@ class R5DGS_OT_extrapolate_until(actions.NeedsScene, bpy.types.Operator):
         if t_end < collection.r5dgs.t_max:
             self.report({"WARNING"}, f"Before the last observed time, {collection.r5dgs.t_max:g}: nothing extrapolated")
         try:
-            written, kept = motion_extrapolate.extrapolate_until(context, collection, t_end, self.fit_timeline)
+            written, kept = extrapolate.extrapolate_until(context, collection, t_end, self.fit_timeline)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         if kept:
             names = ", ".join(anchor.name for anchor in kept)
             self.report({"WARNING"}, f"Their later keys were edited by hand and stay: {names}; Re-Extrapolate them")
-        too_fast = motion_physics.too_fast(written)
+        too_fast = physics.too_fast(written)
         if too_fast:
             self.report({"WARNING"}, too_fast)
-        self.report({"INFO"}, f"{amounts.of(len(written), 'object', 'move')} until {collection.r5dgs.t_end:g}")
+        self.report({"INFO"}, f"{plural.of(len(written), 'object', 'move')} until {collection.r5dgs.t_end:g}")
         return {"FINISHED"}
 
 

@@ -2,10 +2,10 @@
 
 import bpy
 
-from ..r5dgs_addon import actions, loaded_scenes, timeline
+from ..r5dgs_addon.scene import loaded_scenes, polls, timeline
 
 
-class R5DGS_OT_fit_timeline(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_fit_timeline(polls.NeedsScene, bpy.types.Operator):
     """Set the frame range to that of the loaded scene, and mark its last observed time"""
 
     bl_idname = "r5dgs.fit_timeline"

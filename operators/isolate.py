@@ -3,10 +3,12 @@
 import bpy
 from bpy.props import IntProperty, StringProperty
 
-from ..r5dgs_addon import actions, amounts, isolation, prompt, selection, table
+from ..r5dgs_addon.language import prompt
+from ..r5dgs_addon.scene import isolation, object_names, polls, selection
+from ..r5dgs_addon.ui import plural
 
 
-class R5DGS_OT_isolate(actions.Selects, bpy.types.Operator):
+class R5DGS_OT_isolate(polls.Selects, bpy.types.Operator):
     """Hide the other objects of all loaded scenes, in viewports and renders"""
 
     bl_idname = "r5dgs.isolate"
@@ -18,11 +20,11 @@ class R5DGS_OT_isolate(actions.Selects, bpy.types.Operator):
     )
     scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
     object_id: IntProperty(
-        name="Object Id", description="Object to show instead", default=table.NOBODY, options={"SKIP_SAVE"}
+        name="Object Id", description="Object to show instead", default=object_names.NOBODY, options={"SKIP_SAVE"}
     )
 
     def execute(self, context):
-        if self.object_id != table.NOBODY:
+        if self.object_id != object_names.NOBODY:
             found = selection.find(context, self.scene, self.object_id)
             wanted = [] if found is None else [found]
         elif self.text.strip():
@@ -36,14 +38,16 @@ class R5DGS_OT_isolate(actions.Selects, bpy.types.Operator):
             wanted = answer.objects
         else:
             wanted = selection.selected(context)
-        known = {collection: (table.names(collection), table.present(collection)) for collection, _ in wanted}
+        known = {
+            collection: (object_names.names(collection), object_names.present(collection)) for collection, _ in wanted
+        }
         wanted = [(collection, object_id) for collection, object_id in wanted if object_id in known[collection][1]]
         if not wanted:
             self.report({"WARNING"}, "Select an object of a loaded scene, or type its name first")
             return {"CANCELLED"}
         hidden = isolation.isolate(context, wanted)
         shown = ", ".join(known[collection][0][object_id] for collection, object_id in wanted)
-        self.report({"INFO"}, f"{shown}: {amounts.of(hidden, 'other')} hidden; Un-Isolate shows all again")
+        self.report({"INFO"}, f"{shown}: {plural.of(hidden, 'other')} hidden; Un-Isolate shows all again")
         return {"FINISHED"}
 
 

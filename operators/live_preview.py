@@ -2,10 +2,11 @@
 
 import bpy
 
-from ..r5dgs_addon import actions, live_preview
+from ..r5dgs_addon.engine import live_preview
+from ..r5dgs_addon.scene import polls
 
 
-class R5DGS_OT_live_preview(actions.NeedsCamera, bpy.types.Operator):
+class R5DGS_OT_live_preview(polls.NeedsCamera, bpy.types.Operator):
     """Keep the image 'R5DGS Preview' up to date with the frame, the camera and the objects; press again to stop"""
 
     bl_idname = "r5dgs.live_preview"

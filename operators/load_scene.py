@@ -5,7 +5,10 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import amounts, displays, keyframes, loaded_scenes, motion_physics, objects, running
+from ..r5dgs_addon import build_scene
+from ..r5dgs_addon.motion import keyframes, physics
+from ..r5dgs_addon.scene import loaded_scenes, viewport_display
+from ..r5dgs_addon.ui import plural, stepwise_operator
 from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
@@ -64,8 +67,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     display: EnumProperty(
         name="Display",
         description="What stands for Gaussians where the viewport draws no splats",
-        items=displays.ITEMS,
-        default=displays.POINTS,
+        items=viewport_display.ITEMS,
+        default=viewport_display.POINTS,
     )
 
     @classmethod
@@ -89,7 +92,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             self.report({"ERROR"}, "No file given: choose a .r5dgs file")
             return {"CANCELLED"}
         path = Path(bpy.path.abspath(self.filepath))
-        options = objects.Options(
+        options = build_scene.Options(
             world_convention="" if self.world_convention == "FILE" else self.world_convention,
             frame_zero=self.frame_zero,
             t_end=self.t_end or None,
@@ -99,25 +102,25 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             display=self.display,
         )
         try:
-            with running.cursor(context) as progress:
+            with stepwise_operator.cursor(context) as progress:
                 progress(0.1)
                 scene = scene_file.read(path)
                 progress(0.4)
-                collection = objects.build(context, scene, path, options)
+                collection = build_scene.build(context, scene, path, options)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
-        self.report({"INFO"}, f"{path.name}: {amounts.of(len(scene.means), 'Gaussian')}, {amounts.of(named, 'object')}")
+        self.report({"INFO"}, f"{path.name}: {plural.of(len(scene.means), 'Gaussian')}, {plural.of(named, 'object')}")
         if named == 0:
             self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
-        too_fast = motion_physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
+        too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
         if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say
             count = len(scene.residual_rows)
             self.report(
-                {"WARNING"}, f"{amounts.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
+                {"WARNING"}, f"{plural.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
             )
         return {"FINISHED"}
 

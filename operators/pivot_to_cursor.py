@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import motion_objects, motion_physics, motion_pivot
+from ..r5dgs_addon.motion import duplicate_delete, physics, pivot
 from ..r5dgs_core import errors
 
 
@@ -15,20 +15,20 @@ class R5DGS_OT_pivot_to_cursor(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if motion_objects.active_anchor(context) is None:
+        if duplicate_delete.active_anchor(context) is None:
             cls.poll_message_set("Select an object of an R5DGS scene first")
             return False
         return True
 
     def execute(self, context):
-        anchor = motion_objects.active_anchor(context)
+        anchor = duplicate_delete.active_anchor(context)
         try:
-            motion_pivot.move(anchor, motion_pivot.to_parent(anchor, context.scene.cursor.location))
+            pivot.move(anchor, pivot.to_parent(anchor, context.scene.cursor.location))
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        motion_physics.write_at_once(anchor.r5dgs_motion, context)
-        then = "" if motion_physics.is_written(anchor) else "; Re-Extrapolate writes it to the keys"
+        physics.write_at_once(anchor.r5dgs_motion, context)
+        then = "" if physics.is_written(anchor) else "; Re-Extrapolate writes it to the keys"
         self.report({"INFO"}, f"{anchor.name}: pivot at the 3D cursor{then}")
         return {"FINISHED"}
 

@@ -2,10 +2,12 @@
 
 import bpy
 
-from ..r5dgs_addon import actions, figures, picture, waiting
+from ..r5dgs_addon.engine import render_request, render_stats
+from ..r5dgs_addon.scene import polls
+from ..r5dgs_addon.worker import worker_operator
 
 
-class R5DGS_OT_preview(waiting.Waiting, actions.NeedsCamera, bpy.types.Operator):
+class R5DGS_OT_preview(worker_operator.Waiting, polls.NeedsCamera, bpy.types.Operator):
     """Render the loaded scenes as the active camera sees them, in the worker, into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"
@@ -14,15 +16,17 @@ class R5DGS_OT_preview(waiting.Waiting, actions.NeedsCamera, bpy.types.Operator)
 
     @classmethod
     def poll(cls, context):
-        return waiting.free(cls, picture.PREVIEW) and super().poll(context)
+        return worker_operator.free(cls, render_request.PREVIEW) and super().poll(context)
 
     def _begin(self, context):
-        return picture.start(context)
+        return render_request.start(context)
 
     def _finish(self, context, answer):
-        image, _ = picture.finish(answer)
-        place = [] if picture.show(context, image) else [f"open an Image Editor and choose '{image.name}' to see it"]
-        self.report({"INFO"}, "; ".join([f"{image.name}: {figures.speed()}", *figures.errors(), *place]))
+        image, _ = render_request.finish(answer)
+        place = (
+            [] if render_request.show(context, image) else [f"open an Image Editor and choose '{image.name}' to see it"]
+        )
+        self.report({"INFO"}, "; ".join([f"{image.name}: {render_stats.speed()}", *render_stats.errors(), *place]))
         return {"FINISHED"}
 
 

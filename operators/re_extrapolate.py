@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import motion_extrapolate, motion_objects, motion_physics
+from ..r5dgs_addon.motion import duplicate_delete, extrapolate, physics
 from ..r5dgs_core import errors
 
 
@@ -15,15 +15,15 @@ class R5DGS_OT_re_extrapolate(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return motion_objects.poll_chosen(cls, context)
+        return duplicate_delete.poll_chosen(cls, context)
 
     def execute(self, context):
         try:
-            written = motion_extrapolate.re_extrapolate(motion_objects.chosen(context))
+            written = extrapolate.re_extrapolate(duplicate_delete.chosen(context))
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        too_fast = motion_physics.too_fast(written)
+        too_fast = physics.too_fast(written)
         if too_fast:
             self.report({"WARNING"}, too_fast)
         self.report({"INFO"}, f"Extrapolated {', '.join(anchor.name for anchor in written)}")

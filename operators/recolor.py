@@ -3,13 +3,13 @@
 import bpy
 from bpy.props import FloatVectorProperty
 
-from ..r5dgs_addon import look, selection, table
+from ..r5dgs_addon.scene import object_names, object_tint, selection
 
 
 def tint(operator: bpy.types.Operator, context: bpy.types.Context, factors) -> set[str]:
     """Tint the selected objects, and say which are not ours to tint. Returns what operators return."""
-    wanted = [cloud for item in selection.selected(context) for cloud in table.clouds(*item)]
-    linked = look.recolor(wanted, factors)
+    wanted = [cloud for item in selection.selected(context) for cloud in object_names.clouds(*item)]
+    linked = object_tint.recolor(wanted, factors)
     if linked:
         operator.report({"WARNING"}, f"Linked from another file, make a library override first: {', '.join(linked)}")
     return {"CANCELLED"} if len(linked) == len(wanted) else {"FINISHED"}
@@ -27,7 +27,7 @@ class R5DGS_OT_recolor(bpy.types.Operator):
         description="Color that the Gaussians are multiplied with; white leaves them as captured",
         subtype="COLOR_GAMMA",
         size=3,
-        default=look.NONE,
+        default=object_tint.NONE,
         min=0.0,
         soft_max=1.0,
         max=8.0,

@@ -3,10 +3,10 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..r5dgs_addon import actions, loaded_scenes, table
+from ..r5dgs_addon.scene import loaded_scenes, object_names, polls
 
 
-class R5DGS_OT_remove_alias(actions.OfObject, bpy.types.Operator):
+class R5DGS_OT_remove_alias(polls.OfObject, bpy.types.Operator):
     """Remove this word, so that it no longer finds the object"""
 
     bl_idname = "r5dgs.remove_alias"
@@ -17,7 +17,7 @@ class R5DGS_OT_remove_alias(actions.OfObject, bpy.types.Operator):
 
     def execute(self, context):
         found = self.found(context)
-        entry = None if found is None else table.entry_of(*found)
+        entry = None if found is None else object_names.entry_of(*found)
         words = [] if entry is None else [alias.name for alias in entry.aliases]
         if entry is None or not loaded_scenes.is_own(found[0]) or self.word not in words:
             self.report({"WARNING"}, f"No such word to remove: '{self.word}'")

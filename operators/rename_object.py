@@ -3,11 +3,11 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..r5dgs_addon import actions, table
+from ..r5dgs_addon.scene import object_names, polls
 from ..r5dgs_core import errors
 
 
-class R5DGS_OT_rename_object(actions.OfObject, bpy.types.Operator):
+class R5DGS_OT_rename_object(polls.OfObject, bpy.types.Operator):
     """Rename the active object of a loaded scene: its collection, anchor and clouds, and what finds it"""
 
     bl_idname = "r5dgs.rename_object"
@@ -19,7 +19,7 @@ class R5DGS_OT_rename_object(actions.OfObject, bpy.types.Operator):
     def invoke(self, context, event):
         found = self.found(context)
         if found is not None and not self.new_name:
-            self.new_name = table.names(found[0]).get(found[1], "")
+            self.new_name = object_names.names(found[0]).get(found[1], "")
         return context.window_manager.invoke_props_dialog(self)
 
     def draw(self, context):
@@ -27,11 +27,11 @@ class R5DGS_OT_rename_object(actions.OfObject, bpy.types.Operator):
 
     def execute(self, context):
         found = self.found(context)
-        if found is None or table.entry_of(*found) is None:
+        if found is None or object_names.entry_of(*found) is None:
             self.report({"WARNING"}, "Select an object of a loaded scene first")
             return {"CANCELLED"}
         try:
-            name = table.rename(*found, self.new_name)
+            name = object_names.rename(*found, self.new_name)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

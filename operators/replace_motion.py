@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import motion_extrapolate, motion_objects, motion_replacement
+from ..r5dgs_addon.motion import duplicate_delete, extrapolate, replace
 from ..r5dgs_core import errors
 
 STAYS = (
@@ -24,29 +24,29 @@ class R5DGS_OT_replace_motion(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        source = motion_objects.active_anchor(context)
-        if source is None or not [anchor for anchor in motion_objects.chosen(context) if anchor != source]:
+        source = duplicate_delete.active_anchor(context)
+        if source is None or not [anchor for anchor in duplicate_delete.chosen(context) if anchor != source]:
             cls.poll_message_set("Select the objects that shall move, and last the one that they shall move like")
             return False
         return True
 
     def execute(self, context):
-        source = motion_objects.active_anchor(context)
-        targets = [anchor for anchor in motion_objects.chosen(context) if anchor != source]
+        source = duplicate_delete.active_anchor(context)
+        targets = [anchor for anchor in duplicate_delete.chosen(context) if anchor != source]
         try:
             plans = []
             for target in targets:
-                times = motion_extrapolate.times_of(target)
+                times = extrapolate.times_of(target)
                 frame = {
                     "LAST": times.frame(times.t_max),
                     "FIRST": times.frame(times.t_start),
                     "CURRENT": context.scene.frame_current_final,
                 }[self.stays]
-                plans.append(motion_replacement.prepare(target, source, frame, times))
-            motion_extrapolate.check(targets)
+                plans.append(replace.prepare(target, source, frame, times))
+            extrapolate.check(targets)
             for plan in plans:
-                motion_replacement.apply(plan)
-            motion_extrapolate.re_extrapolate(motion_extrapolate.followers(targets))
+                replace.apply(plan)
+            extrapolate.re_extrapolate(extrapolate.followers(targets))
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

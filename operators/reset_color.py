@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import look, selection, table
+from ..r5dgs_addon.scene import object_names, object_tint, selection
 from . import recolor
 
 
@@ -15,13 +15,15 @@ class R5DGS_OT_reset_color(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if not any(look.is_tinted(cloud) for item in selection.selected(context) for cloud in table.clouds(*item)):
+        if not any(
+            object_tint.is_tinted(cloud) for item in selection.selected(context) for cloud in object_names.clouds(*item)
+        ):
             cls.poll_message_set("Select an object that is tinted first")
             return False
         return True
 
     def execute(self, context):
-        return recolor.tint(self, context, look.NONE)
+        return recolor.tint(self, context, object_tint.NONE)
 
 
 CLASSES = (R5DGS_OT_reset_color,)

@@ -3,7 +3,8 @@
 import bpy
 from bpy.props import BoolProperty
 
-from ..r5dgs_addon import motion_extrapolate, motion_objects, picture
+from ..r5dgs_addon.engine import render_request
+from ..r5dgs_addon.motion import duplicate_delete, extrapolate
 from ..r5dgs_core import errors
 
 
@@ -22,21 +23,21 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return motion_objects.poll_chosen(cls, context)
+        return duplicate_delete.poll_chosen(cls, context)
 
     def execute(self, context):
-        anchors = motion_objects.chosen(context)
+        anchors = duplicate_delete.chosen(context)
         try:
             if self.observed:  # all of it is there and can be written before any of it is
-                motion_extrapolate.check(anchors, curves=False)
-                members = motion_objects.by_scene(anchors)
+                extrapolate.check(anchors, curves=False)
+                members = duplicate_delete.by_scene(anchors)
                 sources = [
-                    motion_extrapolate.source(own, picture.scene_path(collection))
+                    extrapolate.source(own, render_request.scene_path(collection))
                     for collection, own in members.items()
                 ]
                 for own, scene in zip(members.values(), sources, strict=True):
-                    motion_extrapolate.reload(own, scene)
-            motion_extrapolate.reset(anchors)
+                    extrapolate.reload(own, scene)
+            extrapolate.reset(anchors)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

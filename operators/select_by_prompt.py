@@ -3,7 +3,8 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 
-from ..r5dgs_addon import actions, prompt, selection
+from ..r5dgs_addon.language import prompt
+from ..r5dgs_addon.scene import polls, selection
 
 MODES = (
     ("SET", "Set", "Select these objects only", "SELECT_SET", 0),
@@ -12,7 +13,7 @@ MODES = (
 )
 
 
-class R5DGS_OT_select_by_prompt(actions.Selects, bpy.types.Operator):
+class R5DGS_OT_select_by_prompt(polls.Selects, bpy.types.Operator):
     """Select the objects that these words name"""
 
     bl_idname = "r5dgs.select_by_prompt"

@@ -3,11 +3,11 @@
 import bpy
 from bpy.props import EnumProperty, IntProperty, StringProperty
 
-from ..r5dgs_addon import actions, selection, table
+from ..r5dgs_addon.scene import object_names, polls, selection
 from . import select_by_prompt
 
 
-class R5DGS_OT_select_object(actions.Selects, bpy.types.Operator):
+class R5DGS_OT_select_object(polls.Selects, bpy.types.Operator):
     """Select this object; Shift adds it, Ctrl takes it out"""
 
     bl_idname = "r5dgs.select_object"
@@ -18,7 +18,10 @@ class R5DGS_OT_select_object(actions.Selects, bpy.types.Operator):
         name="Scene", description="Collection of its scene; empty for the active one", options={"SKIP_SAVE"}
     )
     object_id: IntProperty(
-        name="Object Id", description="Id in the scene's table of objects", default=table.NOBODY, options={"SKIP_SAVE"}
+        name="Object Id",
+        description="Id in the scene's table of objects",
+        default=object_names.NOBODY,
+        options={"SKIP_SAVE"},
     )
     mode: EnumProperty(
         name="Mode", description="What to do with the selection", items=select_by_prompt.MODES, options={"SKIP_SAVE"}
@@ -35,8 +38,8 @@ class R5DGS_OT_select_object(actions.Selects, bpy.types.Operator):
             self.report({"WARNING"}, "There is no such object; search again")
             return {"CANCELLED"}
         collection, object_id = found
-        name = table.names(collection)[object_id]
-        if object_id not in table.present(collection):
+        name = object_names.names(collection)[object_id]
+        if object_id not in object_names.present(collection):
             self.report({"WARNING"}, f"{name} was deleted")
             return {"CANCELLED"}
         missed = selection.select(context, [found], self.mode)

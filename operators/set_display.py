@@ -3,17 +3,17 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..r5dgs_addon import actions, displays, loaded_scenes
+from ..r5dgs_addon.scene import loaded_scenes, polls, viewport_display
 
 
-class R5DGS_OT_set_display(actions.NeedsScene, bpy.types.Operator):
+class R5DGS_OT_set_display(polls.NeedsScene, bpy.types.Operator):
     """Choose what stands for the Gaussians of this scene where the viewport draws no splats"""
 
     bl_idname = "r5dgs.set_display"
     bl_label = "Set Display"
     bl_options = {"REGISTER", "UNDO"}
 
-    display: EnumProperty(name="Display", description="What stands for a Gaussian", items=displays.ITEMS)
+    display: EnumProperty(name="Display", description="What stands for a Gaussian", items=viewport_display.ITEMS)
 
     @classmethod
     def poll(cls, context):
@@ -25,7 +25,7 @@ class R5DGS_OT_set_display(actions.NeedsScene, bpy.types.Operator):
         return True
 
     def execute(self, context):
-        displays.show(loaded_scenes.active_collection(context), self.display)
+        viewport_display.show(loaded_scenes.active_collection(context), self.display)
         return {"FINISHED"}
 
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import engine_color
+from ..r5dgs_addon.color import display_to_linear
 
 
 class R5DGS_OT_show_colors_as_trained(bpy.types.Operator):
@@ -13,7 +13,7 @@ class R5DGS_OT_show_colors_as_trained(bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context):
-        engine_color.show_as_trained(context.scene)
+        display_to_linear.show_as_trained(context.scene)
         return {"FINISHED"}
 
 

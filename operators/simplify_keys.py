@@ -3,7 +3,8 @@
 import bpy
 from bpy.props import FloatProperty
 
-from ..r5dgs_addon import amounts, motion_objects, motion_simplify
+from ..r5dgs_addon.motion import duplicate_delete, simplify
+from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
 
@@ -25,15 +26,15 @@ class R5DGS_OT_simplify_keys(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return motion_objects.poll_chosen(cls, context)
+        return duplicate_delete.poll_chosen(cls, context)
 
     def execute(self, context):
         try:
-            before, after = motion_simplify.simplify(motion_objects.chosen(context), self.tolerance)
+            before, after = simplify.simplify(duplicate_delete.chosen(context), self.tolerance)
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.report({"INFO"}, f"{amounts.of(before, 'key')} became {after:,}")
+        self.report({"INFO"}, f"{plural.of(before, 'key')} became {after:,}")
         return {"FINISHED"}
 
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..r5dgs_addon import isolation
+from ..r5dgs_addon.scene import isolation
 
 
 class R5DGS_OT_unisolate(bpy.types.Operator):

@@ -2,7 +2,8 @@
 
 import bpy
 
-from ..r5dgs_addon import engine, engine_color, engine_loss
+from ..r5dgs_addon.color import display_to_linear, inverse_loss
+from ..r5dgs_addon.engine import engine
 
 REMEDY = "'Show Colors as Trained' in the render properties sets Standard, which shows all"
 
@@ -17,17 +18,17 @@ class R5DGS_OT_use_engine(bpy.types.Operator):
     def execute(self, context):
         scene = context.scene
         scene.render.engine = engine.ENGINE
-        loss = engine_loss.measure(scene)
-        objections = engine_color.objections(scene)
+        loss = inverse_loss.measure(scene)
+        objections = display_to_linear.objections(scene)
         view = scene.view_settings.view_transform
         if objections:
             self.report({"WARNING"}, f"Engine R5DGS; colors are not as trained with {', '.join(objections)}; {REMEDY}")
         elif loss is None:
             self.report({"INFO"}, "Engine R5DGS")
-        elif loss.psnr < engine_loss.ENOUGH_DB:
-            self.report({"WARNING"}, f"Engine R5DGS; {view} is inverted, {engine_loss.note(loss)}; {REMEDY}")
+        elif loss.psnr < inverse_loss.ENOUGH_DB:
+            self.report({"WARNING"}, f"Engine R5DGS; {view} is inverted, {inverse_loss.note(loss)}; {REMEDY}")
         else:
-            self.report({"INFO"}, f"Engine R5DGS; {view} is inverted: {engine_loss.note(loss)}")
+            self.report({"INFO"}, f"Engine R5DGS; {view} is inverted: {inverse_loss.note(loss)}")
         return {"FINISHED"}
 
 

@@ -1,44 +1,30 @@
 """Services of the add-on: objects, keyframes, properties, preferences, panels and the worker's client."""
 
-from . import (
-    click,
-    cloud_points,
-    engine,
-    figures,
-    handlers,
-    live_preview,
-    look,
-    motion_exact,
-    motion_extrapolate,
-    motion_physics,
-    motion_pivot,
-    panels,
-    preferences,
-    properties,
-    render_notes,
-    table,
-    words,
-    worker,
-)
+from . import panels, preferences
+from .engine import engine, live_preview, render_notes, render_stats
+from .language import prompt_state
+from .motion import exact_mode, extrapolate, physics, pivot
+from .scene import click_select, evaluated_points, object_names, object_tint, properties, relink
+from .worker import jobs
 
 MODULES = (
     properties,
-    look,
-    table,
-    words,
-    motion_physics,
-    motion_extrapolate,
-    motion_pivot,
-    motion_exact,
-    cloud_points,
+    object_tint,
+    object_names,
+    prompt_state,
+    physics,
+    extrapolate,
+    pivot,
+    exact_mode,
+    evaluated_points,
     preferences,
-    figures,
+    render_stats,
     render_notes,
     engine,
     panels,
-    handlers,
-    click,
-    worker,
+    relink,
+    click_select,
+    jobs,
     live_preview,
 )
 

@@ -18,7 +18,8 @@ from bpy.props import IntProperty, StringProperty
 
 from .. import __package__ as base_package
 from ..r5dgs_core import errors, user_settings
-from . import pythons, worker_check
+from . import find_python
+from .ui import worker_status
 
 ENVIRONMENT = "R5DGS_PYTHON"
 ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
@@ -91,7 +92,7 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
         layout.prop(self, "trusted_folders")
         if os.environ.get(TRUSTED_ENVIRONMENT):
             layout.label(text=f"And {TRUSTED_ENVIRONMENT}: {os.environ[TRUSTED_ENVIRONMENT]}", icon="INFO")
-        worker_check.draw(layout, context)
+        worker_status.draw(layout, context)
 
 
 def get() -> "R5DGS_AP_preferences | None":
@@ -140,7 +141,7 @@ class Choice:
         known = self.known()
         if known is not None:
             return known
-        found = pythons.find(list(self.beside), stopped=stopped) or ""
+        found = find_python.find(list(self.beside), stopped=stopped) or ""
         if not stopped():
             _found = found
         return found or sys.executable

@@ -118,7 +118,25 @@ LATE_IMPORTS = {
     "train.run": {"train.object_discovery", "train.residual_trial"},
 }
 # The same of the add-on: OpenImageIO is optional there.
-LATE_ADDON_IMPORTS = {"capture_files": {"data.images"}}
+LATE_ADDON_IMPORTS = {"capture.files": {"data.images"}}
+# Which rooms of the add-on a room may import, itself aside, lower rooms first.
+ADDON_ALLOWED = {
+    "compat": set(),
+    "ui": set(),
+    "process_group": set(),
+    "find_python": {"process_group"},
+    "preferences": {"ui", "find_python"},
+    "scene": {"compat", "ui", "preferences"},
+    "color": {"compat", "ui", "scene"},
+    "worker": {"ui", "process_group", "find_python", "preferences", "scene"},
+    "engine": {"compat", "ui", "scene", "color", "worker"},
+    "language": {"ui", "preferences", "scene", "worker", "engine"},
+    "motion": {"compat", "ui", "scene", "engine"},
+    "build_scene": {"compat", "scene", "motion"},
+    "export": {"ui", "scene", "worker", "engine", "motion"},
+    "panels": {"ui", "scene", "color", "worker", "engine", "language", "motion"},
+    "capture": {"ui", "export"},
+}
 LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "user_settings"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
@@ -306,6 +324,23 @@ def test_the_scan_sees_a_circle(back):
 def test_the_scan_sees_imports_inside_functions():
     sources = {"x.a": ("from . import b\ndef f():\n    from .c import d", "x"), "x.b": ("", "x"), "x.c": ("", "x")}
     assert late_imports(sources) == {"x.a": {"x.c"}}
+
+
+@pytest.mark.parametrize("own", sorted(ADDON_ALLOWED))
+def test_no_room_of_the_addon_imports_upward(own):
+    problems = []
+    for importer, imported, item in project_imports(project_sources()):
+        rooms = [name.split(".")[2] for name in (importer, imported) if name.startswith("r5dgs.r5dgs_addon.")]
+        if len(rooms) == 2 and rooms[0] == own and rooms[1] not in ADDON_ALLOWED[own] | {own}:
+            problems.append(f"{importer}, line {item.line}: {own} imports {imported}")
+    assert not problems, "\n".join(problems)
+
+
+def test_the_directions_of_the_addon_have_no_circle():
+    found = {path.stem for path in (ROOT / "r5dgs_addon").iterdir() if path.suffix == ".py" and path.stem != "__init__"}
+    found |= {path.parent.name for path in (ROOT / "r5dgs_addon").glob("*/__init__.py")}
+    assert found == set(ADDON_ALLOWED)
+    graphlib.TopologicalSorter(ADDON_ALLOWED).prepare()
 
 
 @pytest.mark.parametrize("folder", ["r5dgs_addon", "operators"])

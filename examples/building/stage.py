@@ -82,7 +82,7 @@ def capture_service() -> ModuleType:
         package = importlib.util.module_from_spec(spec)
         sys.modules["r5dgs"] = package
         spec.loader.exec_module(package)
-    return importlib.import_module("r5dgs.r5dgs_addon.capture")
+    return importlib.import_module("r5dgs.r5dgs_addon.capture.capture")
 
 
 def save(blend: Path) -> None:

@@ -3,7 +3,9 @@
 import bpy
 
 from ...r5dgs_core import errors
-from .. import loaded_scenes, motion_confidence, motion_curves, motion_objects, motion_physics, motion_pivot, windows
+from ..motion import confidence_tubes, duplicate_delete, fcurves, physics, pivot
+from ..scene import loaded_scenes
+from ..ui import status_bar
 from . import sidebar
 
 
@@ -17,7 +19,7 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
         layout = self.layout
         layout.use_property_split = True
         layout.use_property_decorate = False
-        anchor = motion_objects.active_anchor(context)
+        anchor = duplicate_delete.active_anchor(context)
         if anchor is None:
             layout.label(text="Select an object to see its motion", icon="INFO")
         else:
@@ -37,24 +39,24 @@ def _physics(layout, anchor) -> None:
     """The fields of the motion."""
     state = anchor.r5dgs_motion
     layout.label(text=anchor.name, icon="EMPTY_ARROWS")
-    refused = motion_curves.refusal(anchor)
+    refused = fcurves.refusal(anchor)
     if refused:
-        windows.wrapped(layout, bpy.context, refused, "ERROR")
+        status_bar.wrapped(layout, bpy.context, refused, "ERROR")
     layout.prop(state, "leader")
-    if motion_physics.follow_matrix(state) is not None:
+    if physics.follow_matrix(state) is not None:
         layout.label(text="Moves with what it follows", icon="LINKED")
         return
     layout.prop(state, "kind")
     if not refused:
         _pivot(layout, anchor)
-    for name in motion_physics.FIELDS[state.kind]:
+    for name in physics.FIELDS[state.kind]:
         layout.prop(state, name)
     layout.prop(state, "at_once")
     if state.too_fast:
-        windows.wrapped(layout, bpy.context, "Too fast for keys: exact only at frames", "ERROR")
-    if not motion_physics.is_written(anchor):
-        windows.wrapped(layout, bpy.context, "Re-Extrapolate writes this to the keys", "ERROR")
-    elif motion_physics.edited(state):
+        status_bar.wrapped(layout, bpy.context, "Too fast for keys: exact only at frames", "ERROR")
+    if not physics.is_written(anchor):
+        status_bar.wrapped(layout, bpy.context, "Re-Extrapolate writes this to the keys", "ERROR")
+    elif physics.edited(state):
         layout.label(text="Edited", icon="GREASEPENCIL")
     else:
         layout.label(text="As learned", icon="CHECKMARK")
@@ -63,14 +65,14 @@ def _physics(layout, anchor) -> None:
 def _pivot(layout, anchor) -> None:
     """What the motion turns or swings about, where it does."""
     try:
-        point = motion_pivot.point(anchor)
+        point = pivot.point(anchor)
     except errors.R5dgsError:  # an action says why
         point = None
     if point is not None:
         column = layout.column(align=True)
         column.prop(anchor.r5dgs_pivot, "point")
         column.operator("r5dgs.pivot_to_cursor", text="Use 3D Cursor", icon="PIVOT_CURSOR")
-    if motion_pivot.axis(anchor) is not None:
+    if pivot.axis(anchor) is not None:
         layout.prop(anchor.r5dgs_pivot, "axis")
 
 
@@ -78,13 +80,13 @@ def _scene(layout, collection) -> None:
     """What concerns all objects."""
     column = layout.column(align=True)
     column.operator("r5dgs.extrapolate_until", icon="PREVIEW_RANGE")
-    shown = any(motion_confidence.helper_of(anchor) for anchor in loaded_scenes.members(collection, "ANCHOR"))
+    shown = any(confidence_tubes.helper_of(anchor) for anchor in loaded_scenes.members(collection, "ANCHOR"))
     column.operator("r5dgs.show_confidence", text="Hide Confidence" if shown else "Show Confidence", icon="CURVE_PATH")
     exact = collection.r5dgs_exact
     text = "Exact Mode Is On" if exact.enabled else "Exact Mode"
     column.operator("r5dgs.exact_mode", text=text, icon="MOD_SIMPLEDEFORM", depress=exact.enabled)
     if exact.problem:
-        windows.wrapped(layout, bpy.context, exact.problem, "ERROR")
+        status_bar.wrapped(layout, bpy.context, exact.problem, "ERROR")
 
 
 CLASSES = (R5DGS_PT_motion,)

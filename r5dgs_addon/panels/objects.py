@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import isolation, loaded_scenes, look, table
+from ..scene import isolation, loaded_scenes, object_names, object_tint
 from . import sidebar
 
 OTHERS = (("r5dgs.duplicate_object", "Duplicate", "DUPLICATE"), ("r5dgs.delete_object", "Delete", "TRASH"))
@@ -15,7 +15,7 @@ class R5DGS_UL_objects(bpy.types.UIList):
     bl_idname = "R5DGS_UL_objects"
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flt_flag=0):
-        own = table.clouds(item.id_data, item.object_id)
+        own = object_names.clouds(item.id_data, item.object_id)
         row = layout.row(align=True)
         swatch = row.row()
         swatch.ui_units_x = 1.0
@@ -38,7 +38,7 @@ class R5DGS_UL_objects(bpy.types.UIList):
         entries, wanted = getattr(data, name), self.filter_name.casefold()
         if not wanted:
             return [], []
-        names = table.names(data.id_data)
+        names = object_names.names(data.id_data)
         shown = [wanted in names[entry.object_id].casefold() for entry in entries]
         return [self.bitflag_filter_item if keep else 0 for keep in shown], []
 
@@ -69,13 +69,13 @@ class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
 
 def _draw_active(box, collection, entry):
     box.prop(entry, "label", text="Name")
-    moves = _motion(table.clouds(collection, entry.object_id))
+    moves = _motion(object_names.clouds(collection, entry.object_id))
     if moves:
         box.label(text=f"Motion: {moves}", icon="CON_FOLLOWPATH")
     row = box.row(align=True)
     row.prop(entry, "tint")
     row.operator("r5dgs.reset_color", text="", icon="LOOP_BACK")
-    if any(look.is_tinted(cloud) for cloud in table.clouds(collection, entry.object_id)):
+    if any(object_tint.is_tinted(cloud) for cloud in object_names.clouds(collection, entry.object_id)):
         box.label(text="Tinted: previews, renders and exports obey it", icon="COLOR")
     if entry.caption:
         box.label(text=entry.caption)

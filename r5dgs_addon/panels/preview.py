@@ -2,7 +2,9 @@
 
 import bpy
 
-from .. import engine, figures, live_preview, windows, worker, worker_check
+from ..engine import engine, live_preview, render_stats
+from ..ui import status_bar, worker_status
+from ..worker import jobs
 from . import render, sidebar
 
 
@@ -18,21 +20,21 @@ class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
         row.operator("r5dgs.preview", icon="RENDER_STILL")
         row.operator("r5dgs.live_preview", text="Live", icon="PLAY", depress=live_preview.running())
         if live_preview.message():
-            windows.wrapped(layout, context, live_preview.message(), "ERROR")
-        if worker.notice():
-            windows.wrapped(layout, context, worker.notice().capitalize(), "SORTTIME")
-        if figures.speed():
+            status_bar.wrapped(layout, context, live_preview.message(), "ERROR")
+        if jobs.notice():
+            status_bar.wrapped(layout, context, jobs.notice().capitalize(), "SORTTIME")
+        if render_stats.speed():
             column = layout.column(align=True)
-            windows.wrapped(column, context, figures.speed(), "TIME")
-            for line in figures.errors():
-                windows.wrapped(column, context, line[0].upper() + line[1:], "BLANK1")
+            status_bar.wrapped(column, context, render_stats.speed(), "TIME")
+            for line in render_stats.errors():
+                status_bar.wrapped(column, context, line[0].upper() + line[1:], "BLANK1")
         if context.scene.camera is None:
             layout.label(text="The scene has no camera", icon="INFO")
         if context.scene.render.engine != engine.ENGINE:
             layout.operator("r5dgs.use_engine", icon="SCENE")
         else:
             render.draw_loss(layout, context.scene)
-        worker_check.draw(layout, context)
+        worker_status.draw(layout, context)
 
 
 CLASSES = (R5DGS_PT_preview,)

@@ -2,7 +2,9 @@
 
 import bpy
 
-from .. import isolation, loaded_scenes, prompt, selection, table, windows
+from ..language import prompt
+from ..scene import isolation, loaded_scenes, object_names, selection
+from ..ui import status_bar
 from . import sidebar
 
 
@@ -51,7 +53,7 @@ class R5DGS_PT_prompt(sidebar.WithScene, bpy.types.Panel):
 def _draw_answers(box, session, names):
     asking = any(note.name.startswith(prompt.ASKING) for note in session.notes)
     if not session.matches and not asking:
-        windows.wrapped(box, bpy.context, f"Nothing matches '{session.asked}'", "INFO")
+        status_bar.wrapped(box, bpy.context, f"Nothing matches '{session.asked}'", "INFO")
     for match in session.matches:
         line = box.split(factor=0.5)
         action = line.operator(
@@ -68,7 +70,7 @@ def _draw_answers(box, session, names):
             row.operator("r5dgs.select_by_prompt", text=item.name).text = item.name
     for note in session.notes:
         icon = "TIME" if note.name.startswith(prompt.ASKING) else "ERROR"
-        windows.wrapped(box, bpy.context, note.name, icon)
+        status_bar.wrapped(box, bpy.context, note.name, icon)
 
 
 def _current_names(session) -> dict[tuple[str, int], str]:
@@ -78,7 +80,7 @@ def _current_names(session) -> dict[tuple[str, int], str]:
         (collection.name, object_id): name
         for collection in loaded_scenes.scene_collections()
         if collection.name in wanted
-        for object_id, name in table.names(collection).items()
+        for object_id, name in object_names.names(collection).items()
     }
 
 

@@ -2,16 +2,19 @@
 
 import bpy
 
-from .. import engine, engine_color, engine_loss, render_notes, windows, worker
+from ..color import display_to_linear, inverse_loss
+from ..engine import engine, render_notes
+from ..ui import status_bar
+from ..worker import jobs
 
 
 def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """Draw the loss of the scenes' colours under the view, once it is measured."""
-    loss = engine_loss.known(scene)
+    loss = inverse_loss.known(scene)
     if loss is not None:
-        poor, text = loss.psnr < engine_loss.ENOUGH_DB, engine_loss.note(loss)
+        poor, text = loss.psnr < inverse_loss.ENOUGH_DB, inverse_loss.note(loss)
         text = f"{scene.view_settings.view_transform}: {text}"
-        windows.wrapped(layout, bpy.context, text, "ERROR" if poor else "INFO")
+        status_bar.wrapped(layout, bpy.context, text, "ERROR" if poor else "INFO")
         if poor:
             layout.operator("r5dgs.show_colors_as_trained", icon="COLOR")
 
@@ -40,29 +43,29 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         scene = context.scene
-        objections = engine_color.objections(scene)
+        objections = display_to_linear.objections(scene)
         if objections:
             box = layout.box().column(align=True)
             text = f"Colors do not come out as trained: {', '.join(objections)}"
-            windows.wrapped(box, context, text, "ERROR")
+            status_bar.wrapped(box, context, text, "ERROR")
             box.operator("r5dgs.show_colors_as_trained", icon="COLOR")
         for note in render_notes.of(scene):
-            windows.wrapped(layout, context, note, "INFO")
+            status_bar.wrapped(layout, context, note, "INFO")
         settings = scene.r5dgs_render
         column = layout.column()
         column.prop(settings, "as_trained")
-        inverse = engine_color.inverse(scene)
+        inverse = display_to_linear.inverse(scene)
         if inverse is not None and not objections:
             text = f"{scene.view_settings.view_transform} is inverted for Gaussians"
-            windows.wrapped(column, context, text, "CHECKMARK")
+            status_bar.wrapped(column, context, text, "CHECKMARK")
             draw_loss(column, scene)
-            if inverse.reach < engine_color.WIDE:
-                windows.wrapped(column, context, "Very saturated colors stay paler")
+            if inverse.reach < display_to_linear.WIDE:
+                status_bar.wrapped(column, context, "Very saturated colors stay paler")
         column.prop(settings, "sky")
         column.prop(scene.render, "film_transparent", text="Transparent")
         column.prop(settings, "moving")
-        if worker.notice():
-            windows.wrapped(layout, context, worker.notice().capitalize(), "SORTTIME")
+        if jobs.notice():
+            status_bar.wrapped(layout, context, jobs.notice().capitalize(), "SORTTIME")
 
 
 class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):

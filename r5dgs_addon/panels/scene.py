@@ -2,7 +2,8 @@
 
 import bpy
 
-from .. import amounts, cloud_points, displays, loaded_scenes, timeline, trust, windows
+from ..scene import evaluated_points, loaded_scenes, timeline, trust, viewport_display
+from ..ui import plural, status_bar
 from . import sidebar
 
 
@@ -25,7 +26,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         column = layout.column(align=True)
         named = sum(entry.object_id > 0 for entry in state.table)
         column.label(
-            text=f"{state.scene_name}: {amounts.of(named, 'object')}, {amounts.of(state.gaussians, 'Gaussian')}",
+            text=f"{state.scene_name}: {plural.of(named, 'object')}, {plural.of(state.gaussians, 'Gaussian')}",
             icon="OUTLINER_COLLECTION",
         )
         column.label(text=f"Observed {times.t_start:.3g} to {times.t_max:.3g}, keys to {times.t_end:.3g}", icon="TIME")
@@ -35,12 +36,12 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
             column.label(text=f"t = {t:.3f}: extrapolated by {t - times.t_max:.3f}", icon="FORWARD")
         else:
             column.label(text=f"t = {t:.3f}: observed", icon="HIDE_OFF")
-        for note in cloud_points.notes(collection):
-            windows.wrapped(layout, context, note, "ERROR")
+        for note in evaluated_points.notes(collection):
+            status_bar.wrapped(layout, context, note, "ERROR")
         if not timeline.fits(context.scene, times):
             layout.operator("r5dgs.fit_timeline", icon="TIME")
         row = layout.row(align=True)
-        for value, name, _ in displays.ITEMS:
+        for value, name, _ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
         row = layout.split(factor=0.33)  # beside the field Blender would cut the name
         row.label(text="Scene File")
@@ -48,7 +49,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         asked = trust.find(collection).asked
         if asked is not None:
             box = layout.box()
-            windows.wrapped(box, context, f"Not read, outside this .blend's folder: {asked}", "LOCKED")
+            status_bar.wrapped(box, context, f"Not read, outside this .blend's folder: {asked}", "LOCKED")
             row = box.row(align=True)
             row.operator("r5dgs.allow_scene_file").always = False
             row.operator("r5dgs.allow_scene_file", text="Trust Its Folder").always = True

@@ -1,6 +1,6 @@
 """What all panels of the tab R5DGS have in common."""
 
-from .. import loaded_scenes
+from ..scene import loaded_scenes
 
 TAB = "R5DGS"
 

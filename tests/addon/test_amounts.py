@@ -17,7 +17,7 @@ from tests import scenes
     ],
 )
 def test_one_is_said_as_one_and_several_as_several(blender, count, things, done):
-    amounts = importlib.import_module("r5dgs.r5dgs_addon.amounts")
+    amounts = importlib.import_module("r5dgs.r5dgs_addon.ui.plural")
     assert amounts.of(count, "Gaussian") == things and amounts.of(count, "Gaussian", "bend") == done
 
 

@@ -287,7 +287,7 @@ def test_a_python_without_torch_is_named_with_the_remedy_and_the_next_choice_wor
 @pytest.fixture
 def dying(loaded):
     """Has the worker killed while it is asked for something."""
-    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
 
     @contextlib.contextmanager
     def kill():

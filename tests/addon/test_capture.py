@@ -29,9 +29,8 @@ STILL = {"frame_end": 1, "objects": "SELECTED"}  # a single time; the moving bal
 @pytest.fixture(scope="module")
 def service(extension):
     """The capture services of the add-on, as attributes of one object."""
-    parts = ("files", "objects", "overrides", "render", "settings", "views")
-    names = ("capture", *(f"capture_{part}" for part in parts))
-    modules = {name: importlib.import_module(f"r5dgs.r5dgs_addon.{name}") for name in names}
+    names = ("capture", "cameras", "captured_objects", "files", "overrides", "render", "settings")
+    modules = {name: importlib.import_module(f"r5dgs.r5dgs_addon.capture.{name}") for name in names}
     return type("Service", (), modules)
 
 
@@ -87,7 +86,7 @@ def add_camera(bpy, name, azimuth_deg, distance=5.0, height=3.0):
 def settings_for(service, directory, **changes):
     """Small and fast settings: frames 1, 5, 9 are t = 0, 0.5, 1."""
     values = {**SMALL, "directory": directory, "frame_step": 4, "t_max": 0.5, "objects": "ANIMATED", **changes}
-    return service.capture_settings.CaptureSettings(**values)
+    return service.settings.CaptureSettings(**values)
 
 
 def capture(service, bpy, directory, **changes):
@@ -117,7 +116,7 @@ def fingerprint(bpy):
 
 @given(st.integers(-20, 20), st.integers(0, 60), st.integers(1, 7), st.floats(0, 1), st.integers(1, 5), st.booleans())
 def test_the_splits_divide_time_at_t_max(extension, start, length, step, t_max, val_every, between):
-    capture_module = importlib.import_module("r5dgs.r5dgs_addon.capture")
+    capture_module = importlib.import_module("r5dgs.r5dgs_addon.capture.capture")
     settings = capture_module.CaptureSettings(
         directory="x", frame_step=step, t_max=t_max, val_every=val_every, val_between=between
     )
@@ -131,7 +130,7 @@ def test_the_splits_divide_time_at_t_max(extension, start, length, step, t_max, 
 
 
 def test_val_also_asks_for_times_between_the_observed_ones(service):
-    settings = service.capture_settings.CaptureSettings(directory="x", frame_step=4, t_max=0.75, val_every=4)
+    settings = service.settings.CaptureSettings(directory="x", frame_step=4, t_max=0.75, val_every=4)
     plan = service.capture.plan_times(settings, 1, 61)
     assert len(plan.observed) == 12
     assert plan.val == (5.0, 15.0, 21.0, 31.0, 37.0)
@@ -144,7 +143,7 @@ def test_val_also_asks_for_times_between_the_observed_ones(service):
 @pytest.mark.parametrize(("observed", "novel"), [(1, 0), (1, 1), (8, 2), (3, 5)])
 def test_every_rig_camera_looks_at_the_target_from_its_distance(service, kind, observed, novel):
     target = np.array([40.0, -25.0, 3.0])
-    groups = service.capture_views.rig_poses(
+    groups = service.cameras.rig_poses(
         kind, observed, novel, target=target, radius=7.0, elevation_deg=20.0, elevation_spread_deg=6.0
     )
     assert [len(group) for group in groups] == [observed, novel]
@@ -163,9 +162,7 @@ def test_every_rig_camera_looks_at_the_target_from_its_distance(service, kind, o
 
 def test_an_arc_is_centred_on_its_azimuth_and_a_ring_is_closed(service):
     def azimuths(kind, **changes):
-        poses, _ = service.capture_views.rig_poses(
-            kind, 4, 0, target=np.zeros(3), radius=1.0, elevation_deg=0.0, **changes
-        )
+        poses, _ = service.cameras.rig_poses(kind, 4, 0, target=np.zeros(3), radius=1.0, elevation_deg=0.0, **changes)
         return [math.degrees(math.atan2(pose[1, 3], pose[0, 3])) for pose in poses]
 
     assert azimuths("ARC", azimuth_deg=-90, arc_deg=90) == pytest.approx([-135, -105, -75, -45])
@@ -303,9 +300,9 @@ def test_an_object_that_no_image_shows_is_reported(service, blender, scene, tmp_
 
 
 def choose(service, bpy, choice, collection=""):
-    with service.capture_overrides.Overrides() as overrides:
-        survey = service.capture_objects.survey(bpy.context, (1.0, 9.0), overrides)
-        return service.capture_objects.choose(bpy.context.view_layer, survey, choice, collection)
+    with service.overrides.Overrides() as overrides:
+        survey = service.captured_objects.survey(bpy.context, (1.0, 9.0), overrides)
+        return service.captured_objects.choose(bpy.context.view_layer, survey, choice, collection)
 
 
 def parent_to_empty(bpy, name, children):
@@ -383,10 +380,10 @@ def test_what_does_not_render_is_no_object(service, blender, scene):
 def test_poses_are_rigid_whatever_the_scale(service, blender, scene):
     moving = blender.data.objects["moving ball"]
     moving.scale = (2.0, -0.5, 1.0)
-    with service.capture_overrides.Overrides() as overrides:
-        survey = service.capture_objects.survey(blender.context, (1.0, 4.5, 9.0), overrides)
-    (found,) = service.capture_objects.choose(blender.context.view_layer, survey, "ANIMATED", "")
-    poses = service.capture_objects.poses(survey, found)
+    with service.overrides.Overrides() as overrides:
+        survey = service.captured_objects.survey(blender.context, (1.0, 4.5, 9.0), overrides)
+    (found,) = service.captured_objects.choose(blender.context.view_layer, survey, "ANIMATED", "")
+    poses = service.captured_objects.poses(survey, found)
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (3, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-6)
@@ -436,7 +433,7 @@ def test_the_file_is_as_it_was_after_an_error_and_no_folder_stays(service, blend
         if len(calls) == 2:
             raise errors.DatasetError("disc full")
 
-    monkeypatch.setattr(service.capture_files, "write_view", fail_later)
+    monkeypatch.setattr(service.files, "write_view", fail_later)
     with pytest.raises(errors.DatasetError, match="disc full"):
         capture(service, blender, tmp_path / "set", rig="RING")
     assert fingerprint(blender) == before
@@ -511,7 +508,7 @@ def test_a_blender_that_cannot_denoise_says_what_to_switch_off(service, blender,
 
     ops = SimpleNamespace(render=SimpleNamespace(render=render))
     stand_in = SimpleNamespace(ops=ops, app=blender.app, data=blender.data)
-    monkeypatch.setattr(service.capture_render, "bpy", stand_in)
+    monkeypatch.setattr(service.render, "bpy", stand_in)
     with pytest.raises(errors.BackendError, match="capture: Failed to denoise, .*; switch denoising off"):
         capture(service, blender, tmp_path / "set")
     assert list(tmp_path.iterdir()) == []
@@ -580,7 +577,7 @@ def test_a_capture_that_blender_cancels_leaves_nothing(service, blender, scene, 
 
 def test_the_operator_has_the_defaults_of_the_settings(service, blender):
     properties = blender.ops.r5dgs.capture_dataset.get_rna_type().properties
-    for field in dataclasses.fields(service.capture_settings.CaptureSettings):
+    for field in dataclasses.fields(service.settings.CaptureSettings):
         default = getattr(properties[field.name], "default", None)
         if field.name not in ("directory", "frame_start", "frame_end"):
             assert default == pytest.approx(field.default), field.name

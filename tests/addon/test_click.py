@@ -13,7 +13,7 @@ from tests import scenes
 def click(blender, tmp_path):
     path = scene_file.write(scenes.make_scene(n=200), tmp_path / "scene.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(path))
-    return importlib.import_module("r5dgs.r5dgs_addon.click")
+    return importlib.import_module("r5dgs.r5dgs_addon.scene.click_select")
 
 
 def selected(bpy):

@@ -38,12 +38,12 @@ def mug(loaded):
 
 @pytest.fixture
 def visible():
-    return importlib.import_module("r5dgs.r5dgs_addon.visible")
+    return importlib.import_module("r5dgs.r5dgs_addon.engine.visible_clouds")
 
 
 @pytest.fixture
 def cloud_points():
-    return importlib.import_module("r5dgs.r5dgs_addon.cloud_points")
+    return importlib.import_module("r5dgs.r5dgs_addon.scene.evaluated_points")
 
 
 def nodes(bpy, obj, build):
@@ -159,7 +159,10 @@ def psnr(a, b):
 @pytest.fixture
 def rendered(blender, scene, loaded):
     """A function that gives the worker's picture of all that is shown, and the camera."""
-    picture, views = (importlib.import_module(f"r5dgs.r5dgs_addon.{name}") for name in ("picture", "views"))
+    picture, views = (
+        importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
+        for name in ("engine.render_request", "engine.view_cameras")
+    )
     data = blender.data.cameras.new("view")
     eye = blender.data.objects.new("view", data)
     blender.context.scene.collection.objects.link(eye)
@@ -320,7 +323,7 @@ def test_what_cannot_be_drawn_of_a_linked_scene_is_named_where_it_is_instanced(b
     instancer.instance_type, instancer.instance_collection = "COLLECTION", target.collections[0]
     blender.context.scene.collection.objects.link(instancer)
     visible.instances(blender.context.evaluated_depsgraph_get())
-    said = importlib.import_module("r5dgs.r5dgs_addon.render_notes").of(blender.context.scene)
+    said = importlib.import_module("r5dgs.r5dgs_addon.engine.render_notes").of(blender.context.scene)
     assert any("1 point without a Gaussian" in note for note in said)
 
 
@@ -340,7 +343,7 @@ def test_unrealized_instances_and_radii_are_named(blender, loaded, mug, cloud_po
 
 
 def test_what_did_not_change_is_compared_once(blender, mug, visible, cloud_points, monkeypatch):
-    clouds, counted = importlib.import_module("r5dgs.r5dgs_addon.clouds"), []
+    clouds, counted = importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds"), []
     plain = clouds.fingerprint
     monkeypatch.setattr(clouds, "fingerprint", lambda values: counted.append(1) or plain(values))
     nodes(blender, mug, lowered)

@@ -267,7 +267,7 @@ def test_an_animation_is_its_frames(blender, loaded, tmp_path):
 
 
 def test_colour_management_that_changes_colours_is_named_and_put_right(blender, loaded):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     blend_scene = blender.context.scene
     view, settings = blend_scene.view_settings, blend_scene.r5dgs_render
     settings.as_trained = False
@@ -289,7 +289,7 @@ def test_colour_management_that_changes_colours_is_named_and_put_right(blender, 
     [("AgX", "None", 0), ("AgX", "AgX - Medium High Contrast", 1), ("Filmic", "None", -1.5), ("Standard", "None", 2)],
 )
 def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, view, look, exposure):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     settings = blender.context.scene.view_settings
     settings.view_transform, settings.exposure = view, exposure
     settings.look = look
@@ -307,7 +307,7 @@ def test_other_view_transforms_are_inverted(blender, loaded, scene, tmp_path, vi
 
 
 def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, loaded, scene, tmp_path, capfd):
-    loss = importlib.import_module("r5dgs.r5dgs_addon.engine_loss")
+    loss = importlib.import_module("r5dgs.r5dgs_addon.color.inverse_loss")
     view, found = blender.context.scene.view_settings, {}
     for name in ("AgX", "Filmic", "Standard"):
         view.view_transform, view.exposure = name, 0.25 if name == "AgX" else 0.0
@@ -332,7 +332,7 @@ def test_using_the_engine_leaves_the_view_alone_and_says_what_it_loses(blender, 
 
 
 def test_the_loss_under_another_exposure_reads_no_points_again(blender, loaded, monkeypatch):
-    loss, reads = importlib.import_module("r5dgs.r5dgs_addon.engine_loss"), []
+    loss, reads = importlib.import_module("r5dgs.r5dgs_addon.color.inverse_loss"), []
     plain = loss._colors
     monkeypatch.setattr(loss, "_colors", lambda collections: reads.append(1) or plain(collections))
     loss.unregister()  # forgets what loading has measured
@@ -344,7 +344,7 @@ def test_the_loss_under_another_exposure_reads_no_points_again(blender, loaded, 
 
 
 def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene, tmp_path):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     view = blender.context.scene.view_settings
     view.use_curve_mapping = True
     curve = view.curve_mapping.curves[3]
@@ -362,7 +362,7 @@ def test_curves_are_inverted_and_what_cannot_be_is_named(blender, loaded, scene,
 
 
 def test_an_output_with_a_view_of_its_own_is_named(blender, loaded):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     blend_scene = blender.context.scene
     output = blend_scene.render.image_settings
     output.color_management, output.view_settings.view_transform = "OVERRIDE", "Filmic"
@@ -385,12 +385,12 @@ def test_a_transparent_film_has_straight_colours_as_trained_under_agx(blender, l
 
 
 def inverse_of(bpy):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     return color.wait_for_inverse(bpy.context.scene, lambda: False)
 
 
 def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
-    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     before = len(blender.data.scenes), len(blender.data.images)
     blender.context.scene.view_settings.view_transform = "Filmic"
     made = inverse_of(blender)
@@ -403,7 +403,7 @@ def test_inverting_a_view_leaves_nothing_behind(blender, loaded):
 
 def test_a_view_is_inverted_where_there_is_no_window(blender, loaded, monkeypatch):
     """As in `blender -b FILE -a`, where removing a scene of one's own crashed Blender 4.2 and 4.3."""
-    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     monkeypatch.setattr(view_module, "_inverses", {})
     blender.context.scene.view_settings.view_transform = "Filmic"
     with blender.context.temp_override(window=None):
@@ -413,8 +413,8 @@ def test_a_view_is_inverted_where_there_is_no_window(blender, loaded, monkeypatc
 
 
 def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blender, loaded, tmp_path, monkeypatch):
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
-    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     blender.context.scene.view_settings.view_transform = "Filmic"
     tried, before = [], len(blender.data.scenes)
 
@@ -431,7 +431,7 @@ def test_a_view_that_cannot_be_sampled_is_named_and_rendered_all_the_same(blende
 
 
 def test_what_a_viewport_wants_is_made_by_the_timer_when_it_rests(blender, loaded, monkeypatch):
-    view_module = importlib.import_module("r5dgs.r5dgs_addon.engine_view")
+    view_module = importlib.import_module("r5dgs.r5dgs_addon.color.view_transform")
     settings = blender.context.scene.view_settings
     made, now = [], [100.0]
     monkeypatch.setattr(view_module, "_inverses", {})
@@ -489,9 +489,9 @@ class Engine:
 
 
 def test_a_render_is_stopped_while_the_worker_hangs_and_the_next_one_works(blender, loaded, tmp_path):
-    engine = importlib.import_module("r5dgs.r5dgs_addon.engine")
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
-    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    engine = importlib.import_module("r5dgs.r5dgs_addon.engine.engine")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     stopped = Engine(engine)
@@ -502,7 +502,7 @@ def test_a_render_is_stopped_while_the_worker_hangs_and_the_next_one_works(blend
 
 
 def test_a_worker_that_is_killed_in_mid_render_is_reported_and_survived(blender, loaded, tmp_path):
-    running = importlib.import_module("r5dgs.r5dgs_addon.worker").current()
+    running = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs").current()
     os.kill(running.pid, signal.SIGSTOP)  # so that the render waits
     killer = threading.Timer(0.5, os.kill, (running.pid, signal.SIGKILL))
     killer.start()

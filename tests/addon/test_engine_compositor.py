@@ -65,7 +65,7 @@ def merged(blender, tmp_path, monkeypatch):
 
 
 def test_the_nearer_of_gaussians_and_meshes_is_seen(blender, merged, tmp_path):
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     merged.render.filepath = str(tmp_path / "merged.png")
     merged.render.image_settings.file_format = "PNG"
     assert blender.ops.render.render(write_still=True) == {"FINISHED"}

@@ -34,7 +34,7 @@ def loaded(blender, scene, tmp_path):
 
 @pytest.fixture
 def gaussians(blender):
-    return importlib.import_module("r5dgs.r5dgs_addon.export_gaussians")
+    return importlib.import_module("r5dgs.r5dgs_addon.export.gaussians")
 
 
 def export(bpy, path, **options):

@@ -130,8 +130,8 @@ def bind_of(bpy, collection, name):
 
 
 def test_edited_physics_are_the_model_of_the_new_file(blender, scene, loaded, tmp_path):
-    physics = importlib.import_module("r5dgs.r5dgs_addon.motion_physics")
-    extrapolate = importlib.import_module("r5dgs.r5dgs_addon.motion_extrapolate")
+    physics = importlib.import_module("r5dgs.r5dgs_addon.motion.physics")
+    extrapolate = importlib.import_module("r5dgs.r5dgs_addon.motion.extrapolate")
     anchor = cloud(loaded, "red apple").parent
     physics.show(anchor.r5dgs_motion, models.MotionModel("translation", velocity=(0.2, 0.4, 1.0)))
     extrapolate.re_extrapolate([anchor])
@@ -193,7 +193,7 @@ def test_without_its_file_a_scene_says_what_to_do(blender, loaded, tmp_path):
 
 
 def test_stopping_leaves_no_file_and_the_frame_where_it_was(blender, loaded, tmp_path):
-    module = importlib.import_module("r5dgs.r5dgs_addon.export_scene")
+    module = importlib.import_module("r5dgs.r5dgs_addon.export.scene")
     blender.context.scene.frame_set(9)
     steps = module.steps(blender.context, loaded, tmp_path / "b.r5dgs")
     for _ in range(5):
@@ -267,7 +267,7 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
 @pytest.mark.parametrize("scale", [(0.0, 0.0, 0.0), (1e-8, 1.0, 1.0)])
 def test_what_is_too_flat_to_be_seen_is_not_in_the_file(blender, loaded, scale, tmp_path):
     cloud(loaded, "mug").scale = scale
-    visible = importlib.import_module("r5dgs.r5dgs_addon.visible")
+    visible = importlib.import_module("r5dgs.r5dgs_addon.engine.visible_clouds")
     _, seen = visible.instances(blender.context.evaluated_depsgraph_get())
     assert "mug" not in {one.object.name for one in seen}
     assert "mug" not in {item.name for item in save(blender, tmp_path / "b.r5dgs").objects}

@@ -77,7 +77,10 @@ def test_a_blend_and_its_scene_can_move_together(blender, scene_path, tmp_path):
     blender.ops.wm.read_homefile(app_template="")
     shutil.move(scene_path.parent, moved)
     blender.ops.wm.open_mainfile(filepath=str(moved / "work.blend"))
-    assert motions.addon("picture").scene_path(loaded(blender)).resolve() == (moved / "synthetic.r5dgs").resolve()
+    assert (
+        motions.addon("engine.render_request").scene_path(loaded(blender)).resolve()
+        == (moved / "synthetic.r5dgs").resolve()
+    )
     assert plays(blender, loaded(blender), moved / "synthetic.r5dgs")
 
 
@@ -88,12 +91,12 @@ def test_a_lost_scene_is_asked_for_by_name_and_found_where_the_user_says(blender
     hidden.parent.mkdir()
     scene_path.rename(hidden)
     with pytest.raises(errors.SceneFileError, match="synthetic.r5dgs.*'Scene File'"):
-        motions.addon("picture").scene_path(collection)
+        motions.addon("engine.render_request").scene_path(collection)
     assert plays(blender, collection, hidden)  # which needs no file
     blender.ops.wm.save_mainfile()  # the lost path is kept as it was
     assert collection.r5dgs.filepath == "//captured/synthetic.r5dgs"
     collection.r5dgs.filepath = "//hidden/renamed.r5dgs"
-    assert motions.addon("picture").scene_path(collection).resolve() == hidden.resolve()
+    assert motions.addon("engine.render_request").scene_path(collection).resolve() == hidden.resolve()
 
 
 # --- append, link, override ---
@@ -106,7 +109,7 @@ def test_an_appended_scene_plays_and_finds_its_file_from_another_folder(blender,
     collection = bring(blender, library, link=False)
     assert collection.library is None and collection.r5dgs.root in collection.objects[:]
     assert plays(blender, collection, scene_path)
-    assert motions.addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    assert motions.addon("engine.render_request").scene_path(collection).resolve() == scene_path.resolve()
     blender.ops.wm.save_mainfile()  # from here on by the new .blend's own relative path
     assert collection.r5dgs.filepath == "//../../captured/synthetic.r5dgs"
     assert blender.ops.r5dgs.select_by_prompt(text="mug") == {"FINISHED"}
@@ -118,7 +121,7 @@ def test_a_linked_scene_plays_and_nothing_is_written_to_it(blender, library, sce
     collection = bring(blender, library, link=True)
     before = library.read_bytes(), collection.r5dgs.filepath, collection.r5dgs.seen_at
     assert collection.library is not None and plays(blender, collection, scene_path)
-    assert motions.addon("picture").scene_path(collection).resolve() == scene_path.resolve()
+    assert motions.addon("engine.render_request").scene_path(collection).resolve() == scene_path.resolve()
     assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
     with pytest.raises(RuntimeError, match="linked from another file"):
         blender.ops.r5dgs.set_display(display="ELLIPSOIDS")
@@ -139,7 +142,7 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
         blender.context.scene.collection.children.unlink(linked)
     assert override.r5dgs.is_scene and override.override_library is not None
     assert plays(blender, override, scene_path)
-    assert motions.addon("picture").scene_path(override).resolve() == scene_path.resolve()
+    assert motions.addon("engine.render_request").scene_path(override).resolve() == scene_path.resolve()
     assert "synthetic: 3 objects, 300 Gaussians" in draw_panels(blender)
     root = next(obj for obj in override.all_objects if obj.r5dgs.role == "ROOT")
     assert root.library is None
@@ -150,7 +153,7 @@ def test_an_override_of_a_linked_scene_can_be_moved_and_still_plays(blender, lib
     assert not plays(blender, again, scene_path)  # it stands higher
     next(obj for obj in again.all_objects if obj.r5dgs.role == "ROOT").location = (0, 0, 0)
     assert plays(blender, again, scene_path)
-    assert motions.addon("picture").scene_path(again).resolve() == scene_path.resolve()
+    assert motions.addon("engine.render_request").scene_path(again).resolve() == scene_path.resolve()
 
 
 def linked_as_instance(bpy, blend):
@@ -218,7 +221,7 @@ def test_a_scene_that_was_brought_offers_its_frames_and_marker(blender, library,
     shown = blender.context.scene
     assert "r5dgs.fit_timeline" in draw_panels(blender) and len(shown.timeline_markers) == 0
     assert blender.ops.r5dgs.fit_timeline() == {"FINISHED"}
-    times = motions.addon("timeline").of_collection(collection)
+    times = motions.addon("scene.timeline").of_collection(collection)
     assert (shown.frame_start, shown.frame_end) == (1, round(times.frame(times.t_end)))
     assert [marker.frame for marker in shown.timeline_markers] == [round(times.frame(times.t_max))]
     assert "r5dgs.fit_timeline" not in draw_panels(blender)
@@ -235,7 +238,7 @@ def test_two_scenes_at_once_have_names_of_their_own_and_both_play(blender, scene
     names = [obj.name for collection in (first, second, third) for obj in collection.all_objects]
     assert len(names) == len(set(names))
     assert plays(blender, first, scene_path) and plays(blender, second, other)
-    loaded_scenes = motions.addon("loaded_scenes")
+    loaded_scenes = motions.addon("scene.loaded_scenes")
     for collection in (first, second, third):
         blender.context.view_layer.objects.active = loaded_scenes.members(collection, "CLOUD")[0]
         assert loaded_scenes.active_collection(blender.context) == collection

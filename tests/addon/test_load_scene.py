@@ -314,7 +314,7 @@ def test_bad_files_are_refused_by_name_and_leave_nothing_behind(blender, scene_p
 
 
 def test_an_error_half_way_leaves_nothing_behind(blender, scene_path, monkeypatch):
-    clouds_module = importlib.import_module("r5dgs.r5dgs_addon.clouds")
+    clouds_module = importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds")
     fill, filled = clouds_module.fill, []
 
     def fill_three(*arguments):

@@ -25,11 +25,11 @@ def shown(cloud):
 
 
 def linear(srgb):
-    return importlib.import_module("r5dgs.r5dgs_addon.clouds").srgb_to_linear(np.asarray(srgb, np.float64))
+    return importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds").srgb_to_linear(np.asarray(srgb, np.float64))
 
 
 def test_a_new_cloud_has_no_tint(mug):
-    look = importlib.import_module("r5dgs.r5dgs_addon.look")
+    look = importlib.import_module("r5dgs.r5dgs_addon.scene.object_tint")
     assert not look.is_tinted(mug) and tuple(look.tint(mug)) == (1, 1, 1)
 
 

@@ -40,7 +40,7 @@ def test_fields_show_the_learned_motion_per_second_of_blenders_time(blender, sce
         np.testing.assert_allclose(state.acceleration, model.acceleration * (fps / 60) ** 2, rtol=1e-6)
         np.testing.assert_allclose(state.angular_velocity, model.angular_velocity * fps / 60, rtol=1e-6)
         np.testing.assert_allclose(state.angular_acceleration, model.angular_acceleration * (fps / 60) ** 2, rtol=1e-6)
-    assert not motions.addon("motion_physics").edited(state)
+    assert not motions.addon("motion.physics").edited(state)
 
 
 def test_a_motion_that_was_not_edited_is_written_as_it_was_learned(blender, scene_path, loaded):
@@ -105,7 +105,7 @@ def test_any_kind_of_motion_can_be_given_to_what_stood_still(blender, loaded, ki
     for name, value in rates.items():
         setattr(state, name, np.array(value) * factor ** powers.get(name, 1))
     blender.ops.r5dgs.re_extrapolate()
-    inertia = motions.addon("motion_physics").inertia(anchor) if kind == "free_top" else None
+    inertia = motions.addon("motion.physics").inertia(anchor) if kind == "free_top" else None
     model = models.MotionModel(kind, **rates, inertia=inertia)
     pivot = np.array(anchor.r5dgs.pivot)
     for t in (0.2, T_MAX, 0.8, 0.95):
@@ -296,7 +296,7 @@ def test_a_strip_that_was_moved_and_slowed_down_plays_the_new_motion_so_too(blen
 
 def strip_keys(strip, until):
     """Keys of the action of a strip up to a frame."""
-    found = motions.addon("motion_curves").Place(strip.action, getattr(strip, "action_slot", None)).curves()
+    found = motions.addon("motion.fcurves").Place(strip.action, getattr(strip, "action_slot", None)).curves()
     return {
         name: [(tuple(p.co), tuple(p.handle_left)) for p in curve.keyframe_points if p.co[0] <= until + 1e-3]
         for name, curve in found.items()
@@ -329,7 +329,7 @@ def test_reset_brings_the_learned_motion_back(blender, scene_path, loaded, mug):
     state.kind, state.velocity = "constant_twist", (4.0, 5.0, 6.0)
     blender.ops.r5dgs.re_extrapolate()
     assert blender.ops.r5dgs.reset_motion() == {"FINISHED"}
-    assert state.kind == "ballistic_spin" and not motions.addon("motion_physics").edited(state)
+    assert state.kind == "ballistic_spin" and not motions.addon("motion.physics").edited(state)
     motions.assert_plays_like_the_core(blender, loaded, scene_file.read(scene_path), TIMES)
 
 
@@ -474,7 +474,7 @@ def test_fewer_keys_hold_the_tolerance_and_the_ends(blender, scene_path, loaded)
         for cloud in (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD"):
             rows = slice(cloud.r5dgs.start, cloud.r5dgs.start + cloud.r5dgs.count)
             worst = np.linalg.norm(motions.points(blender, cloud) - frame.means[rows], axis=-1).max()
-            assert worst <= 2e-3 * motions.addon("motion_physics").size(cloud.parent) + 1e-5 * scene.extent
+            assert worst <= 2e-3 * motions.addon("motion.physics").size(cloud.parent) + 1e-5 * scene.extent
     motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.0))
     blender.ops.r5dgs.extrapolate_until(t_end=1.2)  # nobody edited these by hand
     motions.assert_plays_like_the_core(blender, loaded, scene, (0.0, T_MAX, 1.2))
@@ -504,7 +504,7 @@ def test_stepped_keys_are_not_smoothed_away(blender, loaded, mug):
 
 def test_the_panel_shows_what_a_motion_has_and_whether_it_was_edited(blender, loaded, mug):
     (panel,) = importlib.import_module("r5dgs.r5dgs_addon.panels.motion").CLASSES
-    physics = motions.addon("motion_physics")
+    physics = motions.addon("motion.physics")
     for kind, fields in physics.FIELDS.items():
         mug.r5dgs_motion.kind = kind
         said = layouts.draw(blender, panel)
@@ -537,7 +537,7 @@ def test_numbers_are_written_at_once_when_that_is_wanted(blender, loaded, mug):
     np.testing.assert_allclose(places[1] - places[0], [0.5, 0, 0], atol=1e-5)
     mug.rotation_mode = "XYZ"
     state.velocity = (0.0, 0.0, 0.0)  # cannot be written: no error out of a slider
-    assert not motions.addon("motion_physics").is_written(mug)
+    assert not motions.addon("motion.physics").is_written(mug)
 
 
 def test_what_lies_in_another_blend_file_is_refused(blender, loaded, tmp_path):
@@ -567,7 +567,7 @@ def test_a_spin_too_fast_for_keys_is_keyed_at_every_frame_and_named(blender, loa
     curves = [curve for name, curve in motions.curves(mug).items() if name[0] == "rotation_quaternion"]
     keys = np.array([[point.co for point in curve.keyframe_points if point.co[0] > LAST] for curve in curves])
     np.testing.assert_allclose(keys[0, :, 0], LAST + 1 + np.arange(15))
-    model = motions.addon("motion_physics").model(mug)
+    model = motions.addon("motion.physics").model(mug)
     quats, _ = models.evaluate(model, (keys[0, :, 0].astype(np.float64) - LAST) / 60)
     assert rotations.angle_between(rotations.normalize(keys[:, :, 1].T), quats).max() < 1e-5
     blender.ops.r5dgs.reset_motion()
@@ -581,7 +581,7 @@ def test_speeds_beyond_all_measure_do_no_harm(blender, loaded, mug, speed):
     assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
     assert motions.keys(mug, LAST) == before
     blender.ops.r5dgs.reset_motion()
-    assert not motions.addon("motion_physics").edited(mug.r5dgs_motion)
+    assert not motions.addon("motion.physics").edited(mug.r5dgs_motion)
 
 
 def test_what_is_no_number_is_refused_by_name(blender, mug):

@@ -38,7 +38,7 @@ def loaded(blender, scene, tmp_path):
 def rings(tube):
     """Vertices of a tube by ring. [H, SIDES, 3]"""
     points = np.array([vertex.co for vertex in tube.data.vertices], np.float64)
-    return points.reshape(-1, motions.addon("motion_confidence").SIDES, 3)
+    return points.reshape(-1, motions.addon("motion.confidence_tubes").SIDES, 3)
 
 
 def test_a_tube_runs_along_the_path_as_thick_as_one_standard_deviation(blender, scene, loaded):

@@ -178,11 +178,11 @@ def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others
     blender.ops.r5dgs.select_by_prompt(text=name)
     selected = blender.context.selected_objects
     assert any(obj.parent is not None and obj.parent not in selected for obj in selected if obj.r5dgs.role == "CLOUD")
-    meant = motions.addon("motion_objects").chosen(blender.context)
+    meant = motions.addon("motion.duplicate_delete").chosen(blender.context)
     assert meant and {obj.r5dgs.object_id for obj in meant} == {anchor(blender, name).r5dgs.object_id}
     blender.ops.r5dgs.delete_object()
     blender.ops.r5dgs.select_by_prompt(text=name)  # what is left of it moves with others
-    assert blender.context.selected_objects and not motions.addon("motion_objects").chosen(blender.context)
+    assert blender.context.selected_objects and not motions.addon("motion.duplicate_delete").chosen(blender.context)
 
 
 def test_shadows_stay_when_asked_to(blender, loaded):

@@ -113,7 +113,7 @@ def test_a_spring_swings_about_its_pivot(blender, loaded, mug):
 
 
 def test_nothing_is_edited_by_looking_and_reset_brings_the_learned_pivot_back(blender, scene_path, loaded, mug):
-    physics = motions.addon("motion_physics")
+    physics = motions.addon("motion.physics")
     learned = scene_file.read(scene_path).groups[1]
     motions.go_to(blender, loaded, T_MAX)
     before = tuple(mug.r5dgs_pivot.point)
@@ -140,7 +140,7 @@ def test_the_3d_cursor_becomes_the_pivot_and_can_be_undone(blender, loaded, mug)
     blender.ops.ed.undo_push(message="before")
     assert blender.ops.r5dgs.pivot_to_cursor() == {"FINISHED"}
     np.testing.assert_allclose(mug.r5dgs_pivot.point, PIVOT, atol=1e-5)
-    assert motions.addon("motion_physics").is_written(mug)
+    assert motions.addon("motion.physics").is_written(mug)
     written = motions.keys(mug)
     blender.ops.ed.undo_push(message="pivot")
     blender.ops.ed.undo()
@@ -178,7 +178,7 @@ def test_the_pivot_of_a_copy_is_where_the_copy_is(blender, loaded, mug):
     set_up(mug.r5dgs_motion, *KINDS["hinge"][:1], **SPIN)
     mug.r5dgs_pivot.point = PIVOT
     blender.ops.r5dgs.duplicate_object(offset=(1.0, 2.0, 0.0))
-    copy = motions.addon("motion_objects").active_anchor(blender.context)
+    copy = motions.addon("motion.duplicate_delete").active_anchor(blender.context)
     np.testing.assert_allclose(copy.r5dgs_pivot.point, PIVOT + [1.0, 2.0, 0.0], atol=1e-5)
     copy.r5dgs_pivot.point = PIVOT
     blender.ops.r5dgs.re_extrapolate()
@@ -248,7 +248,7 @@ def test_a_pivot_beyond_all_measure_does_no_harm(blender, loaded, mug):
         assert blender.ops.r5dgs.re_extrapolate() == {"FINISHED"}
         assert motions.keys(mug, LAST) == observed
     blender.ops.r5dgs.reset_motion()
-    assert not motions.addon("motion_physics").edited(mug.r5dgs_motion)
+    assert not motions.addon("motion.physics").edited(mug.r5dgs_motion)
 
 
 @pytest.mark.parametrize("far", [1e9, 1e30])

@@ -94,7 +94,7 @@ def test_recolouring_takes_all_clouds_of_the_selected_objects(blender, loaded):
     blender.ops.r5dgs.select_by_prompt(text="mug, car")
     assert not blender.ops.r5dgs.reset_color.poll()
     assert blender.ops.r5dgs.recolor(tint=TINT) == {"FINISHED"}
-    look = importlib.import_module("r5dgs.r5dgs_addon.look")
+    look = importlib.import_module("r5dgs.r5dgs_addon.scene.object_tint")
 
     def tinted():
         return {obj.name for obj in loaded.all_objects if look.is_tinted(obj)}

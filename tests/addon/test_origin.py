@@ -28,7 +28,7 @@ def scene_path(tmp_path):
 
 @pytest.fixture
 def loaded_scenes(blender):
-    return importlib.import_module("r5dgs.r5dgs_addon.loaded_scenes")
+    return importlib.import_module("r5dgs.r5dgs_addon.scene.loaded_scenes")
 
 
 @pytest.fixture

@@ -54,10 +54,10 @@ def test_the_sidebar_shows_answers_and_says_when_there_are_none(blender, sidebar
 
 
 def test_the_sidebar_says_when_the_worker_is_still_compiling(blender, sidebar, scene_path, monkeypatch):
-    worker = importlib.import_module("r5dgs.r5dgs_addon.worker")
+    worker = importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     before = sidebar()
-    process = importlib.import_module("r5dgs.r5dgs_addon.worker_process")
+    process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
     monkeypatch.setattr(worker, "notice", lambda: process.COMPILING)
     new = [text for text in sidebar() if text not in before]
     assert " ".join(new) == "Preparing the rasterizer (first use, about 10 s)"
@@ -67,7 +67,10 @@ def test_no_text_is_longer_than_a_sidebar_of_normal_width_shows(blender, sidebar
     blender.ops.r5dgs.load_scene(filepath=str(scene_path))
     windows, points, worker, live, notes = (
         importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
-        for name in ("windows", "cloud_points", "worker", "live_preview", "render_notes")
+        for name in (
+            *("ui.status_bar", "scene.evaluated_points", "worker.jobs"),
+            *("engine.live_preview", "engine.render_notes"),
+        )
     )
     monkeypatch.setattr(windows, "_WIDTH", 280)
     long = "mug: the radius of points is for display only; change the attribute 'scale' instead"

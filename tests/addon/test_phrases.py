@@ -34,14 +34,14 @@ def folders(tmp_path_factory):
 def loaded(blender, folders, monkeypatch):
     monkeypatch.setenv("R5DGS_PYTHON", sys.executable)
     monkeypatch.setenv("R5DGS_TEXT_ENCODER", str(folders[0]))
-    motions.addon("phrases").forget()
+    motions.addon("language.phrase_embeddings").forget()
     blender.ops.r5dgs.load_scene(filepath=str(folders[2]))
     return blender
 
 
 def wait_for_the_answer():
     """Look as often as Blender's timer does until there is nothing more to look for."""
-    patience.wait_until(lambda: motions.addon("phrases").look() is None)
+    patience.wait_until(lambda: motions.addon("language.phrase_embeddings").look() is None)
 
 
 def ask(bpy, text):
@@ -59,7 +59,7 @@ def test_the_encoder_of_the_preferences_knows_other_words(loaded):
 
 
 def test_a_phrase_is_embedded_once_and_names_need_nobody(loaded, monkeypatch):
-    worker = motions.addon("worker")
+    worker = motions.addon("worker.jobs")
     asked, run = [], worker.run
     monkeypatch.setattr(worker, "run", lambda steps: asked.append(steps[0][2]["texts"]) or run(steps))
     ask(loaded, "zorb")
@@ -89,7 +89,7 @@ def test_a_damaged_encoder_is_said_and_names_are_searched_all_the_same(loaded, t
 
 
 def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
-    phrases, told = motions.addon("phrases"), []
+    phrases, told = motions.addon("language.phrase_embeddings"), []
     phrases.begin(["zorb", "glorp"], told.append)
     assert phrases.missing(["zorb", "glorp"]) == ["zorb", "glorp"]
     wait_for_the_answer()
@@ -103,7 +103,7 @@ def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
 @pytest.fixture
 def windowed(loaded, monkeypatch):
     """`loaded` as if somebody looked at a window, which must not wait."""
-    monkeypatch.setattr(motions.addon("prompt"), "_has_window", lambda: True)
+    monkeypatch.setattr(motions.addon("language.prompt"), "_has_window", lambda: True)
     return loaded
 
 
@@ -121,7 +121,7 @@ def test_an_answer_that_comes_later_is_not_shown_where_another_prompt_stands(win
     ask(windowed, "zorb")
     ask(windowed, "mug")
     wait_for_the_answer()
-    assert motions.addon("phrases").missing(["zorb"]) == []
+    assert motions.addon("language.phrase_embeddings").missing(["zorb"]) == []
     assert session.asked == "mug" and [match.object_id for match in session.matches] == [1]
 
 
@@ -134,7 +134,7 @@ def test_what_goes_wrong_later_is_said_beside_what_is_known(windowed, monkeypatc
 
 
 def test_what_was_asked_in_another_file_is_not_answered_in_this_one(loaded):
-    phrases, told = motions.addon("phrases"), []
+    phrases, told = motions.addon("language.phrase_embeddings"), []
     phrases.begin(["zorb"], told.append)
     loaded.ops.wm.read_homefile(app_template="")
     assert not loaded.app.timers.is_registered(phrases.look) and told == []

@@ -25,7 +25,7 @@ W = cameras.WORLD_TO_BLENDER["colmap"]
 @pytest.fixture
 def picture(blender, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    return importlib.import_module("r5dgs.r5dgs_addon.picture")
+    return importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
 
 
 @pytest.fixture
@@ -239,7 +239,7 @@ def test_points_that_do_not_say_what_they_are_are_refused(blender, picture, kitc
 def without(bpy, old, rows, named=True):
     """A cloud of the points of some rows alone, as deleting the others leaves it."""
     compat = importlib.import_module("r5dgs.r5dgs_addon.compat")
-    clouds = importlib.import_module("r5dgs.r5dgs_addon.clouds")
+    clouds = importlib.import_module("r5dgs.r5dgs_addon.scene.point_clouds")
     (cloud,) = compat.new_point_clouds([len(rows)])
     fields = {
         "FLOAT": ("value", 1),
@@ -318,8 +318,8 @@ def test_a_view_of_a_region_is_the_cameras_where_it_looks_through_it(blender, pi
     """A window's region, as far as `views` reads it: bpy has none."""
     import types
 
-    views = importlib.import_module("r5dgs.r5dgs_addon.views")
-    visible = importlib.import_module("r5dgs.r5dgs_addon.visible")
+    views = importlib.import_module("r5dgs.r5dgs_addon.engine.view_cameras")
+    visible = importlib.import_module("r5dgs.r5dgs_addon.engine.visible_clouds")
     scene, camera = blender.context.scene, blender.context.scene.camera
     depsgraph = blender.context.evaluated_depsgraph_get()
     _, found = visible.instances(depsgraph)

@@ -33,7 +33,7 @@ def scene_path(tmp_path):
 @pytest.fixture
 def worker(blender, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    return importlib.import_module("r5dgs.r5dgs_addon.worker")  # one worker serves all tests that do not break it
+    return importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")  # one worker serves all tests that do not break it
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_the_preview_is_the_cores_picture(blender, loaded, scene_path, t):
 
 
 def test_the_error_is_told_beside_the_milliseconds(blender, loaded, scene_path):
-    figures = importlib.import_module("r5dgs.r5dgs_addon.figures")
+    figures = importlib.import_module("r5dgs.r5dgs_addon.engine.render_stats")
     preview(blender)
     size = " x ".join(map(str, blender.data.images["R5DGS Preview"].size))
     assert re.fullmatch(rf"{size} in \d+ ms \(motion \d+, raster \d+\)", figures.speed())
@@ -177,7 +177,7 @@ def test_moving_the_whole_scene_with_its_camera_changes_nothing(blender, loaded)
 def test_the_camera_projects_as_blenders_own(blender, loaded, fit, size):
     from bpy_extras.object_utils import world_to_camera_view
 
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     scene = blender.context.scene
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = size
@@ -195,7 +195,7 @@ def test_the_camera_projects_as_blenders_own(blender, loaded, fit, size):
 
 
 def test_the_picture_has_the_size_that_blender_renders(blender, loaded, tmp_path):
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     render = blender.context.scene.render
     render.engine = "CYCLES"
     blender.context.scene.cycles.samples, blender.context.scene.cycles.use_denoising = 1, False
@@ -210,7 +210,7 @@ def test_the_picture_has_the_size_that_blender_renders(blender, loaded, tmp_path
 
 
 def test_pixel_aspect_is_part_of_the_camera(blender, loaded):
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     square = picture.shown(blender.context.evaluated_depsgraph_get()).camera.intrinsics
     blender.context.scene.render.pixel_aspect_x = 2.0
     wide = picture.shown(blender.context.evaluated_depsgraph_get()).camera.intrinsics
@@ -255,7 +255,7 @@ class Window:
 def windowed(blender, loaded):
     """Starts a preview as the window does."""
     operator = importlib.import_module("r5dgs.operators.preview").R5DGS_OT_preview
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     return lambda: Window(operator, picture.start(blender.context))
 
 
@@ -282,7 +282,7 @@ def test_the_picture_goes_to_image_editors_that_hold_none_and_one_is_asked_for_w
         types.SimpleNamespace(type="IMAGE_EDITOR", spaces=types.SimpleNamespace(active=one), tag_redraw=lambda: None)
         for one in editors
     ]
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     monkeypatch.setattr(picture.bpy, "app", types.SimpleNamespace(background=False))
     for there, asked in ((areas, False), (areas[:1], True), ([], True)):
         window = windowed()
@@ -388,7 +388,7 @@ def test_the_worker_test_says_that_it_is_ready_and_unregistering_stops_it(blende
 def drawn_check(bpy):
     """Texts that *Test Worker* draws under its button."""
     said = []
-    module = importlib.import_module("r5dgs.r5dgs_addon.worker_check")
+    module = importlib.import_module("r5dgs.r5dgs_addon.ui.worker_status")
     module.draw(layouts.Layout(bpy, said), bpy.context)
     return said
 
@@ -397,7 +397,7 @@ def test_progress_and_result_of_the_worker_test_are_drawn_under_its_button(blend
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     module = importlib.import_module("r5dgs.operators.check_worker")
-    check = importlib.import_module("r5dgs.r5dgs_addon.worker_check")
+    check = importlib.import_module("r5dgs.r5dgs_addon.ui.worker_status")
     job = worker.start([("testing", "check", {})])
     check.begin(job)
     patience.wait_until(lambda: job.doing in ("testing", worker.notice()))

@@ -53,7 +53,7 @@ def test_reset_changes_no_field_where_its_own_curves_cannot_be_cut_unless_they_a
         blender.ops.r5dgs.reset_motion()
     assert (fields(mug), motions.keys(mug)) == before
     assert blender.ops.r5dgs.reset_motion(observed=True) == {"FINISHED"}
-    assert not motions.addon("motion_physics").edited(mug.r5dgs_motion)
+    assert not motions.addon("motion.physics").edited(mug.r5dgs_motion)
 
 
 def test_reset_of_a_shadow_is_refused_where_its_caster_has_numbers_that_are_none(blender, mug):
@@ -101,7 +101,7 @@ def test_an_end_that_extrapolation_refuses_is_refused_by_loading_too(blender, sc
 
 
 def test_the_end_that_loading_chooses_is_never_too_far(blender, tmp_path):
-    timeline = motions.addon("timeline")
+    timeline = motions.addon("scene.timeline")
     whole = scenes.make_scene(n=300, objects=3, seed=1)
     for shift, shrink in ((0.0, 0.01), (0.0, 1.0), (50.0, 0.01), (-30.0, 1.0)):
         times = shift + shrink * whole.track_times

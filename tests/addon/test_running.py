@@ -36,7 +36,7 @@ class Window:
 
 @pytest.fixture
 def running(blender, extension, monkeypatch):
-    module = importlib.import_module("r5dgs.r5dgs_addon.running")
+    module = importlib.import_module("r5dgs.r5dgs_addon.ui.stepwise_operator")
     monkeypatch.setattr(module, "bpy", SimpleNamespace(app=SimpleNamespace(background=False), types=blender.types))
     return module
 

@@ -48,7 +48,7 @@ def test_what_an_object_answers_to_is_kept_word_for_word(blender, tmp_path):
     blender.ops.wm.save_as_mainfile(filepath=str(tmp_path / "words.blend"))
     blender.ops.wm.open_mainfile(filepath=str(tmp_path / "words.blend"))
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
-    table = importlib.import_module("r5dgs.r5dgs_addon.table")
+    table = importlib.import_module("r5dgs.r5dgs_addon.scene.object_names")
     assert [label.aliases for label in table.labels(collection) if label.object_id == 1] == [words]
 
 

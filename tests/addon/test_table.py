@@ -24,7 +24,7 @@ def loaded(blender, path):
 
 @pytest.fixture
 def table():
-    return importlib.import_module("r5dgs.r5dgs_addon.table")
+    return importlib.import_module("r5dgs.r5dgs_addon.scene.object_names")
 
 
 def named(collection):

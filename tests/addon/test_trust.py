@@ -19,7 +19,7 @@ ASKS = "not read, as it lies neither beside nor below"
 @pytest.fixture
 def trust(blender, monkeypatch):
     """The module, with what other tests have allowed forgotten, and the environment of a plain session."""
-    module = motions.addon("trust")
+    module = motions.addon("scene.trust")
     monkeypatch.setattr(module, "_allowed", set())
     monkeypatch.delenv(module.ENVIRONMENT, raising=False)
     return module
@@ -48,7 +48,7 @@ def blend(blender, trust, scene_path, tmp_path):
 def new_session(trust):
     """Forget what the user has allowed, and what was read."""
     trust._allowed.clear()
-    motions.addon("motion_exact")._files.clear()
+    motions.addon("motion.exact_mode")._files.clear()
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_opening_a_blend_reads_no_file_from_elsewhere_until_the_user_allows_it(b
     assert f"Not read, outside this .blend's folder:{scene_path}" in "".join(said).replace(": ", ":")
     assert "r5dgs.allow_scene_file" in said
     with pytest.raises(errors.SceneFileError, match=ASKS):
-        motions.addon("picture").scene_path(collection)
+        motions.addon("engine.render_request").scene_path(collection)
     assert blender.ops.r5dgs.allow_scene_file() == {"FINISHED"}
     assert [path.resolve() for path in reads] == [scene_path] and collection.r5dgs_exact.problem == ""
     assert "r5dgs.allow_scene_file" not in scene_panel(blender)
@@ -219,7 +219,7 @@ def test_a_file_that_cannot_be_read_is_read_once_until_it_changes(blender, blend
 
 
 def test_the_module_that_remembers_reads_again_after_a_change_alone(blender, tmp_path):
-    remembered = importlib.import_module("r5dgs.r5dgs_addon.remembered")
+    remembered = importlib.import_module("r5dgs.r5dgs_addon.scene.file_cache")
     calls = []
     files = remembered.Remembered(lambda path: calls.append(path) or len(path.read_bytes()))
     path = tmp_path / "file"

@@ -17,7 +17,7 @@ pytest.importorskip("torch", reason="torch is not installed in this Python, whic
 def seen(blender, tmp_path, monkeypatch):
     """Gives what the camera sees at a frame."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scenes.make_scene(n=300), tmp_path / "scene.r5dgs")))
     render = blender.context.scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = 64, 40, 100
@@ -31,7 +31,7 @@ def seen(blender, tmp_path, monkeypatch):
 
 @pytest.fixture
 def viewport(blender):
-    module = importlib.import_module("r5dgs.r5dgs_addon.viewport")
+    module = importlib.import_module("r5dgs.r5dgs_addon.engine.viewport")
     yield module
     module.forget()
 
@@ -50,8 +50,8 @@ def run(module):
 
 
 def test_a_viewport_gets_a_small_picture_at_once_and_a_full_one_when_it_rests(blender, seen, viewport):
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     port, now = viewport.Port(), seen(20)
     port.want(viewport.Wish(now, sky=True, transparent=False, moving=4))
     assert run(viewport) == [(10, 16, 4), (40, 64, 4)]
@@ -62,8 +62,8 @@ def test_a_viewport_gets_a_small_picture_at_once_and_a_full_one_when_it_rests(bl
 
 
 def test_the_latest_wish_wins(blender, seen, viewport):
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
-    color = importlib.import_module("r5dgs.r5dgs_addon.engine_color")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
+    color = importlib.import_module("r5dgs.r5dgs_addon.color.display_to_linear")
     port = viewport.Port()
     for frame in (1, 20, 40, 61):
         last = seen(frame)
@@ -106,8 +106,8 @@ def test_smaller_pictures_are_of_the_same_view(blender, seen, viewport):
 
 
 def test_the_live_preview_follows_frame_and_edits_and_is_off_after_loading(blender, seen):
-    live = importlib.import_module("r5dgs.r5dgs_addon.live_preview")
-    picture = importlib.import_module("r5dgs.r5dgs_addon.picture")
+    live = importlib.import_module("r5dgs.r5dgs_addon.engine.live_preview")
+    picture = importlib.import_module("r5dgs.r5dgs_addon.engine.render_request")
 
     def look():
         live.look()

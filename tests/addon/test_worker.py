@@ -28,12 +28,12 @@ HELLO = [("greeting", "hello", {})]
 @pytest.fixture
 def worker(blender, monkeypatch):
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
-    return importlib.import_module("r5dgs.r5dgs_addon.worker")
+    return importlib.import_module("r5dgs.r5dgs_addon.worker.jobs")
 
 
 @pytest.fixture
 def pythons(blender):
-    return importlib.import_module("r5dgs.r5dgs_addon.pythons")
+    return importlib.import_module("r5dgs.r5dgs_addon.find_python")
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def held(worker):
 @pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="Windows has no such signal")
 def test_writing_to_a_worker_that_has_ended_is_an_error_and_no_signal_for_blender(worker):
     """Blender leaves SIGPIPE to the system, which would end it; Python ignores it."""
-    process = importlib.import_module("r5dgs.r5dgs_addon.worker_process")
+    process = importlib.import_module("r5dgs.r5dgs_addon.worker.process")
     heard = []
     before = signal.signal(signal.SIGPIPE, lambda *_: heard.append(True))
     try:

@@ -21,7 +21,7 @@ from window import STEP_S, run, service, wait  # noqa: E402
 
 def full_picture():
     """The picture of full size that the one viewport shows, or None."""
-    ports = [port for port in service("viewport")._ports if port._shown is not None and port.next() is None]
+    ports = [port for port in service("engine.viewport")._ports if port._shown is not None and port.next() is None]
     return ports[0]._shown if ports else None
 
 
@@ -53,7 +53,7 @@ def checks(path: str):
     while time.monotonic() < end:
         region_3d.view_rotation = region_3d.view_rotation @ Quaternion((0, 1, 0), 0.02)
         yield STEP_S
-        sizes |= {(id(port._shown[0]), port._shown[1]) for port in service("viewport")._ports if port._shown}
+        sizes |= {(id(port._shown[0]), port._shown[1]) for port in service("engine.viewport")._ports if port._shown}
     print(f"moving: {len(sizes)} pictures in 5 s", flush=True)
     assert len(sizes) > 1
 
@@ -66,13 +66,13 @@ def checks(path: str):
     bpy.data.images["Render Result"].save_render(str(saved))
     rendered = pixels(bpy.data.images.load(str(saved)))
     with bpy.context.temp_override(window=window):
-        picture = service("picture")
+        picture = service("engine.render_request")
         _, arrays = picture.render(picture.shown(bpy.context.evaluated_depsgraph_get()))
     error = float(np.square(rendered - np.clip(arrays["color"], 0, 1)).mean())
     print(f"F12: {-10 * np.log10(max(error, 1e-12)):.1f} dB", flush=True)
     assert error < 10**-4.5
 
-    live = service("live_preview")
+    live = service("engine.live_preview")
     live.start()
     asked = []
     for frame in (10, 20, 30):
@@ -83,7 +83,7 @@ def checks(path: str):
     assert asked[0] != asked[1] != asked[2] and live.message() == ""
     bpy.ops.wm.read_homefile(app_template="")
     yield 2.0
-    assert not live.running() and not bpy.app.timers.is_registered(service("viewport").look)
+    assert not live.running() and not bpy.app.timers.is_registered(service("engine.viewport").look)
     print("closed: nothing goes on", flush=True)
 
 

@@ -40,7 +40,7 @@ def load(path: Path) -> None:
 
 def nothing_runs() -> bool:
     """Whether no operator waits for events, and no job for the worker."""
-    return not w.main_window().modal_operators and not w.service("worker").busy()
+    return not w.main_window().modal_operators and not w.service("worker.jobs").busy()
 
 
 def choose(folder: Path, name: str = ""):
@@ -137,7 +137,7 @@ def rendering(path: Path, folder: Path):
     render, ended = scene.render, []
     bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancelled"))
     bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
-    job = w.service("worker")
+    job = w.service("worker.jobs")
     for size, stop in ((320, False), (6000, True), (320, False)):
         render.resolution_x, render.resolution_y, render.resolution_percentage = size, size * 3 // 4, 100
         yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
@@ -161,7 +161,7 @@ def rendering(path: Path, folder: Path):
 
 def previewing(path: Path, folder: Path):
     """Esc stops a preview while the worker draws, and the next one comes."""
-    render, worker = w.main_window().scene.render, w.service("worker")
+    render, worker = w.main_window().scene.render, w.service("worker.jobs")
     for size in (320, 6000, 320):
         render.resolution_x, render.resolution_y, render.resolution_percentage = size, size * 3 // 4, 100
         yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
@@ -185,7 +185,7 @@ WRAPPERS = {
 
 def stopping(path: Path, folder: Path):
     """Esc ends a preview at once if Worker Python is a wrapper script, and no process is left."""
-    render, worker, area = w.main_window().scene.render, w.service("worker"), w.area_of("VIEW_3D")
+    render, worker, area = w.main_window().scene.render, w.service("worker.jobs"), w.area_of("VIEW_3D")
     render.resolution_x, render.resolution_y, render.resolution_percentage = 6000, 4500, 100
     chosen, python = os.environ.get("R5DGS_PYTHON"), w.service("preferences").worker_python()
     for number, (what, lines) in enumerate(WRAPPERS.items()):
@@ -253,7 +253,7 @@ def render_by_key():
     """F12, until the picture is there, and back to the 3D view."""
     yield from w.hover(w.region_of(w.area_of("VIEW_3D")))
     yield from w.press("F12")
-    yield from w.wait(lambda: not w.service("worker").busy() and not bpy.app.is_job_running("RENDER"), "F12")
+    yield from w.wait(lambda: not w.service("worker.jobs").busy() and not bpy.app.is_job_running("RENDER"), "F12")
     yield 0.5
     yield from w.press("Escape")
 
@@ -272,7 +272,7 @@ def exporting(path: Path, folder: Path):
     scene = w.main_window().scene
     scene.render.resolution_x, scene.render.resolution_y = 320, 240
     scene.frame_set(7)
-    running = w.service("running")
+    running = w.service("ui.stepwise_operator")
     blink, running.BLINK_S = running.BLINK_S, 1e-4  # the window is drawn after each step: there is time for Esc
     for operator, name in (("export_masks", ""), ("export_ply", "a.ply"), ("export_scene", "b.r5dgs")):
         target = folder / operator
@@ -337,7 +337,7 @@ def merging(path: Path, folder: Path):
         render = scene.render
         render.resolution_x, render.resolution_y, render.resolution_percentage = 160, 120, 100
     gaussians.render.dither_intensity = 0
-    picture = w.service("picture")
+    picture = w.service("engine.render_request")
     with bpy.context.temp_override(window=w.main_window()):
         seen = picture.shown(bpy.context.evaluated_depsgraph_get())
         _, arrays = picture.render(seen, ("depth", "alpha"))

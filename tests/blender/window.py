@@ -117,7 +117,7 @@ def run(checks: Callable[..., Iterator[float]], *arguments) -> None:
         except BaseException:
             traceback.print_exc()
             code = 1
-        service("worker").stop()
+        service("worker.jobs").stop()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)  # quitting would end with 0

@@ -1,0 +1,273 @@
+"""A scene as Blender objects: a collection, a root empty, and per object a collection with anchors and point clouds.
+
+Notation: the root carries the world convention W; the anchor of motion group g stands at the group's pivot p and turns
+and moves by the group's pose (R, d). A point x of the bind state is shown at W T(p + d) R T(-p) x, where T(-p) is the
+cloud's parent inverse, so that the point cloud holds the file's own coordinates.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from ..r5dgs_core import errors
+from ..r5dgs_core.scene import cameras
+from ..r5dgs_core.scene.scene import MotionGroup, Scene
+from . import compat
+from .motion import keyframes, physics
+from .scene import loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
+
+SMALLEST = 1e-4  # size of a scene; Blender's curves take steps below 1.2e-7 for none
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a scene is built.
+
+    Attributes:
+        world_convention: Key of `cameras.WORLD_TO_BLENDER`, or "" for the file's own.
+        frame_zero: Frame at which the scene time is 0.
+        t_end: Scene time up to which motion is extrapolated; None for `timeline.default_end`.
+        key_tolerance: Error of the reduced keys, fraction of the scene's size.
+        fit_timeline: Whether the frame range and the marker are set.
+        sh_degree: Highest degree of the spherical harmonics that are stored on the points.
+        display: What stands for Gaussians in viewports without splats, of `viewport_display.ITEMS`.
+    """
+
+    world_convention: str = ""
+    frame_zero: float = 1.0
+    t_end: float | None = None
+    key_tolerance: float = keyframes.TOLERANCE
+    fit_timeline: bool = True
+    sh_degree: int = 3
+    display: str = viewport_display.POINTS
+
+
+@dataclass(frozen=True)
+class Range:
+    """Consecutive Gaussians of one object and one motion group."""
+
+    object_id: int
+    motion_id: int
+    start: int
+    count: int
+
+
+def ranges(scene: Scene) -> list[Range]:
+    """The scene's Gaussians cut where object or motion group change."""
+    pairs = np.stack([scene.object_ids, scene.motion_ids], axis=-1).astype(np.int64)
+    if len(pairs) == 0:
+        return []
+    starts = np.concatenate([[0], np.flatnonzero((np.diff(pairs, axis=0) != 0).any(-1)) + 1, [len(pairs)]])
+    return [
+        Range(int(pairs[a, 0]), int(pairs[a, 1]), int(a), int(b - a))
+        for a, b in zip(starts[:-1], starts[1:], strict=True)
+    ]
+
+
+def homes(scene: Scene, parts: list[Range]) -> list[Range]:
+    """The ranges whose objects keep the anchors: one for each motion group, one for each object's pinned Gaussians.
+
+    A body's anchor stays with the group's own object where that has Gaussians of it, though Gaussians of others may
+    move with it; any other with the object that has the most of it.
+    """
+    best: dict[tuple[int, int], Range] = {}
+    for part in parts:
+        group = scene.groups[part.motion_id]
+        own = group.role == "body" and part.object_id == group.object_id
+        known = best.get(_anchor_key(part))
+        known_own = known is not None and group.role == "body" and known.object_id == group.object_id
+        if known is None or (own, part.count) > (known_own, known.count):
+            best[_anchor_key(part)] = part
+    return list(best.values())
+
+
+def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options = Options()) -> bpy.types.Collection:
+    """Build a scene in the active Blender scene. After an error everything is as it was before.
+
+    Args:
+        context: Its scene and view layer get the objects.
+        scene: The scene.
+        path: File that it came from; remembered for the preview.
+        options: How to build.
+
+    Returns:
+        The collection ``R5DGS <name>``.
+
+    Raises:
+        SceneFileError: The scene has no Gaussians, or is too small for Blender's curves.
+        ConfigError: Extrapolation would end too far.
+    """
+    if len(scene.means) == 0:
+        raise errors.SceneFileError(
+            f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
+        )
+    size = max(scene.extent, float(np.exp(scene.log_scales.max())))
+    if size < SMALLEST:
+        factor = 10.0 ** -math.floor(math.log10(size))
+        raise errors.SceneFileError(
+            f"{path}: expected a scene of {SMALLEST:g} units or more, as Blender's animation has no finer steps than "
+            f"1e-7, found {size:.3g}; multiply the positions of the data set's cameras by {factor:g} and train again"
+        )
+    times = timeline.Times.of(scene, options.frame_zero, options.t_end)
+    timeline.check_end(path.name, times)
+    with loaded_scenes.nothing_left_after_error():
+        collection = bpy.data.collections.new(object_names.fit(f"R5DGS {scene.name}"))
+        context.scene.collection.children.link(collection)
+        extent = scene.extent
+        root = _root(collection, scene, options.world_convention or scene.world_convention)
+        _describe(collection, scene, path, root, times)
+        material = point_clouds.material(object_names.fit(f"R5DGS {scene.name}"))
+        parts = ranges(scene)
+        largest: dict[int, Range] = {}
+        for part in parts:
+            largest[part.object_id] = max(largest.get(part.object_id, part), part, key=lambda own: own.count)
+        children = {}
+        for object_id in sorted({part.object_id for part in parts}):
+            children[object_id] = bpy.data.collections.new(object_names.fit(object_name(scene, object_id)))
+            collection.children.link(children[object_id])
+        anchors = {}
+        for part in homes(scene, parts):
+            anchors[_anchor_key(part)] = _anchor(children[part.object_id], root, scene, part, largest, extent)
+        for part, data in zip(parts, compat.new_point_clouds([part.count for part in parts]), strict=True):
+            point_clouds.fill(data, scene, slice(part.start, part.start + part.count), extent, options.sh_degree)
+            data.materials.append(material)
+            _cloud(children[part.object_id], anchors[_anchor_key(part)], scene, part, largest, data)
+        viewport_display.show(collection, options.display)
+        reaches = keyframes.reaches(scene)
+        for (_, motion_id), anchor in anchors.items():
+            keyframes.animate(anchor, scene, motion_id, times, options.key_tolerance, float(reaches[motion_id]))
+        physics.remember(anchors, scene, times, options.key_tolerance, reaches)
+        object_names.remember(collection, meanings=scene.vocabulary_embeddings is not None)
+        if options.fit_timeline:
+            timeline.fit(context.scene, times)
+        context.view_layer.update()
+    for selected in context.selected_objects:
+        selected.select_set(False)
+    root.select_set(True)
+    context.view_layer.objects.active = root
+    return collection
+
+
+def object_name(scene: Scene, object_id: int) -> str:
+    """Name of an object of the table, or one made of its id where the table lacks it."""
+    try:
+        return scene.object(object_id).name
+    except KeyError:
+        return "unassigned" if object_id < 0 else f"object {object_id}"
+
+
+def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bpy.types.Object:
+    root = bpy.data.objects.new(object_names.fit(f"{scene.name} root"), None)
+    root.r5dgs.role = "ROOT"
+    root.empty_display_type = "PLAIN_AXES"
+    root.empty_display_size = 0.1 * scene.extent
+    root.rotation_mode = "QUATERNION"
+    root.rotation_quaternion = Matrix(cameras.WORLD_TO_BLENDER[convention].tolist()).to_quaternion()
+    if scene.origin.any():
+        root[loaded_scenes.ORIGIN] = scene.origin.tolist()
+        root.id_properties_ui(loaded_scenes.ORIGIN).update(
+            description="Point of the data set's world that is shown at the root"
+        )
+    collection.objects.link(root)
+    return root
+
+
+def _pivot(scene: Scene, part: Range) -> np.ndarray:
+    """Where the anchor stands: the group's pivot; the middle of the object where the group is the pinned one. [3]"""
+    if part.motion_id != 0:
+        return np.asarray(scene.groups[part.motion_id].pivot, np.float64)
+    if part.object_id <= 0:
+        return np.zeros(3)
+    return np.median(scene.means[part.start : part.start + part.count].astype(np.float64), axis=0)
+
+
+def _anchor_key(part: Range) -> tuple[int, int]:
+    """What shares an anchor: a motion group; of the pinned one, each object by itself, so that it can be moved."""
+    return (part.object_id if part.motion_id == 0 else 0, part.motion_id)
+
+
+def _part_name(scene: Scene, part: Range, largest: dict[int, Range]) -> str:
+    """Name of a range: its object's for the largest one, which of the object's Gaussians these are for the others."""
+    name = object_name(scene, part.object_id)
+    group: MotionGroup = scene.groups[part.motion_id]
+    if group.role == "shadow":
+        owner = object_name(scene, group.object_id)
+        return f"{owner} shadow" if part.object_id <= 0 else f"{name} with {owner} shadow"
+    if part == largest[part.object_id]:
+        return name
+    return f"{name} still" if part.motion_id == 0 else f"{name} with {object_name(scene, group.object_id)}"
+
+
+def _anchor(
+    collection: bpy.types.Collection,
+    root: bpy.types.Object,
+    scene: Scene,
+    part: Range,
+    largest: dict[int, Range],
+    extent: float,
+) -> bpy.types.Object:
+    anchor = bpy.data.objects.new(object_names.fit(f"{_part_name(scene, part, largest)} anchor"), None)
+    pivot = _pivot(scene, part)
+    shadow = scene.groups[part.motion_id].role == "shadow"  # what goes along is drawn smaller than what leads
+    anchor.empty_display_type = "PLAIN_AXES" if shadow else "ARROWS"
+    anchor.empty_display_size = (0.01 if shadow else 0.03) * extent
+    anchor.rotation_mode = "QUATERNION"
+    anchor.location = pivot
+    anchor.parent = root
+    state = anchor.r5dgs
+    state.role, state.object_id, state.motion_id, state.pivot = "ANCHOR", part.object_id, part.motion_id, pivot
+    collection.objects.link(anchor)
+    return anchor
+
+
+def _cloud(
+    collection: bpy.types.Collection,
+    anchor: bpy.types.Object,
+    scene: Scene,
+    part: Range,
+    largest: dict[int, Range],
+    data: bpy.types.PointCloud,
+) -> bpy.types.Object:
+    data.name = name = object_names.fit(_part_name(scene, part, largest))
+    cloud = bpy.data.objects.new(name, data)
+    collection.objects.link(cloud)
+    color = point_clouds.srgb_to_linear(np.asarray(_color(scene, part.object_id), np.float64))
+    cloud.color = (*color, 1.0)
+    cloud.parent = anchor
+    pivot = Vector(anchor.r5dgs.pivot)
+    cloud.matrix_parent_inverse = Matrix.Translation(-pivot)
+    state = cloud.r5dgs
+    state.role, state.object_id, state.motion_id, state.pivot = "CLOUD", part.object_id, part.motion_id, pivot
+    state.start, state.count = part.start, part.count
+    return cloud
+
+
+def _color(scene: Scene, object_id: int) -> tuple[float, float, float]:
+    try:
+        return scene.object(object_id).color
+    except KeyError:
+        return (0.5, 0.5, 0.5)
+
+
+def _describe(
+    collection: bpy.types.Collection, scene: Scene, path: Path, root: bpy.types.Object, times: timeline.Times
+) -> None:
+    state = collection.r5dgs
+    state.is_scene = True
+    state.scene_name = scene.name
+    state.filepath = relink.relative_to(str(path.resolve()), bpy.data.filepath)  # allows the file, see `trust`
+    state.seen_at = str(path.resolve())
+    state.gaussians = len(scene.means)
+    state.root = root
+    state.t_start, state.t_max, state.t_end = times.t_start, times.t_max, times.t_end
+    state.frames_per_unit, state.frame_zero = times.frames_per_unit, times.frame_zero
+    for item in scene.objects:
+        entry = state.table.add()
+        entry.name, entry.object_id = item.name, item.id
+        for alias in item.aliases:
+            entry.aliases.add().name = alias
+        entry.caption, entry.count = item.caption, item.count

@@ -1,0 +1,1 @@
+"""Capture a training data set from any .blend with Cycles."""

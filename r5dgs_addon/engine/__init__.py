@@ -1,0 +1,1 @@
+"""The render engine: requests to the worker, viewport, passes and previews."""

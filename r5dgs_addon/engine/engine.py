@@ -1,0 +1,154 @@
+"""The render engine R5DGS: F12, animations and Rendered viewports with the worker's rasterizer.
+
+A picture is what the depsgraph shows, see `render_request`; so a frame of an animation is the frame that F12 renders.
+"""
+
+import functools
+import time
+
+import bpy
+
+from ...r5dgs_core import errors
+from .. import compat
+from ..color import display_to_linear, inverse_loss, view_transform
+from ..scene import loaded_scenes, render_settings
+from ..ui import plural
+from ..worker import jobs
+from . import cryptomatte, render_notes, render_passes, render_request, stereo, view_cameras, viewport
+
+ENGINE = "R5DGS"
+LOOK_S = 0.005  # between two looks at the worker, and at whether the user wants to stop
+GRACE_S = 0.2  # a picture that is stopped may take this long, before the worker is
+
+
+class R5DGS_RenderEngine(bpy.types.RenderEngine):
+    """Renders loaded R5DGS scenes as they were trained."""
+
+    bl_idname = ENGINE
+    bl_label = "R5DGS"
+    bl_use_preview = False
+    bl_use_eevee_viewport = True  # for Material Preview
+
+    _port = None  # what this engine draws in its viewport
+    _said = ""
+
+    def update_render_passes(self, scene, renderlayer):
+        """Tell the compositor which passes there are."""
+        for one in render_passes.of_layer(renderlayer):
+            self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
+
+    def render(self, depsgraph):
+        """Render a view layer; called for every frame, in a thread of its own where there is a window.
+
+        An error that is reported ends the render, and nothing is written; without, a black picture would be saved.
+        """
+        try:
+            self._render(depsgraph)
+        except errors.R5dgsError as error:
+            self.report({"ERROR"}, f"R5DGS: {error}")
+        except Exception as error:
+            self.report({"ERROR"}, f"R5DGS: {type(error).__name__}: {error}; the console has more")
+            raise
+
+    def view_update(self, context, depsgraph):
+        """Nothing to do: `view_draw`, which follows, sees by itself what has changed."""
+
+    def view_draw(self, context, depsgraph):
+        """Draw the last picture of the viewport, and ask for another where it is not of what the viewport shows."""
+        if self._port is None:
+            self._port = viewport.Port()
+        self._port.draw(self, context, depsgraph)
+
+    def _render(self, depsgraph: bpy.types.Depsgraph) -> None:
+        for view, eye in stereo.eyes(self, depsgraph):
+            if not self.test_break():
+                self._render_view(depsgraph, view, eye)
+
+    def _render_view(self, depsgraph: bpy.types.Depsgraph, view: str, eye: view_cameras.Eye | None) -> None:
+        scene, layer = depsgraph.scene, depsgraph.view_layer
+        if not loaded_scenes.scene_collections():
+            raise errors.ConfigError("expected a loaded R5DGS scene, found none; load one from File > Import first")
+        inverse = display_to_linear.wait_for_inverse(scene, self.test_break)
+        objections = display_to_linear.objections(scene)
+        if objections:
+            self.report(
+                {"WARNING"},
+                f"R5DGS: colors do not come out as trained with {', '.join(objections)}; press 'Show Colors as "
+                "Trained' in the render properties",
+            )
+        passes, transparent = render_passes.of_layer(layer), scene.render.film_transparent
+        mattes = cryptomatte.pass_names(layer)
+        seen = render_request.shown(depsgraph, functools.partial(view_cameras.of_camera, depsgraph, eye=eye))
+        render_notes.report(self, render_notes.of(scene, depsgraph))
+        if seen.scenes:
+            sky = render_settings.of(scene).sky and not transparent
+            steps = render_request.steps(seen, render_passes.wanted(passes, transparent), sky)
+            if mattes:
+                steps[-1][-1]["coverage"] = cryptomatte.request(seen, len(mattes))
+            arrays = self._ask(steps)
+        else:
+            self.report({"WARNING"}, f"R5DGS: view layer {layer.name} shows no R5DGS scene")
+            arrays = render_passes.empty(seen.camera, cryptomatte.RANKS * len(mattes))
+        if arrays is None:
+            return
+        for one in passes[1:]:
+            self.add_pass(one.name, len(one.channels), one.channels, layer=layer.name)
+        rendered = self.begin_result(0, 0, seen.camera.width, seen.camera.height, layer=layer.name, view=view)
+        filled = {one.name: render_passes.pixels(one, arrays, seen, transparent, inverse) for one in passes}
+        render_passes.fill(rendered.layers[0], filled)
+        self.end_result(rendered)
+        if mattes:
+            cryptomatte.write_names(self.get_result(), layer, seen)
+        self.update_progress(1.0)
+
+    def _ask(self, steps):
+        """The worker's arrays, or None where the user stops the render."""
+        job = jobs.start(steps)
+        while not job.done:
+            if self._stopped(job.doing):
+                _leave(job)
+                return None
+        result, arrays = job.answer()
+        milliseconds = result["ms_motion"] + result["ms_raster"]
+        self._say(f"{plural.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms")
+        return arrays
+
+    def _stopped(self, doing: str) -> bool:
+        """Say what is waited for, wait a moment, and see whether the user wants to stop."""
+        self._say(f"{doing[:1].upper()}{doing[1:]}")
+        time.sleep(LOOK_S)
+        return self.test_break()
+
+    def _say(self, text: str) -> None:
+        """Show a few words over the picture and in the console, once."""
+        if text != self._said:
+            self._said = text
+            self.update_stats("", text)
+
+
+def _leave(job: jobs.Job) -> None:
+    """Give up on a job; one that ends by itself in a moment spares the worker."""
+    end = time.monotonic() + GRACE_S
+    while not (job.done or job.drop()) and time.monotonic() < end:
+        time.sleep(LOOK_S)
+    job.cancel()
+
+
+def register():
+    """Register the settings and the engine, and let Blender's panels that are for all engines show for it."""
+    render_settings.register()
+    view_transform.register()
+    bpy.utils.register_class(R5DGS_RenderEngine)
+    for panel in compat.panels_of_all_engines():
+        panel.COMPAT_ENGINES.add(ENGINE)
+
+
+def unregister():
+    """Undo `register`."""
+    viewport.forget()
+    for panel in compat.panels_of_all_engines():
+        panel.COMPAT_ENGINES.discard(ENGINE)
+    bpy.utils.unregister_class(R5DGS_RenderEngine)
+    inverse_loss.unregister()
+    view_transform.unregister()
+    render_settings.unregister()

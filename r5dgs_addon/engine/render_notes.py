@@ -1,0 +1,53 @@
+"""Notes on what a render leaves out, for the render's report, once per render, and the render properties."""
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..scene import evaluated_points, loaded_scenes
+from . import visible_clouds
+
+_reported: set[str] = set()  # since the render began; an animation is one render
+
+
+def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> list[str]:
+    """Name what the engine does not render of a Blender scene, as sentences without a period.
+
+    Args:
+        scene: The scene.
+        depsgraph: Evaluated; its other hold-outs are named, too.
+    """
+    notes = []
+    if scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof:
+        notes.append("Depth of field is not rendered")
+    if scene.render.use_motion_blur:
+        notes.append("Motion blur is not rendered")
+    solid = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
+    others = [obj.original for obj in depsgraph.objects if obj.type in solid] if depsgraph is not None else []
+    held = sorted({obj.name for obj in others if visible_clouds.is_held_out(obj, None, depsgraph)})
+    if held:
+        notes.append(f"{', '.join(held)}: hold-outs other than clouds do not cut Gaussians; merge them by depth")
+    return notes + [note for one in loaded_scenes.shown(scene) for note in evaluated_points.notes(one)]
+
+
+def report(engine: bpy.types.RenderEngine, notes: list[str]) -> None:
+    """Report sentences as warnings, each once per render."""
+    for note in notes:
+        if note not in _reported:
+            _reported.add(note)
+            engine.report({"WARNING"}, f"R5DGS: {note}")
+
+
+@persistent
+def _begin(*_):
+    _reported.clear()
+
+
+def register():
+    """Listen to the beginning of renders."""
+    bpy.app.handlers.render_init.append(_begin)
+
+
+def unregister():
+    """Undo `register`."""
+    if _begin in bpy.app.handlers.render_init:
+        bpy.app.handlers.render_init.remove(_begin)

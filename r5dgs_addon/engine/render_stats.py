@@ -1,0 +1,59 @@
+"""What the last picture took, and the error that goes with it: for the sidebar, not saved."""
+
+from typing import Any
+
+import bpy
+from bpy.props import FloatProperty, IntProperty, PointerProperty, StringProperty
+
+from ..ui import plural
+
+
+class R5DGS_PG_figures(bpy.types.PropertyGroup):
+    """Figures of the last preview."""
+
+    size: StringProperty(name="Size", description="Width and height of the last preview in pixels")
+    ms_motion: FloatProperty(name="Motion", description="Milliseconds that bringing Gaussians to their places took")
+    ms_raster: FloatProperty(name="Raster", description="Milliseconds that rasterizing took")
+    error: StringProperty(name="Error", description="What is known of the error of the scenes in the picture")
+    unbent: IntProperty(name="Not Bent", description="Gaussians that bend while observed, shown as if they did not")
+
+
+def remember(image: bpy.types.Image, result: dict[str, Any]) -> None:
+    """Keep the figures of a picture, of the worker's result."""
+    figures = bpy.context.window_manager.r5dgs_figures
+    figures.size = f"{image.size[0]} x {image.size[1]}"
+    figures.ms_motion, figures.ms_raster = result["ms_motion"], result["ms_raster"]
+    known = result["scenes"]
+    texts = [f"{one['name']}: {one['error']}" if len(known) > 1 else one["error"] for one in known]
+    figures.error = "; ".join(texts)
+    figures.unbent = sum(one["unbent"] for one in known)
+
+
+def speed() -> str:
+    """The last preview's size and milliseconds in a line; empty before the first."""
+    figures = bpy.context.window_manager.r5dgs_figures
+    if not figures.size:
+        return ""
+    total = figures.ms_motion + figures.ms_raster
+    return f"{figures.size} in {total:.0f} ms (motion {figures.ms_motion:.0f}, raster {figures.ms_raster:.0f})"
+
+
+def errors() -> list[str]:
+    """What is known of the last preview's error, a line for each thing."""
+    figures = bpy.context.window_manager.r5dgs_figures
+    lines = [figures.error] if figures.error else []
+    if figures.unbent:
+        lines.append(f"{plural.of(figures.unbent, 'Gaussian', 'bend')} while observed, shown unbent; see Exact Mode")
+    return lines
+
+
+def register():
+    """Register the group and hang it on the window manager."""
+    bpy.utils.register_class(R5DGS_PG_figures)
+    bpy.types.WindowManager.r5dgs_figures = PointerProperty(type=R5DGS_PG_figures)
+
+
+def unregister():
+    """Undo `register`."""
+    del bpy.types.WindowManager.r5dgs_figures
+    bpy.utils.unregister_class(R5DGS_PG_figures)

@@ -1,0 +1,205 @@
+"""Rendered viewports: each draws its last picture and asks the worker for the next without waiting for it.
+
+While a view moves, pictures are small and the latest wish wins; once it rests, one of full size follows. A timer, in
+Blender's own thread, gives wishes to the worker and takes pictures from it.
+"""
+
+import functools
+import time
+import weakref
+from typing import Any
+
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.presets import draw_texture_2d
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.color import view_inverse
+from ...r5dgs_core.scene import cameras
+from ..color import display_to_linear
+from ..scene import render_settings
+from ..ui import plural, status_bar
+from ..worker import jobs
+from . import render_passes, render_request, view_cameras
+
+KEY = "viewport"  # what `jobs.busy` knows their pictures by
+LOOK_S = 0.01  # between two looks at the worker
+REST_S = 0.15  # a view that has not moved for this long rests
+QUICK_MS = 40.0  # pictures of full size that take no longer come at once
+FULL = 1
+
+_ports: "weakref.WeakSet[Port]" = weakref.WeakSet()
+_asked: "tuple[jobs.Job, Port, Wish, int] | None" = None
+
+
+class Wish:
+    """What a viewport wants to show.
+
+    Args:
+        seen: What it shows, with a camera of full size.
+        sky: Whether the sky lies behind everything.
+        transparent: Whether the film is.
+        moving: By what pictures are smaller while it moves.
+        inverse: Of the view transform; of *Standard* where None.
+    """
+
+    def __init__(
+        self,
+        seen: render_request.Shown,
+        sky: bool,
+        transparent: bool,
+        moving: int,
+        inverse: view_inverse.Inverse | None = None,
+    ):
+        self.camera = seen.camera
+        self.transparent = transparent
+        self.moving = moving
+        self.inverse = inverse
+        self.steps = render_request.steps(seen, ("alpha",) if transparent else (), sky)
+        self.since = time.monotonic()
+
+    def same(self, other: "Wish | None") -> bool:
+        """Whether another wish is for the same picture."""
+        if other is None or self.inverse is not other.inverse:
+            return False
+        return (self.steps, self.transparent) == (other.steps, other.transparent)
+
+    def requests(self, smaller: int) -> list[tuple[str, str, dict[str, Any]]]:
+        """The worker's requests for the picture, smaller by a factor."""
+        *before, (doing, command, arguments) = self.steps
+        if smaller == FULL:
+            return self.steps
+        size = (max(self.camera.width // smaller, 1), max(self.camera.height // smaller, 1))
+        view = view_cameras.View(cameras.resize(self.camera, *size))
+        return [*before, (doing, command, {**arguments, "camera": view.request()})]
+
+
+class Port:
+    """A viewport: its wish, its last picture, and how that was made."""
+
+    def __init__(self):
+        self._wish: Wish | None = None
+        self._shown: tuple[Wish, int] | None = None  # what the picture is of, and by what it is smaller
+        self._failed: Wish | None = None
+        self._pixels: np.ndarray | None = None  # a picture that is not on the GPU yet
+        self._texture = None
+        self._message = ""
+        self._full_ms = 1e9
+        _ports.add(self)
+
+    def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
+        """Draw the last picture over the region, and wish for what it shows now."""
+        region, scene = context.region, depsgraph.scene
+        try:
+            self.want(_wish(context, depsgraph))
+        except errors.R5dgsError as error:
+            self._wish = self._shown = self._pixels = self._texture = None
+            self._message = str(error)
+        if self._pixels is not None:
+            height, width = self._pixels.shape[:2]
+            data = gpu.types.Buffer("FLOAT", self._pixels.size, self._pixels.ravel())
+            self._texture, self._pixels = gpu.types.GPUTexture((width, height), format="RGBA16F", data=data), None
+        if self._texture is not None:
+            gpu.state.blend_set("ALPHA_PREMULT")
+            engine.bind_display_space_shader(scene)
+            draw_texture_2d(self._texture, (0, 0), region.width, region.height)
+            engine.unbind_display_space_shader()
+            gpu.state.blend_set("NONE")
+        engine.update_stats("R5DGS", self._message)
+
+    def want(self, wish: Wish) -> None:
+        """Wish for a picture; nothing happens where it is the one that was wished for."""
+        if not wish.same(self._wish):
+            self._wish, self._failed = wish, None
+        if self.next() is not None and not bpy.app.timers.is_registered(look):
+            bpy.app.timers.register(look, first_interval=0.0)
+
+    def next(self) -> tuple[Wish, int] | None:
+        """The picture that it waits for and by what that is smaller; None where it shows what it should."""
+        wish = self._wish
+        if wish is None or wish.same(self._failed):
+            return None
+        done = self._shown is not None and wish.same(self._shown[0])
+        if done and self._shown[1] == FULL:
+            return None
+        quick = self._full_ms <= QUICK_MS or wish.moving == FULL
+        return wish, FULL if done or quick else wish.moving
+
+    def rests(self) -> bool:
+        """Whether the view has not moved for a while."""
+        return self._wish is not None and time.monotonic() - self._wish.since >= REST_S
+
+    def take(self, wish: Wish, smaller: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
+        """Keep a picture of the worker for the next drawing."""
+        result, arrays = answer
+        milliseconds = result["ms_motion"] + result["ms_raster"]
+        alpha = render_passes.alpha(arrays, wish.transparent)
+        linear = display_to_linear.scene_linear(arrays["color"], alpha, wish.inverse)
+        self._pixels = np.ascontiguousarray(linear[::-1])
+        self._shown = wish, smaller
+        if smaller == FULL:
+            self._full_ms = milliseconds
+        self._message = f"{plural.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms"
+
+    def say(self, message: str) -> None:
+        """Show a few words at the viewport's corner."""
+        self._message = message
+
+    def fail(self, wish: Wish, error: errors.R5dgsError) -> None:
+        """Show why there is no picture, and do not ask for it again until something changes."""
+        self._failed, self._message = wish, str(error)
+
+
+def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
+    """What the viewport that is being drawn should show."""
+    scene, settings = depsgraph.scene, render_settings.of(depsgraph.scene)
+    looks = functools.partial(view_cameras.of_region, context.region, context.region_data)
+    seen = render_request.shown(depsgraph, looks, context.space_data)
+    if not seen.scenes:
+        raise errors.ConfigError("No R5DGS scene is shown; load one from File > Import")
+    transparent = scene.render.film_transparent
+    inverse = display_to_linear.inverse(scene)
+    return Wish(seen, settings.sky and not transparent, transparent, int(settings.moving), inverse)
+
+
+def look() -> float | None:
+    """Take a picture that is ready, and give the worker the next wish. Returns seconds to the next look."""
+    global _asked
+    if _asked is not None:
+        job, port, wish, smaller = _asked
+        if not job.done:
+            if job.seconds > 1.0:
+                port.say(f"{job.doing[:1].upper()}{job.doing[1:]}, {job.seconds:.0f} s")
+                status_bar.redraw("VIEW_3D")
+            return LOOK_S if job.seconds < 1.0 else 0.25
+        _asked = None
+        try:
+            port.take(wish, smaller, job.answer())
+        except errors.R5dgsError as error:
+            port.fail(wish, error)
+        status_bar.redraw("VIEW_3D")
+    waiting = [(port, *following) for port in _ports if (following := port.next()) is not None]
+    if not waiting:
+        return None
+    if jobs.busy() or bpy.app.is_job_running("RENDER"):
+        return 0.1
+    for port, wish, smaller in sorted(waiting, key=lambda one: -one[2]):  # small pictures first: they are waited for
+        if smaller == FULL and wish.moving != FULL and not port.rests():
+            continue
+        try:
+            _asked = jobs.submit(KEY, wish.requests(smaller)), port, wish, smaller
+        except errors.R5dgsError as error:
+            port.fail(wish, error)
+            status_bar.redraw("VIEW_3D")
+        break
+    return LOOK_S
+
+
+def forget() -> None:
+    """Stop looking after viewports."""
+    global _asked
+    _asked = None
+    _ports.clear()
+    if bpy.app.timers.is_registered(look):
+        bpy.app.timers.unregister(look)

@@ -1,0 +1,1 @@
+"""Export scenes, Gaussians, cameras and masks from Blender."""

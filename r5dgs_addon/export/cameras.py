@@ -1,0 +1,150 @@
+"""Blender's cameras for tools that take pictures with their cameras: `transforms.json` and COLMAP's text model."""
+
+import re
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.formats import camera_files
+from ...r5dgs_core.formats.camera_files import View
+from ...r5dgs_core.playback import affine_transform
+from ...r5dgs_core.scene import cameras
+from ..engine import view_cameras, visible_clouds
+from ..scene import loaded_scenes, timeline
+from ..ui import plural
+from ..ui.stepwise_operator import Outcome, Step, Steps
+from . import frame_range, gaussians
+
+FORMATS = (
+    ("NERF", "transforms.json", "NeRF and D-NeRF: camera to world with OpenGL axes, lens and time"),
+    ("COLMAP", "COLMAP Text", "cameras.txt, images.txt and an empty points3D.txt in sparse/0, times in times.json"),
+)
+WHICH = (
+    ("ACTIVE", "Active Camera", "The scene's camera, and those that markers bind"),
+    ("ALL", "All Cameras", "Every perspective camera of the scene"),
+)
+
+
+def steps(
+    context: bpy.types.Context, folder: Path, which: str, *, format: str, axes: str, every: bool, step: int = 1
+) -> Steps:
+    """Write cameras into a folder; images are named ``images/frame_0001.png`` or ``images/CAMERA/0001.png``.
+
+    Args:
+        context: Its scene has cameras, frames and resolution.
+        folder: Made where it does not exist.
+        which: Of `WHICH`.
+        format: Of `FORMATS`.
+        axes: Of `gaussians.AXES`; "FILE" gives cameras of the data set's world.
+        every: The scene's frame range instead of the current frame.
+        step: Frames from one view to the next.
+
+    Raises:
+        ConfigError: A camera cannot be expressed, or there is none.
+        SceneFileError: A file cannot be written.
+    """
+    scene, found, notes = context.scene, [], []
+    collection = loaded_scenes.active_collection(context)
+    if axes == "FILE" and collection is None:
+        raise errors.ConfigError("export: expected a loaded scene for the axes 'Scene File', found none; choose others")
+    origin = loaded_scenes.origin(collection)
+    if origin.any() and axes != "FILE":
+        notes.append(gaussians.relative_note(origin, "the axes 'Scene File' give cameras of that world"))
+    frames, folders = frame_range.frames_of(scene, every, step), _folders(scene)
+    with frame_range.frame_kept(scene):
+        for number, frame in enumerate(frames):
+            yield Step(number, len(frames), f"frame {frame}")
+            frame_range.go_to(scene, frame)
+            depsgraph, t = context.evaluated_depsgraph_get(), time_of(scene, collection, frame, every)
+            world = np.eye(4) if collection is None else visible_clouds.world_of(collection, depsgraph)
+            for camera in _cameras(scene, which, notes):
+                name = image_name(frame) if which == "ACTIVE" else f"images/{folders[camera]}/{frame:04d}.png"
+                own = in_axes(depsgraph, camera, axes, world)
+                found.append(View(name, cameras.moved(own, origin) if axes == "FILE" else own, t))
+    if not found:
+        raise errors.ConfigError(f"{scene.name}: expected a camera, found none; add one to the scene")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if format == "NERF":
+            written = camera_files.write_transforms(folder / "transforms.json", found)
+        else:
+            written = camera_files.write_colmap(folder, found)
+    except OSError as error:
+        raise errors.SceneFileError(f"{folder}: cannot be written: {error}") from error
+    return Outcome(f"{written}: {plural.of(len(found), 'view')}", notes)
+
+
+def image_name(frame: int) -> str:
+    """Path of the active camera's image of a frame, relative to the folder."""
+    return f"images/frame_{frame:04d}.png"
+
+
+def _folders(scene: bpy.types.Scene) -> dict[bpy.types.Object, str]:
+    """A folder for each camera, called as every file system and COLMAP take it; those of like names are numbered."""
+    found: dict[bpy.types.Object, str] = {}
+    taken: set[str] = set()
+    for camera in _sorted(scene):
+        plain = re.sub(r"[^\w.+-]+", "_", camera.name)
+        found[camera], number = plain, 1
+        while found[camera].casefold() in taken:
+            number += 1
+            found[camera] = f"{plain}_{number}"
+        taken.add(found[camera].casefold())
+    return found
+
+
+def _sorted(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The cameras of a Blender scene by name."""
+    return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
+
+
+def time_of(scene: bpy.types.Scene, collection: bpy.types.Collection | None, frame: int, every: bool) -> float | None:
+    """Scene time of a frame; without a loaded scene its share of the frame range, None where one frame is all."""
+    if collection is not None:
+        return timeline.of_collection(collection).time(frame)
+    span = scene.frame_end - scene.frame_start
+    return (frame - scene.frame_start) / span if every and span else None
+
+
+def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str, world: np.ndarray) -> cameras.Camera:
+    """A camera of Blender in other axes.
+
+    Args:
+        depsgraph: Evaluated.
+        camera: A perspective camera.
+        axes: Of `gaussians.AXES`.
+        world: Map of the loaded scene's own world to Blender's. [4, 4]
+
+    Returns:
+        The camera, its whole picture.
+
+    Raises:
+        ConfigError: The scene's own world is sheared or scaled unevenly, so that its cameras would be no cameras.
+    """
+    own = view_cameras.of_camera(depsgraph, lambda: np.zeros((0, 3)), camera, border=False).camera
+    turn = gaussians.world_to(axes, world)
+    if not affine_transform.is_similarity(turn[:3, :3]) or np.linalg.det(turn[:3, :3]) < 0:
+        raise errors.ConfigError("export: expected a root with one scale on all axes, found another; choose other axes")
+    matrix = turn @ cameras.cam_world_to_opengl(own.T_cam_world)
+    return cameras.Camera(own.width, own.height, own.intrinsics, cameras.opengl_to_cam_world(matrix), camera.name)
+
+
+def _cameras(scene: bpy.types.Scene, which: str, notes: list[str]) -> list[bpy.types.Object]:
+    """The cameras to write at the present frame."""
+    if which == "ACTIVE":
+        camera = scene.camera
+        if camera is not None and camera.type == "CAMERA" and camera.data.type != "PERSP":
+            raise errors.ConfigError(
+                f"{camera.name}: expected a perspective camera, found {camera.data.type.lower()}; set its lens type to "
+                "Perspective"
+            )
+        return [] if camera is None or camera.type != "CAMERA" else [camera]
+    found = []
+    for camera in _sorted(scene):
+        if camera.data.type == "PERSP":
+            found.append(camera)
+        elif (note := f"{camera.name}: left out, as it is {camera.data.type.lower()} and not perspective") not in notes:
+            notes.append(note)
+    return found

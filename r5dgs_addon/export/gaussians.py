@@ -1,0 +1,238 @@
+"""What Blender shows as Gaussians for others: the clouds of a frame, carried to where they are, in the axes wanted."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.editing import point_edits
+from ...r5dgs_core.formats import ply
+from ...r5dgs_core.playback import affine_transform
+from ...r5dgs_core.playback.residuals import Residuals
+from ...r5dgs_core.scene import cameras, scene_file
+from ...r5dgs_core.scene.scene import Scene
+from ..engine import render_request, visible_clouds
+from ..scene import evaluated_points, loaded_scenes, object_tint
+from ..ui import plural
+from ..ui.stepwise_operator import Outcome, Step, Steps
+from . import frame_range
+
+AXES = (
+    ("BLENDER", "Blender World", "As Blender shows it: z up"),
+    ("FILE", "Scene File", "The world of the .r5dgs file, in which its cameras and data set are"),
+    ("COLMAP", "COLMAP (Y Down)", "Blender's world turned to x right, y down, z forward, as many viewers expect"),
+    ("OPENGL", "OpenGL (Y Up)", "Blender's world turned to x right, y up, z backward"),
+)
+WHICH = (
+    ("SELECTED", "Selected", "Selected objects, and the clouds of selected anchors and roots"),
+    ("VISIBLE", "All Visible", "Everything that can be seen in this view layer"),
+)
+
+
+@dataclass
+class Sources:
+    """Where the Gaussians of clouds come from; scene files are read once.
+
+    Attributes:
+        notes: What has to be said about it, each once.
+        origins: Points that the positions of the scenes are measured from.
+    """
+
+    notes: list[str] = field(default_factory=list)
+    origins: set[tuple[float, ...]] = field(default_factory=set)
+    _scenes: dict[int, Scene | None] = field(default_factory=dict)
+    _bending: dict[int, Residuals] = field(default_factory=dict)
+
+    def scene(self, collection: bpy.types.Collection | None) -> Scene | None:
+        """The scene file of a loaded scene, or None where it is gone or damaged."""
+        if collection is None:
+            return None
+        if collection.session_uid not in self._scenes:
+            try:
+                self._scenes[collection.session_uid] = scene_file.read(render_request.scene_path(collection))
+            except errors.R5dgsError as error:
+                self._scenes[collection.session_uid] = None
+                self.note(f"Taken from the points in Blender, without shading: {error}")
+        return self._scenes[collection.session_uid]
+
+    def bending(self, collection: bpy.types.Collection) -> Residuals:
+        """How single Gaussians of a loaded scene leave their group; its file has to be there."""
+        known = self._bending.get(collection.session_uid)
+        if known is None:
+            scene = self.scene(collection)
+            assert scene is not None
+            known = self._bending[collection.session_uid] = Residuals(scene)
+        return known
+
+    def note(self, text: str) -> None:
+        """Remember what has to be said in the end."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+
+def chosen(context: bpy.types.Context, which: str) -> set[bpy.types.Object] | None:
+    """Objects whose clouds are exported, of `WHICH`: the selected ones and what hangs from them; None for all."""
+    if which == "VISIBLE":
+        return None
+    selected = set(context.selected_objects)
+    return selected | {child for obj in selected for child in obj.children_recursive}
+
+
+def world_to(axes: str, world: np.ndarray) -> np.ndarray:
+    """The map from Blender's world to the axes wanted, of `AXES`.
+
+    Args:
+        axes: Of `AXES`.
+        world: Map of the scene's own world to Blender's. [4, 4]
+
+    Returns:
+        The map. [4, 4]
+    """
+    if axes == "FILE":
+        return np.linalg.inv(world)
+    result = np.eye(4)
+    if axes != "BLENDER":
+        result[:3, :3] = cameras.WORLD_TO_BLENDER[axes.lower()].T
+    return result
+
+
+def splats_of(
+    context: bpy.types.Context, wanted: set[bpy.types.Object] | None, axes: str, sources: Sources
+) -> tuple[ply.Splats, list[str]]:
+    """The Gaussians that Blender shows at the current frame.
+
+    Args:
+        context: Its scene has the frame; what its view layer hides is left out.
+        wanted: What `chosen` gave.
+        axes: Of `AXES`.
+        sources: Where they come from, and what has to be said.
+
+    Returns:
+        The Gaussians, and the names of the clouds that are in them.
+    """
+    depsgraph = context.evaluated_depsgraph_get()
+    _, found = visible_clouds.instances(depsgraph)
+    parts, names = [], []
+    for one in found:
+        if wanted is not None and one.object not in wanted and one.parent not in wanted:
+            continue
+        scene, turn = sources.scene(one.collection), world_to(axes, one.world)
+        sources.origins.add(tuple(loaded_scenes.origin(one.collection).tolist()))
+        matrix, names = turn @ one.matrix, [*names, one.object.name]
+        for note in evaluated_points.of(one.object, depsgraph, one.collection.r5dgs.gaussians).notes:
+            sources.note(note)
+        if scene is not None and one.object.r5dgs.start + one.object.r5dgs.count <= len(scene.means):
+            parts.append(_placed(scene, one, matrix, turn, sources))
+        else:
+            points = from_points(evaluated_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)
+            parts.append(affine_transform.carry(points, matrix, np.array(one.tint)))
+        if parts[-1].sh.shape[1] > 1 and not affine_transform.is_similarity(matrix[:3, :3]):
+            sources.note(f"{names[-1]}: scaled unevenly; how its colors change with the direction is a best fit")
+    return affine_transform.join(parts), names
+
+
+def _placed(
+    scene: Scene, one: visible_clouds.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources
+) -> ply.Splats:
+    """The Gaussians of a visible cloud, by its scene file. matrix, turn [4, 4]"""
+    start, count, bending = one.start, one.count, None
+    if one.edit is not None:
+        whole = scene
+        scene, place = point_edits.apply(scene, one.edit.points)
+        start, count, matrix = place.start, place.count, matrix @ place.matrix
+        bending = None if scene is whole else Residuals(scene)
+    bend = None
+    if one.t is not None:
+        bend = affine_transform.bend_of(bending or sources.bending(one.collection), one.t, start, count)
+    tint = None if one.tint == object_tint.NONE else np.array(one.tint)
+    return affine_transform.place(scene, start, count, matrix, world=turn @ one.world, tint=tint, bend=bend)
+
+
+def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
+    """Gaussians out of the attributes that `point_clouds.fill` writes.
+
+    Raises:
+        SceneFileError: The points are no Gaussians.
+    """
+    count = len(cloud.points)
+
+    def values(name: str, field_name: str, width: int) -> np.ndarray:
+        attribute = cloud.attributes.get(name)
+        if attribute is None or len(attribute.data) != count:
+            raise errors.SceneFileError(
+                f"{cloud.name}: expected points with the attribute '{name}', found none; load the scene again"
+            )
+        found = np.empty(count * width, np.float32)
+        attribute.data.foreach_get(field_name, found)
+        return found.reshape(count, width)
+
+    base = values("radiance:base", "color", 4)
+    rest, k = [], 0
+    while cloud.attributes.get(f"radiance:sh_{k}") is not None:
+        rest.append(values(f"radiance:sh_{k}", "vector", 3))
+        k += 1
+    opacities = np.clip(base[:, 3].astype(np.float64), 1e-7, 1 - 1e-7)
+    return ply.Splats(
+        means=values("position", "vector", 3),
+        quats=values("rotation", "value", 4),
+        log_scales=np.log(np.maximum(values("scale", "vector", 3), 1e-30)),
+        opacity_logits=np.log(opacities / (1 - opacities)).astype(np.float32),
+        sh=np.ascontiguousarray(np.stack([base[:, :3], *rest], axis=1)),
+        object_ids=np.full(count, object_id, np.int32),
+    )
+
+
+def ply_steps(
+    context: bpy.types.Context, path: Path, which: str, *, axes: str, plain: bool, every: bool, step: int = 1
+) -> Steps:
+    """Write clouds as 3DGS PLY, one file for each frame.
+
+    Args:
+        context: Its scene has the frames.
+        path: The file; those of a range get the frame's number behind the name.
+        which: Of `WHICH`.
+        axes: Of `AXES`.
+        plain: Leave identities and ids out.
+        every: The scene's frame range instead of the current frame.
+        step: Frames from one file to the next.
+
+    Raises:
+        ConfigError: The current frame shows nothing of it.
+        SceneFileError: A file cannot be written, or points are no Gaussians.
+    """
+    wanted, sources, scene = chosen(context, which), Sources(), context.scene
+    frames, most, clouds = frame_range.frames_of(scene, every, step), 0, set()
+    with frame_range.frame_kept(scene):
+        for number, frame in enumerate(frames):
+            target = frame_range.numbered(path, frame) if every else path
+            yield Step(number, len(frames), target.name)
+            frame_range.go_to(scene, frame)
+            splats, names = splats_of(context, wanted, axes, sources)
+            if not names and not every:
+                raise errors.ConfigError(
+                    "export: expected a visible object of a loaded scene" + (", selected" if wanted is not None else "")
+                    + ", found none; select or show one first"
+                )  # fmt: skip
+            ply.write(splats, target, plain=plain, origin=_shared_origin(sources) if axes == "FILE" else None)
+            most, clouds = max(most, len(splats.means)), clouds | set(names)
+    for origin in sorted(sources.origins):
+        if any(origin):
+            sources.note(
+                relative_note(np.array(origin), "PLY files hold 32-bit numbers, which would lose detail there")
+            )
+    if not clouds:
+        sources.note("No frame shows anything to export; the files are empty")
+    files = plural.of(len(frames), "file") if every else path.name
+    return Outcome(f"{files}: {plural.of(most, 'Gaussian')} of {plural.of(len(clouds), 'cloud')}", sources.notes)
+
+
+def relative_note(origin: np.ndarray, more: str) -> str:
+    """A note that exported positions are relative to the origin of a scene. [3]"""
+    return f"Positions are relative to {loaded_scenes.origin_text(origin)} of the data set's world; {more}"
+
+
+def _shared_origin(sources: Sources) -> np.ndarray | None:
+    """The origin of all exported scenes; None if they differ."""
+    return np.array(next(iter(sources.origins))) if len(sources.origins) == 1 else None

@@ -1,0 +1,272 @@
+"""A loaded scene as it was edited in Blender, for a `.r5dgs` file: where clouds are at the observed times and after."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.editing import edited_scene, point_edits
+from ...r5dgs_core.scene import cameras, scene_file
+from ...r5dgs_core.scene.scene import Scene, SceneObject
+from ..engine import render_request, visible_clouds
+from ..motion import physics
+from ..scene import evaluated_points, loaded_scenes, object_names, object_tint, timeline
+from ..ui import plural
+from ..ui.stepwise_operator import Outcome, Step, Steps
+from . import frame_range
+
+TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
+KEY_SHARE = 1.5  # of the keys' own tolerance that counts as none, too
+MOST_LATER = 64  # times past t_max that are looked at
+MOST_EARLIER = 16  # frames before the first observed time that are looked at
+_STILL = 1e-6  # how far from the identity a parent may be that turns nothing
+
+
+@dataclass
+class _Member:
+    """A cloud while the frames go by. matrices [4, 4] each; pivot [3], parent [3, 3] and points at t_max.
+
+    ``keys`` has the different states of its points that were seen: several if modifiers animate them.
+    """
+
+    cloud: bpy.types.Object
+    anchor: bpy.types.Object | None
+    object_id: int
+    matrices: list[np.ndarray] = field(default_factory=list)
+    pivot: np.ndarray | None = None
+    parent: np.ndarray | None = None
+    points: evaluated_points.Found = field(default_factory=evaluated_points.Found)
+    keys: set[str] = field(default_factory=set)
+
+
+def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Path, *, exact: bool = False) -> Steps:
+    """Write a loaded scene with its edits.
+
+    Args:
+        context: Its scene has the frames.
+        collection: The loaded scene.
+        path: The new file; none that a loaded scene comes from.
+        exact: Store all numbers in full precision.
+
+    Raises:
+        ConfigError: The path is that of a loaded scene, or a cloud has lost its points.
+        SceneFileError: The scene's own file is gone, or the new one cannot be written.
+    """
+    _refuse_sources(path)
+    own = render_request.scene_path(collection)
+    source = scene_file.read(own)
+    times = timeline.of_collection(collection)
+    members, names = _members(collection)
+    if any(member.cloud.r5dgs.start + member.cloud.r5dgs.count > len(source.means) for member in members):
+        raise errors.SceneFileError(
+            f"{own}: expected the scene that '{collection.name}' was loaded from, found another one; load it again"
+        )
+    when = np.concatenate([source.track_times, _later(times)])
+    earlier = _earlier(context.scene, times)
+    with frame_range.frame_kept(context.scene):
+        before = []
+        for frame in earlier:
+            depsgraph, back = _go_to(context, collection, frame)
+            before.append([back @ _matrix(member.cloud, depsgraph) for member in members])
+        for number, t in enumerate(when):
+            yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
+            _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
+    yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
+    changed = [member for member in members if member.points.edit is not None]
+    extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
+    placed = {id(member): place for member, place in zip(changed, places, strict=True)}
+    pieces = [piece for member in members for piece in _pieces(member, extended, placed.get(id(member)))]
+    result, notes = edited_scene.edit(extended, pieces, when, _table(collection, source, members, names))
+    notes += _lost_points(members, source, extended)
+    yield Step(
+        len(when) + 1, len(when) + 2, f"packing {plural.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
+    )
+    scene_file.write(result, path, exact=exact)
+    lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
+    if lost:
+        notes.append(
+            f"{', '.join(lost)}: what moves before frame {times.frame(times.t_start):.4g}, the first observed time, is "
+            "not in the file; move those keys behind it"
+        )
+    if not _rests(collection):
+        notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
+    named = sum(item.id > 0 for item in result.objects)
+    return Outcome(f"{path.name}: {plural.of(len(result.means), 'Gaussian')}, {plural.of(named, 'object')}", notes)
+
+
+def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:
+    """Sentences on edited points that the file does not hold."""
+    notes = [note for member in members for note in member.points.notes]
+    animated = [member.cloud.name for member in members if len(member.keys) > 1]
+    if animated:
+        notes.append(f"{', '.join(animated)}: points that modifiers animate are written as they are at t_max")
+    lost = [name for name in ("dynamics", "canonical_means") if getattr(extended, name) is None]
+    notes += [f"'{name}' of edited points is left out" for name in lost if getattr(source, name) is not None]
+    return notes
+
+
+def _refuse_sources(path: Path) -> None:
+    for collection in loaded_scenes.scene_collections():
+        try:
+            own = render_request.scene_path(collection)
+        except errors.R5dgsError:
+            continue
+        if path.exists() and path.samefile(own):
+            raise errors.ConfigError(
+                f"{path}: '{collection.name}' plays from this file; save the edited scene under another name"
+            )
+
+
+def _later(times: timeline.Times) -> np.ndarray:
+    """Times past t_max at which Blender's curves are looked at: whole frames, and the last one."""
+    first, last = times.frame(times.t_max), times.frame(times.t_end)
+    if last <= first + 1e-6:
+        return np.zeros(0)
+    count = int(min(max(np.ceil(last - first), 8), MOST_LATER))
+    return times.t_max + (times.t_end - times.t_max) * np.arange(1, count + 1) / count
+
+
+def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
+    """Frames of the timeline before the first observed time, of which a scene file knows nothing."""
+    first, end = scene.frame_start, int(np.ceil(times.frame(times.t_start) - 1e-6))
+    return sorted({int(frame) for frame in np.linspace(first, end - 1, MOST_EARLIER)}) if first < end else []
+
+
+def _go_to(
+    context: bpy.types.Context, collection: bpy.types.Collection, frame: float
+) -> tuple[bpy.types.Depsgraph, np.ndarray]:
+    """Blender at a frame, and the map of its world to the file's then. [4, 4]"""
+    whole = int(np.floor(frame))
+    context.scene.frame_set(whole, subframe=min(float(frame - whole), 0.999999))
+    depsgraph = context.evaluated_depsgraph_get()
+    return depsgraph, np.linalg.inv(visible_clouds.world_of(collection, depsgraph))
+
+
+def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allowed: float, extent: float) -> list[str]:
+    """Names of the clouds that are elsewhere before the first observed time than at it."""
+    names = []
+    for number, member in enumerate(members):
+        changes = [np.abs(matrices[number] - member.matrices[0]) for matrices in before]
+        if any(max(extent * change[:3, :3].max(), change[:3, 3].max()) > allowed for change in changes):
+            names.append(member.cloud.name)
+    return names
+
+
+def _members(collection: bpy.types.Collection) -> tuple[list[_Member], dict[int, tuple[str, int]]]:
+    """The clouds of a scene; copies of an object are objects of their own, whose names and originals come second."""
+    found, names = [], {}
+    clouds = [obj for obj in loaded_scenes.members(collection, "CLOUD") if obj.type == "POINTCLOUD"]
+    clouds.sort(key=lambda obj: (obj.r5dgs.start, len(obj.name), obj.name))
+    free = max([entry.object_id for entry in collection.r5dgs.table] + [0]) + 1
+    anchors: dict[tuple[int, int], list[bpy.types.Object | None]] = {}
+    copies: dict[tuple[int, bpy.types.Collection], int] = {}
+    for cloud in clouds:
+        state, anchor = cloud.r5dgs, _anchor(cloud)
+        rows = anchors.setdefault((state.start, state.count), [])
+        rows.append(anchor)
+        object_id, home = state.object_id, cloud.users_collection[0]
+        if object_id > 0 and len(rows) > 1:
+            if (object_id, home) not in copies:
+                copies[object_id, home] = free
+                names[free] = (home.name if home != collection else cloud.name, object_id)
+                free += 1
+            object_id = copies[object_id, home]
+        found.append(_Member(cloud, anchor, object_id))
+    return found, names
+
+
+def _anchor(cloud: bpy.types.Object) -> bpy.types.Object | None:
+    parent = cloud.parent
+    return parent if parent is not None and parent.r5dgs.role == "ANCHOR" else None
+
+
+def _look(
+    context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float, bind: bool
+) -> None:
+    """Note where clouds are at a frame, in the world of the file; at t_max where their anchors stand, too."""
+    depsgraph, back = _go_to(context, collection, frame)
+    for member in members:
+        member.matrices.append(back @ _matrix(member.cloud, depsgraph))
+        found = evaluated_points.of(member.cloud, depsgraph, collection.r5dgs.gaussians)
+        if found.edit is None or not found.edit.bent:
+            member.keys.add("" if found.edit is None else found.edit.key)
+        if bind:
+            member.points = found
+        if bind and member.anchor is not None:
+            member.pivot = (back @ _matrix(member.anchor, depsgraph))[:3, 3]
+            parent = member.anchor.parent
+            outer = np.eye(4) if parent is None else _matrix(parent, depsgraph)
+            linear = (back @ outer @ np.array(member.anchor.matrix_parent_inverse, np.float64))[:3, :3]
+            member.parent = np.eye(3) if np.abs(linear - np.eye(3)).max() < _STILL else linear
+
+
+def _matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:
+    return np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
+
+
+def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> list[edited_scene.Piece]:
+    """A cloud as what the core writes; nothing if nothing is left of it.
+
+    Args:
+        member: The cloud.
+        source: The scene, extended by edited points.
+        place: Where its points are there, if they were edited.
+    """
+    cloud, anchor, matrices = member.cloud, member.anchor, np.array(member.matrices)
+    bind = matrices[len(source.track_times) - 1]
+    start, count = cloud.r5dgs.start, cloud.r5dgs.count
+    if place is not None:
+        start, count, matrices = place.start, place.count, matrices @ place.matrix
+    if visible_clouds.flat([bind])[0]:  # scaled to nothing: nothing is left of it
+        return []
+    remembers = anchor is not None and physics.has_motion(anchor)
+    keys = physics.key_error(anchor)[0] if remembers else 0.0
+    model = physics.model(anchor) if remembers else None
+    return [
+        edited_scene.Piece(
+            name=cloud.name,
+            object_id=member.object_id,
+            motion_id=cloud.r5dgs.motion_id,
+            start=start,
+            count=count,
+            mover=cloud.name if anchor is None else anchor.name,
+            matrices=matrices,
+            pivot=member.pivot,
+            parent=member.parent,
+            model=model,
+            allowed=TOLERANCE * source.extent + KEY_SHARE * keys,
+            tint=object_tint.tint(cloud) if object_tint.is_tinted(cloud) else None,
+        )
+    ]
+
+
+def _table(
+    collection: bpy.types.Collection, source: Scene, members: list[_Member], copies: dict[int, tuple[str, int]]
+) -> dict[int, SceneObject]:
+    """Names, aliases, captions and colours of the objects as Blender has them now."""
+    colors = {item.id: item.color for item in source.objects}
+    tints = {member.object_id: object_tint.tint(member.cloud) for member in reversed(members)}
+    result = {}
+    current = object_names.names(collection)
+    for entry in collection.r5dgs.table:
+        aliases = tuple(alias.name for alias in entry.aliases if alias.name)
+        color = colors.get(entry.object_id, (0.5, 0.5, 0.5))
+        name = current.get(entry.object_id, entry.name) or f"object {entry.object_id}"
+        result[entry.object_id] = SceneObject(entry.object_id, name, aliases, entry.caption, color, 0, 0)
+    for object_id, (name, original) in copies.items():
+        if original in result:
+            result[object_id] = replace(result[original], id=object_id, name=name)
+    for object_id, tint in tints.items():
+        if object_id in result and tuple(tint) != object_tint.NONE:
+            color = np.clip(np.array(result[object_id].color) * tint, 0, 1)
+            result[object_id] = replace(result[object_id], color=tuple(color.tolist()))
+    return result
+
+
+def _rests(collection: bpy.types.Collection) -> bool:
+    """Whether the root only turns the scene's world to one of Blender's conventions."""
+    world = visible_clouds.world_of(collection)
+    turns = cameras.WORLD_TO_BLENDER.values()
+    return not world[:3, 3].any() and any(np.allclose(world[:3, :3], turn, atol=1e-5) for turn in turns)

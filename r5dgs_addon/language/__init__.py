@@ -1,0 +1,1 @@
+"""Select objects by prompt: prompt state, search and phrase embeddings."""

@@ -1,0 +1,1 @@
+"""Motion of loaded objects: F-curves, editable physics, extrapolation and the exact mode."""

@@ -1,0 +1,245 @@
+"""The motion of a group as F-curves of its anchor.
+
+In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and
+the knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys
+are taken from the motion model under the same tolerance; they are of another key type, and at t_max there may be a
+kink. A motion too fast for that gets a key at every frame, and its anchor is marked.
+"""
+
+import math
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core.motion import key_reduction as reduction
+from ...r5dgs_core.motion import rotations
+from ...r5dgs_core.motion.key_reduction import Curves, Keys
+from ...r5dgs_core.playback import scene_player
+from ...r5dgs_core.scene import row_runs
+from ...r5dgs_core.scene.scene import Scene
+from .. import compat
+from ..scene import timeline
+
+# Of the scene's size. Blender may differ from playback by 1e-5: its float32 evaluation takes a share too.
+TOLERANCE = 3e-6
+_PER_KNOT = 4  # intervals between possible keys: where even more are needed, the knots themselves are fewer
+NEAREST = 0.011  # frames between keys of a curve: Blender takes those that are nearer than 0.01 for one
+_INTERVALS = 1 << 17  # between possible keys of all objects together, so that no file blocks Blender for minutes
+OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
+
+
+def animate(
+    anchor: bpy.types.Object,
+    scene: Scene,
+    motion_id: int,
+    times: timeline.Times,
+    tolerance: float,
+    reach: float,
+) -> None:
+    """Key an anchor with the motion of its group; a group that stays put gets no keys.
+
+    Args:
+        anchor: Empty at the group's pivot, rotation mode quaternion; its action has no curves of location or rotation.
+        scene: The scene.
+        motion_id: The motion group.
+        times: Scene times and their frames.
+        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+        reach: Of the group, from `reaches`.
+    """
+    if motion_id == 0:
+        return
+    motion = curves(scene, motion_id, times, tolerance, reach)
+    anchor.r5dgs_motion.too_fast = not motion.followed
+    location, rotation = motion.location, motion.rotation
+    moves, turns = varies(location.values), varies(rotation.values)
+    if not (moves or turns):
+        return
+    fcurves = compat.own_fcurves(anchor, anchor.name)
+    if moves:
+        pivot = np.asarray(scene.groups[motion_id].pivot, np.float64)
+        placed = Keys(location.times, location.values + pivot, location.left_slopes, location.right_slopes)
+        write(fcurves, "location", placed, times)
+    if turns:
+        write(fcurves, "rotation_quaternion", rotation, times)
+
+
+def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float, reach: float) -> Curves:
+    """Keys of a motion group from the first knot to the end, over scene time.
+
+    Args:
+        scene: The scene.
+        motion_id: The motion group.
+        times: Scene times and their frames; nothing is extrapolated if the end is not past t_max.
+        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
+        reach: Of the group, from `reaches`.
+
+    Returns:
+        Displacement of the pivot and rotation, with a key at t_max unless they never change.
+    """
+    allowed = tolerance * scene.extent
+    observed = _observed(scene, motion_id, allowed, reach)
+    if times.t_end <= scene.t_max:
+        return observed
+    most = share(len(scene.groups))
+    sample = _future(scene, motion_id, most)
+    return reduction.join(observed, few(sample, scene.t_max, times, allowed, reach, most))
+
+
+def share(objects: int) -> int:
+    """Largest number of intervals between the keys of one of so many objects, for `few`."""
+    return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+
+
+def few(
+    sample: reduction.Sampler, start: float, times: timeline.Times, allowed: float, reach: float, most: int
+) -> Curves:
+    """Keys from a scene time to the end.
+
+    Args:
+        sample: Poses and slopes at scene times.
+        start: First time.
+        times: Scene times and their frames.
+        allowed: Error of reduced keys at the members, world units.
+        reach: Largest distance of a member from the pivot, world units.
+        most: Largest number of intervals between keys, from `share`.
+    """
+    frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
+    nearest = NEAREST / times.frames_per_unit
+    return reduction.reduce(sample, start, times.t_end, allowed, reach, nearest=nearest, frames=frames, most=most)
+
+
+def reaches(scene: Scene) -> np.ndarray:
+    """Largest distance of a member from the pivot of each motion group. [G] float64"""
+    result = np.zeros(len(scene.groups))
+    for start, stop, g in row_runs.runs(scene.motion_ids):
+        pivot = np.asarray(scene.groups[g].pivot, np.float64)
+        squares = np.zeros(stop - start)
+        for axis in range(3):  # a column at a time: numpy is slow at rows of three
+            arms = scene.means[start:stop, axis] - pivot[axis]
+            squares += arms * arms
+        result[g] = max(result[g], math.sqrt(float(squares.max())))
+    return result
+
+
+def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
+    """One key per knot, which is playback itself, or fewer keys where they hold the tolerance."""
+    times = np.asarray(scene.track_times, np.float64)
+    own = slice(motion_id, motion_id + 1)
+    quats, displacements = (values[0] for values in scene_player.knots(scene, own))
+    quat_slopes, displacement_slopes = (values[0] for values in scene_player.knot_slopes(scene, own))
+    exact = Curves(
+        Keys(times, displacements, displacement_slopes, displacement_slopes),
+        Keys(times, quats, quat_slopes, quat_slopes),
+    )
+    if len(times) < 2 or not _worth_reducing(exact, allowed, radius):
+        return exact
+
+    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        raw, raw_slopes = _cubic(exact.rotation, at)
+        moved, moved_slopes = _cubic(exact.location, at)
+        norm = np.linalg.norm(raw, axis=-1, keepdims=True)
+        unit = raw / norm
+        return unit, moved, (raw_slopes - unit * (unit * raw_slopes).sum(-1, keepdims=True)) / norm, moved_slopes
+
+    most = min(max(_PER_KNOT * len(times), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
+    fewer = reduction.reduce(sample, float(times[0]), float(times[-1]), allowed, radius, most=most)
+    if not fewer.followed:
+        return exact
+    return Curves(
+        *(
+            some if len(some.times) < len(times) else all_knots
+            for some, all_knots in ((fewer.location, exact.location), (fewer.rotation, exact.rotation))
+        )
+    )
+
+
+def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
+    """Whether some knot could go: the cubic across it, from its left neighbour to its right one, holds the tolerance.
+
+    Playback has a kink in its second derivative at each knot, so keys elsewhere do not help where no knot can go.
+    """
+    for keys, reach in ((exact.location, 1.0), (exact.rotation, 2.0 * radius)):
+        if len(keys.times) == 2 or not varies(keys.values):
+            return True
+        around = [slice(None, -2), slice(2, None)]
+        (t0, t1), (v0, v1) = ([a[part] for part in around] for a in (keys.times, keys.values))
+        m0, m1 = keys.right_slopes[around[0]], keys.left_slopes[around[1]]
+        h = (t1 - t0)[:, None]
+        worst = np.zeros(len(t0))
+        for u in (0.2, 0.4, 0.6, 0.8):
+            truth, _ = _cubic(keys, t0 + u * (t1 - t0))
+            # Quaternions that are e apart turn a point at radius r to places at most 2 r e apart, to first order.
+            worst = np.maximum(worst, reach * np.linalg.norm(reduction.hermite(v0, v1, m0, m1, h, u) - truth, axis=-1))
+        if (worst <= allowed).mean() > 0.05:
+            return True
+    return False
+
+
+def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
+    """Motion past t_max: the group's own model, or what it follows as `scene_player.group_poses` does."""
+    group = scene.groups[motion_id]
+    if group.follows is None or group.follow_matrix is None:
+        return reduction.model_sampler(group.model, scene.t_max, most)
+    leader = reduction.model_sampler(scene.groups[group.follows].model, scene.t_max, most)
+    follow = np.asarray(group.follow_matrix, np.float64)
+
+    def sample(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        _, displacements, _, velocities = leader(at)
+        quats = rotations.identity(len(at))
+        return quats, displacements @ follow.T, np.zeros_like(quats), velocities @ follow.T
+
+    return sample
+
+
+def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values and slopes of the cubic between keys, at times within them. [S] -> [S, C], [S, C]"""
+    k = np.clip(np.searchsorted(keys.times, at, side="right") - 1, 0, len(keys.times) - 2)
+    h = (keys.times[k + 1] - keys.times[k])[:, None]
+    u = (at - keys.times[k])[:, None] / h
+    start, stop, leave, arrive = keys.values[k], keys.values[k + 1], keys.right_slopes[k], keys.left_slopes[k + 1]
+    slopes = 6 * (u - u * u) * (stop - start) / h + (1 - 4 * u + 3 * u * u) * leave + (3 * u * u - 2 * u) * arrive
+    return reduction.hermite(start, stop, leave, arrive, h, u), slopes
+
+
+def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
+    """Write a curve as F-curves with Bezier keys and free handles; a component that never changes gets one key.
+
+    Args:
+        fcurves: Where they go; the keys of those of this path are replaced.
+        data_path: "location" or "rotation_quaternion".
+        curve: The keys.
+        times: Scene times and their frames.
+    """
+    bezier = compat.keyframe_enum("interpolation", "BEZIER")
+    free = compat.keyframe_enum("handle_left_type", "FREE")
+    kinds = {kind: compat.keyframe_enum("type", kind) for kind in (OBSERVED_KEY, EXTRAPOLATED_KEY)}
+    frames = times.frame(1.0) - times.frame(0.0)
+    for index in range(curve.values.shape[1]):
+        keep = slice(None) if varies(curve.values[:, index : index + 1]) else slice(0, 1)
+        t, value = curve.times[keep], curve.values[keep, index]
+        gaps = np.diff(t)
+        before = np.concatenate([gaps[:1], gaps]) if len(gaps) else np.ones(1)
+        after = np.concatenate([gaps, gaps[-1:]]) if len(gaps) else np.ones(1)
+        frame = times.frame(0.0) + frames * t
+        left = np.stack([frame - frames * before / 3, value - curve.left_slopes[keep, index] * before / 3], axis=-1)
+        right = np.stack([frame + frames * after / 3, value + curve.right_slopes[keep, index] * after / 3], axis=-1)
+        kind = np.where(t > times.t_max + 1e-9, kinds[EXTRAPOLATED_KEY], kinds[OBSERVED_KEY])
+        fcurve = fcurves.find(data_path, index=index) or fcurves.new(data_path, index=index)
+        points = fcurve.keyframe_points
+        for k in range(len(points) - 1, -1, -1):
+            points.remove(points[k], fast=True)
+        points.add(len(t))
+        count = len(t)
+        points.foreach_set("interpolation", np.full(count, bezier, np.int32))
+        points.foreach_set("handle_left_type", np.full(count, free, np.int32))
+        points.foreach_set("handle_right_type", np.full(count, free, np.int32))
+        points.foreach_set("type", kind.astype(np.int32))
+        points.foreach_set("co", np.stack([frame, value], axis=-1).astype(np.float32).ravel())
+        points.foreach_set("handle_left", left.astype(np.float32).ravel())
+        points.foreach_set("handle_right", right.astype(np.float32).ravel())
+        fcurve.update()
+
+
+def varies(values: np.ndarray) -> bool:
+    """Whether a curve changes. [K, C]"""
+    return bool((values != values[:1]).any())

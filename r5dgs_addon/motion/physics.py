@@ -1,0 +1,402 @@
+"""How an anchor moves past t_max as numbers that a person can edit, and what was learned, kept in the .blend whole.
+
+Rates are stored per unit of scene time, as the core has them, and shown per second of Blender's time. Fields that were
+not touched keep the precision of the file: a rate counts as edited where it differs from the learned one in float32.
+Vectors are along the axes of the anchor's parent, those of its location.
+"""
+
+import contextlib
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, PointerProperty, StringProperty
+
+from ...r5dgs_core import errors
+from ...r5dgs_core.motion import confidence, free_top, models, rotations
+from ...r5dgs_core.motion.models import MotionModel
+from ...r5dgs_core.scene.scene import Scene
+from ..scene import timeline
+from ..ui import plural
+from . import fcurves
+
+KINDS = (
+    ("static", "Still", "Stays where it is"),
+    ("translation", "Slide", "Moves without turning; with a swing, to and fro as on a spring"),
+    (
+        "ballistic_spin",
+        "Throw and Spin",
+        "Its center flies and it spins about that; a hinge or a pendulum where the center lies on the axis and rests",
+    ),
+    ("constant_twist", "Screw", "Turns steadily and moves along with its own axes"),
+    ("world_twist", "Orbit", "Turns about a place in the world, with steadily changing rates"),
+    ("free_top", "Tumble", "Flies and spins freely, as a body of its shape does that nothing touches"),
+)
+RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")
+FIELDS = {  # beside the point and the axis that it turns about, `pivot`
+    "static": (),
+    "translation": ("velocity", "acceleration", "frequency"),
+    "ballistic_spin": RATES[:4] + ("frequency",),
+    "constant_twist": ("velocity", "angular_velocity"),
+    "world_twist": RATES[:4],
+    "free_top": ("velocity", "acceleration", "angular_velocity"),
+}
+_POWERS = {"velocity": 1, "acceleration": 2, "angular_velocity": 1, "angular_acceleration": 2, "frequency": 1}
+_re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by the service above this module
+_LEAST_MOMENT = 1e-3  # of the largest moment of inertia: what a flat or thin body is given
+
+
+def units_per_second(state: bpy.types.PropertyGroup) -> float:
+    """Units of scene time that pass in a second of Blender's time."""
+    render = bpy.context.scene.render
+    return render.fps / render.fps_base / state.frames_per_unit
+
+
+def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
+    """Re-extrapolate an anchor whose fields have changed if its user wants that: their ``update``."""
+    if state.at_once and _re_extrapolate is not None:
+        with contextlib.suppress(errors.R5dgsError):  # the panel says why
+            _re_extrapolate([state.id_data])
+
+
+def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | None) -> None:
+    """Set the function that `write_at_once` calls with the anchor, None for no function."""
+    global _re_extrapolate
+    _re_extrapolate = re_extrapolate
+
+
+def _vector(name: str):
+    """Getter and setter of a vector in Blender's units."""
+    power = _POWERS.get(name, 0)
+
+    def read(state):
+        factor = units_per_second(state) ** power
+        return [factor * value for value in getattr(state, f"stored_{name}")]
+
+    def write(state, values):
+        factor = units_per_second(state) ** power
+        setattr(state, f"stored_{name}", [value / factor for value in values])
+
+    return {"get": read, "set": write, "size": 3, "update": write_at_once, "options": set()}
+
+
+def _read_swing(state):
+    return state.stored_frequency * units_per_second(state) / math.tau
+
+
+def _write_swing(state, value):
+    state.stored_frequency = max(value, 0.0) * math.tau / units_per_second(state)
+
+
+def _stored(**options):
+    return FloatVectorProperty(size=3, options={"HIDDEN"}, **options)
+
+
+class R5DGS_PG_motion(bpy.types.PropertyGroup):
+    """The motion of an anchor past the last observed time."""
+
+    learned: StringProperty(name="Learned Motion", description="The motion of the scene file, as JSON", options=set())
+    taken: StringProperty(name="Taken Motion", description="That of the object it was taken from", options={"HIDDEN"})
+    written: StringProperty(name="Written Keys", description="Digest of the keys written last", options={"HIDDEN"})
+    frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
+    written_motion: StringProperty(name="Written Motion", description="Digest of its motion", options={"HIDDEN"})
+    too_fast: BoolProperty(
+        name="Too Fast for Keys",
+        description="The motion turns or swings too fast for keys, which are exact only at frames",
+        options={"HIDDEN"},
+    )
+    at_once: BoolProperty(
+        name="Write at Once", description="Re-extrapolate whenever a number is changed here", options=set()
+    )
+    kind: EnumProperty(
+        name="Motion", description="How the object moves on", items=KINDS, update=write_at_once, options=set()
+    )
+    stored_velocity: _stored()
+    stored_acceleration: _stored()
+    stored_angular_velocity: _stored()
+    stored_angular_acceleration: _stored()
+    stored_center_offset: _stored()
+    stored_frequency: FloatProperty(options={"HIDDEN"})
+    stored_pivot: _stored()  # point chosen on an axis, seen from the anchor
+    velocity: FloatVectorProperty(
+        name="Velocity",
+        description="Velocity at the last observed time, per second, along the axes of the parent",
+        subtype="VELOCITY",
+        **_vector("velocity"),
+    )
+    acceleration: FloatVectorProperty(
+        name="Acceleration",
+        description="How the velocity changes, per second and second",
+        subtype="ACCELERATION",
+        **_vector("acceleration"),
+    )
+    angular_velocity: FloatVectorProperty(
+        name="Spin /s",
+        description="Rotation vector per second: the axis, as long as the angle",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("angular_velocity"),
+    )
+    angular_acceleration: FloatVectorProperty(
+        name="Spin /s²",
+        description="How the spin changes, per second and second",
+        subtype="EULER",
+        unit="ROTATION",
+        **_vector("angular_acceleration"),
+    )
+    center_offset: FloatVectorProperty(
+        name="Center",
+        description="The point that flies or rests while the object spins about it, seen from the anchor",
+        subtype="TRANSLATION",
+        unit="LENGTH",
+        **_vector("center_offset"),
+    )
+    frequency: FloatProperty(
+        name="Swings /s",
+        description="How often a second the motion swings to and fro; 0 moves steadily",
+        get=_read_swing,
+        set=_write_swing,
+        update=write_at_once,
+        options=set(),
+    )
+    learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
+    tube: PointerProperty(
+        name="Confidence", description="Helper that shows how sure the path is", type=bpy.types.Object, options=set()
+    )
+    leader: PointerProperty(
+        name="Follows",
+        description="The anchor whose path this one takes after the last observed time, as a shadow does; "
+        "none to move by numbers of its own",
+        type=bpy.types.Object,
+        poll=lambda state, obj: obj.r5dgs.role == "ANCHOR" and obj != state.id_data,
+        options=set(),
+    )
+
+
+def remember(
+    anchors: dict[tuple[int, int], bpy.types.Object],
+    scene: Scene,
+    times: timeline.Times,
+    tolerance: float,
+    reaches: np.ndarray,
+) -> None:
+    """Keep the learned motions of a scene on its anchors, so that editing them needs no scene file.
+
+    Args:
+        anchors: Anchors by object id and motion id; the object id is 0 unless the motion id is.
+        scene: The scene.
+        times: Its times.
+        tolerance: Error of the keys, fraction of the scene's size.
+        reaches: Of its motion groups, from `keyframes.reaches`. [G]
+    """
+    extent = scene.extent
+    for (_, motion_id), anchor in anchors.items():
+        group = scene.groups[motion_id]
+        leader = anchors.get((0, group.follows)) if group.follows else None
+        state = anchor.r5dgs_motion
+        state.learned = json.dumps(
+            {
+                "model": group.model.to_dict(),
+                "follow_matrix": None if group.follow_matrix is None else np.asarray(group.follow_matrix).tolist(),
+                "reach": float(reaches[motion_id]) if motion_id else 0.0,
+                "allowed": tolerance * extent,
+            }
+        )
+        state.frames_per_unit = scene.frames_per_unit
+        state.leader = state.learned_leader = leader
+        show(state, group.model)
+        sign(anchor, times)
+
+
+def sign(anchor: bpy.types.Object, times: timeline.Times) -> None:
+    """Remember what the keys past t_max are and what motion they have, for `hand_edited` and `is_written`."""
+    place = fcurves.place(anchor)
+    anchor.r5dgs_motion.written = fcurves.digest(place, times.frame(times.t_max))
+    anchor.r5dgs_motion.written_motion = _digest(anchor)
+
+
+def is_written(anchor: bpy.types.Object) -> bool:
+    """Whether the keys past t_max were written from the motion that the fields describe now."""
+    return anchor.r5dgs_motion.written_motion == _digest(anchor)
+
+
+def _digest(anchor: bpy.types.Object) -> str:
+    state = anchor.r5dgs_motion
+    fields = [list(getattr(state, f"stored_{name}")) for name in RATES]
+    leader = state.leader.name if follow_matrix(state) is not None else ""
+    text = json.dumps([state.taken, state.kind, *fields, state.stored_frequency, leader])
+    return hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
+
+
+def hand_edited(anchor: bpy.types.Object, times: timeline.Times) -> bool:
+    """Whether the keys past t_max are others than those written last.
+
+    Raises:
+        ConfigError: Its curves cannot be read.
+    """
+    place = fcurves.place(anchor)
+    return fcurves.digest(place, times.frame(times.t_max)) != anchor.r5dgs_motion.written
+
+
+def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
+    """Warning that names the anchors whose motion keys cannot follow, or "" if there are none."""
+    names = [anchor.name for anchor in anchors if anchor.r5dgs_motion.too_fast]
+    if not names:
+        return ""
+    return (
+        f"Too fast for keys, which are exact only at frames: {plural.names(names)}; take smaller rates under Motion, "
+        "or train with more frames per unit of time"
+    )
+
+
+def has_motion(anchor: bpy.types.Object) -> bool:
+    """Whether an anchor remembers a learned motion."""
+    return bool(anchor.r5dgs_motion.learned)
+
+
+def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
+    """Set the fields of an anchor to a motion."""
+    state.kind = model.kind
+    for name in RATES:
+        setattr(state, f"stored_{name}", getattr(model, name))
+    state.stored_frequency = model.frequency
+    state.stored_pivot = (0.0, 0.0, 0.0)
+
+
+def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
+    """Give an anchor the motion of another that follows nobody; what it learned itself stays remembered.
+
+    Args:
+        source: The anchor that has the motion.
+        target: The anchor that gets it.
+        turn: How the target is turned against the source in its own frame, unit wxyz. [4]
+    """
+    giver, taker = source.r5dgs_motion, target.r5dgs_motion
+    base = basis(giver)
+    if base.inertia is not None:  # that of the source in the world, seen from the target
+        back = rotations.quats_to_rotmats(rotations.conjugate(turn))
+        base = replace(base, inertia=back @ base.inertia @ back.T)
+    taker.taken = json.dumps(base.to_dict())
+    taker.kind, taker.leader = giver.kind, None
+    for name in (*RATES, "frequency", "pivot"):
+        setattr(taker, f"stored_{name}", getattr(giver, f"stored_{name}"))
+
+
+def reset(anchor: bpy.types.Object) -> None:
+    """Bring the fields of an anchor back to the learned motion."""
+    state = anchor.r5dgs_motion
+    state.taken = ""
+    show(state, basis(state))
+    state.leader = state.learned_leader
+
+
+def basis(state: bpy.types.PropertyGroup) -> MotionModel:
+    """What the fields were set to before anybody edited them: the motion of the scene file, or one that was taken."""
+    if state.taken:
+        return MotionModel.from_dict(json.loads(state.taken))
+    return MotionModel.from_dict(json.loads(state.learned)["model"]) if state.learned else models.STATIC
+
+
+def edited(state: bpy.types.PropertyGroup) -> set[str]:
+    """Fields of the motion that differ from its `basis`."""
+    model = basis(state)
+    stored = {name: np.array(getattr(state, f"stored_{name}"), np.float32) for name in (*RATES, "frequency")}
+    found = {name for name, value in stored.items() if (value != np.float32(getattr(model, name))).any()}
+    return found | ({"kind"} if state.kind != model.kind else set())
+
+
+def model(anchor: bpy.types.Object) -> MotionModel:
+    """The motion of an anchor as its fields have it now, relative to its pose at t_max.
+
+    A learned motion blends from the last observed pose, which is noisy, onto the path that was fitted to all of them.
+    An edited one starts with exactly the rates that are shown. Edited rates count as certain: the covariance speaks of
+    the others.
+
+    Raises:
+        ConfigError: A field is no number that a motion can have.
+    """
+    state = anchor.r5dgs_motion
+    base, changed = basis(state), edited(state)
+    values = {name: np.array(getattr(state, f"stored_{name}"), np.float64) for name in RATES if name in changed}
+    if "frequency" in changed:
+        values["frequency"] = state.stored_frequency
+    if changed:
+        values.update(offset_rotvec=np.zeros(3), offset_displacement=np.zeros(3))
+    if "kind" in changed:
+        values.update(kind=state.kind, inertia=inertia(anchor) if state.kind == "free_top" else None)
+    try:
+        return confidence.without(replace(base, **values), changed)
+    except ValueError as error:
+        raise errors.ConfigError(f"{anchor.name}: {error}") from error
+
+
+def inertia(anchor: bpy.types.Object) -> np.ndarray:
+    """Inertia of the points that an anchor carries, about their centre, bind state; up to a factor. [3, 3]"""
+    points = _points(anchor)
+    if len(points) == 0:
+        return np.eye(3) / 3
+    body = free_top.inertia(points)
+    return body + _LEAST_MOMENT * float(np.linalg.eigvalsh(body)[-1]) * np.eye(3)
+
+
+def allow(anchor: bpy.types.Object, error: float) -> None:
+    """Set the allowed error of an anchor's keys, in scene units."""
+    kept = json.loads(anchor.r5dgs_motion.learned)
+    anchor.r5dgs_motion.learned = json.dumps({**kept, "allowed": error})
+
+
+def size(anchor: bpy.types.Object) -> float:
+    """The size of what an anchor carries: twice the radius that its learned motion was weighed with, scene units."""
+    kept = json.loads(anchor.r5dgs_motion.learned)
+    return 2.0 * (kept["model"]["radius"] if kept["reach"] else key_error(anchor)[1])
+
+
+def _points(anchor: bpy.types.Object) -> np.ndarray:
+    """Centres of the Gaussians that an anchor carries, bind state. [n, 3] float64"""
+    parts = [np.zeros((0, 3))]
+    for cloud in anchor.children:
+        if cloud.r5dgs.role == "CLOUD" and cloud.type == "POINTCLOUD":
+            points = np.empty(3 * len(cloud.data.points), np.float32)
+            cloud.data.attributes["position"].data.foreach_get("vector", points)
+            parts.append(points.reshape(-1, 3))
+    return np.concatenate(parts).astype(np.float64)
+
+
+def key_error(anchor: bpy.types.Object) -> tuple[float, float]:
+    """Allowed error of an anchor's keys and the largest distance of its points from it, both in scene units."""
+    kept = json.loads(anchor.r5dgs_motion.learned)
+    return kept["allowed"], kept["reach"] or _reach(anchor)
+
+
+def _reach(anchor: bpy.types.Object) -> float:
+    points = _points(anchor) - np.array(anchor.r5dgs.pivot, np.float64)
+    return float(np.linalg.norm(points, axis=-1).max(initial=0.0))
+
+
+def follow_matrix(state: bpy.types.PropertyGroup) -> np.ndarray | None:
+    """Linear map from the leader's displacement to this anchor's, or None where it follows nobody. [3, 3]"""
+    if state.leader is None:
+        return None
+    matrix = json.loads(state.learned)["follow_matrix"]
+    return np.eye(3) if matrix is None else np.array(matrix, np.float64)
+
+
+def mover(anchor: bpy.types.Object) -> bpy.types.Object:
+    """The anchor whose motion moves an anchor: the one that it follows, or itself."""
+    return anchor.r5dgs_motion.leader or anchor
+
+
+def register():
+    """Register the group and hang it on objects."""
+    bpy.utils.register_class(R5DGS_PG_motion)
+    bpy.types.Object.r5dgs_motion = PointerProperty(type=R5DGS_PG_motion)
+
+
+def unregister():
+    """Undo `register`."""
+    del bpy.types.Object.r5dgs_motion
+    bpy.utils.unregister_class(R5DGS_PG_motion)

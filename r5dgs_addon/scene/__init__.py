@@ -1,0 +1,1 @@
+"""Loaded scenes in Blender: collections, point clouds, object names, display and selection."""

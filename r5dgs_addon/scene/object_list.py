@@ -1,0 +1,80 @@
+"""What a row of the objects list shows of an object, and what editing the row does: functions of properties.
+
+A row is an entry of the table; an object may have several clouds, and all of them are changed together.
+"""
+
+import bpy
+import numpy as np
+
+from . import object_names, object_tint, point_clouds, selection
+
+GREY = (0.5, 0.5, 0.5)
+
+
+def label(entry: bpy.types.PropertyGroup) -> str:
+    """The object's name."""
+    return object_names.name_of(entry)
+
+
+def set_label(entry: bpy.types.PropertyGroup, name: str) -> None:
+    """Rename the object; a name that cannot be had changes nothing."""
+    if name.strip() and entry.id_data.library is None:
+        object_names.rename(entry.id_data, entry.object_id, name)
+
+
+def color(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
+    """The object's colour in viewports, display-referred: its tint's where it has one, else the table's."""
+    own = object_names.clouds(entry.id_data, entry.object_id)
+    return tuple(point_clouds.linear_to_srgb(np.array(own[0].color[:3])).tolist()) if own else GREY
+
+
+def set_color(entry: bpy.types.PropertyGroup, value) -> None:
+    """Tint the object."""
+    object_tint.recolor(object_names.clouds(entry.id_data, entry.object_id), value)
+
+
+def tint(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
+    """The object's tint."""
+    own = object_names.clouds(entry.id_data, entry.object_id)
+    return tuple(own[0].r5dgs_look.tint) if own else object_tint.NONE
+
+
+def is_hidden(entry: bpy.types.PropertyGroup) -> bool:
+    """Whether all of it is hidden in the view layer."""
+    layer = bpy.context.view_layer
+    return all(cloud.hide_get(view_layer=layer) for cloud in object_names.clouds(entry.id_data, entry.object_id))
+
+
+def set_hidden(entry: bpy.types.PropertyGroup, hide: bool) -> None:
+    """Hide or show all of it in the view layer."""
+    layer = bpy.context.view_layer
+    for cloud in object_names.clouds(entry.id_data, entry.object_id):
+        if cloud in layer.objects.values():
+            cloud.hide_set(hide, view_layer=layer)
+
+
+def is_hidden_in_renders(entry: bpy.types.PropertyGroup) -> bool:
+    """Whether all of it is left out of renders."""
+    return all(cloud.hide_render for cloud in object_names.clouds(entry.id_data, entry.object_id))
+
+
+def set_hidden_in_renders(entry: bpy.types.PropertyGroup, hide: bool) -> None:
+    """Leave all of it out of renders, or not."""
+    for cloud in object_names.clouds(entry.id_data, entry.object_id):
+        if cloud.library is None:
+            cloud.hide_render = hide
+
+
+def active_row(state: bpy.types.PropertyGroup) -> int:
+    """Row of the active object in its scene's list; -1 where it is of none."""
+    active = bpy.context.view_layer.objects.active
+    found = selection.owner([state.id_data], active) if active is not None else None
+    ids = [entry.object_id for entry in state.table]
+    return ids.index(found[1]) if found is not None and found[1] in ids else -1
+
+
+def set_active_row(state: bpy.types.PropertyGroup, row: int) -> None:
+    """Select the object of a row, and no other."""
+    context = bpy.context
+    if 0 <= row < len(state.table) and not selection.obstacle(context):
+        selection.select(context, [(state.id_data, state.table[row].object_id)], "SET")

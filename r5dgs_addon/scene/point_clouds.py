@@ -1,0 +1,189 @@
+"""Gaussians as attributes of a point cloud, under the names that Blender 5.3 draws as splats, and their material."""
+
+import ctypes
+import hashlib
+
+import bpy
+import numpy as np
+
+from ...r5dgs_core.scene import spherical_harmonics
+from ...r5dgs_core.scene.scene import Scene
+from .. import compat
+
+# A colour attribute named exactly `color` renders black in Cycles, hence this name.
+DISPLAY_COLOR = "display_color"
+ROW = "gaussian"
+HARMONICS = "radiance:sh_"
+BIND = "bind_state:"  # prefix of the attributes that Exact Mode keeps of what it overwrites
+_FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
+_BLOCK = 2048
+# Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
+DISPLAY_SIGMAS = 1.2
+LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
+
+
+def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Display-referred sRGB in [0, 1] to linear light, as Blender's colours are. Any shape."""
+    srgb = np.clip(srgb, 0.0, 1.0)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] to display-referred sRGB. Any shape."""
+    linear = np.clip(linear, 0.0, 1.0)
+    return np.where(linear <= 0.04045 / 12.92, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, sh_degree: int) -> None:
+    """Write Gaussians to a point cloud of as many points.
+
+    Attributes: `position`; `scale` (standard deviations) and `rotation` (wxyz); `radiance:base` (degree-0 coefficients
+    and opacity) and `radiance:sh_<k>` (the others), as trained: display-referred; `object_id`; `gaussian`, the row in
+    the scene file, which a point keeps when others are deleted; and for display `radius` and `display_color` (linear).
+
+    Args:
+        cloud: The point cloud.
+        scene: The scene.
+        rows: Its rows to write.
+        extent: The scene's size.
+        sh_degree: Highest degree of the coefficients to write, at most 3.
+    """
+    sh = scene.sh[rows]
+    log_scales = scene.log_scales[rows]
+    opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
+    base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
+    shown = srgb_to_linear(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64))
+    radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
+    radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
+    written = {
+        "position": _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows]),
+        "radius": _write(cloud, "radius", "FLOAT", "value", radii),
+        "scale": _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales)),
+        "rotation": _write(cloud, "rotation", "QUATERNION", "value", scene.quats[rows]),
+        "radiance:base": _write(cloud, "radiance:base", "FLOAT_COLOR", "color", base),
+        ROW: _write(cloud, ROW, "INT", "value", np.arange(rows.start, rows.stop), np.int32),
+    }
+    for k, plane in enumerate(_planes(sh[:, 1 : (sh_degree + 1) ** 2])):
+        written[f"{HARMONICS}{k}"] = _write(cloud, f"{HARMONICS}{k}", "FLOAT_VECTOR", "vector", plane)
+    cloud[_FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
+    _write(cloud, "object_id", "INT", "value", scene.object_ids[rows], np.int32)
+    _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
+    compat.make_gaussian_splat(cloud)
+    cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
+
+
+def fingerprint(values: np.ndarray) -> str:
+    """Return a digest of an array's bytes that any edit changes; far quicker than a cryptographic one."""
+    data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+    cut = len(data) // (8 * _BLOCK) * 8 * _BLOCK
+    blocks = data[:cut].view(np.uint64).reshape(-1, _BLOCK)
+    digest = hashlib.blake2b(str(len(data)).encode(), digest_size=16)
+    for part in (blocks.sum(0, dtype=np.uint64), blocks.sum(1, dtype=np.uint64), data[cut:]):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def fingerprints(cloud: bpy.types.PointCloud) -> dict[str, str]:
+    """Return the fingerprints of the attributes that a point cloud was filled with, by name; none of older files."""
+    stored = cloud.get(_FINGERPRINTS)
+    return {} if stored is None else stored.to_dict()
+
+
+def attribute(cloud: bpy.types.PointCloud, name: str, kind: str) -> bpy.types.Attribute | None:
+    """Return an attribute of the points, or None if it is missing or of another type."""
+    found = cloud.attributes.get(name)
+    return found if found is not None and found.data_type == kind and found.domain == "POINT" else None
+
+
+def read(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.float32) -> np.ndarray:
+    """Return the values of an attribute. [n, width]"""
+    values = np.empty(len(source.data) * width, dtype)
+    source.data.foreach_get(field, values)
+    return values.reshape(-1, width)
+
+
+def view(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.float32) -> np.ndarray:
+    """Return the values of an attribute without copying them where Blender keeps them in one piece. [n, width]
+
+    The array is valid until Blender changes the attribute; do not write to it.
+    """
+    count, size = len(source.data), width * np.dtype(dtype).itemsize
+    if count == 0:
+        return np.empty((0, width), dtype)
+    first = source.data[0].as_pointer()
+    if source.data[count - 1].as_pointer() - first != (count - 1) * size:
+        return read(source, field, width, dtype)
+    buffer = (ctypes.c_char * (count * size)).from_address(first)
+    return np.frombuffer(buffer, dtype).reshape(count, width)
+
+
+def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
+    """Write `display_color` of a filled point cloud anew: its own colours times a tint.
+
+    Args:
+        cloud: The point cloud; one without `radiance:base` is left as it is.
+        tint: Factors on display-referred sRGB. [3]
+    """
+    stored = cloud.attributes.get("radiance:base")
+    if stored is None:
+        return
+    base = np.empty(4 * len(cloud.points), np.float32)
+    stored.data.foreach_get("color", base)
+    colors = base.reshape(-1, 4).astype(np.float64)
+    colors[:, :3] = srgb_to_linear(tint * (0.5 + spherical_harmonics.C0 * colors[:, :3]))
+    _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", colors)
+    cloud.update_tag()
+
+
+def material(name: str) -> bpy.types.Material:
+    """A material that shows `display_color` as it is, without light."""
+    result = bpy.data.materials.new(name)
+    nodes = compat.empty_nodes(result)
+    _, emission, output = _emission(nodes, "GEOMETRY")
+    nodes.links.new(emission.outputs["Emission"], output.inputs["Surface"])
+    return result
+
+
+def instance_material(name: str) -> bpy.types.Material:
+    """As `material`, for instances on the points; as opaque as the Gaussian."""
+    result = bpy.data.materials.new(name)
+    nodes = compat.empty_nodes(result)
+    attribute, emission, output = _emission(nodes, "INSTANCER")
+    clear, mix = nodes.nodes.new("ShaderNodeBsdfTransparent"), nodes.nodes.new("ShaderNodeMixShader")
+    clear.location, mix.location = (-150, 150), (50, 0)
+    output.location = (250, 0)
+    nodes.links.new(attribute.outputs["Alpha"], mix.inputs[0])
+    nodes.links.new(clear.outputs[0], mix.inputs[1])
+    nodes.links.new(emission.outputs[0], mix.inputs[2])
+    nodes.links.new(mix.outputs[0], output.inputs["Surface"])
+    return result
+
+
+def _emission(tree: bpy.types.NodeTree, source: str) -> list[bpy.types.Node]:
+    """Nodes attribute, emission and output, the first two linked."""
+    kinds = ("ShaderNodeAttribute", "ShaderNodeEmission", "ShaderNodeOutputMaterial")
+    attribute, emission, output = (tree.nodes.new(kind) for kind in kinds)
+    attribute.attribute_type, attribute.attribute_name = source, DISPLAY_COLOR
+    attribute.location, emission.location, output.location = (-400, 0), (-150, 0), (50, 0)
+    tree.links.new(attribute.outputs["Color"], emission.inputs["Color"])
+    return [attribute, emission, output]
+
+
+def _planes(sh: np.ndarray) -> np.ndarray:
+    """Coefficients by themselves, some thousand Gaussians at a time so that the processor's cache holds them.
+
+    [N, K, 3] -> [K, N, 3]
+    """
+    count, bases, _ = sh.shape
+    result = np.empty((bases, count, 3), np.float32)
+    for start in range(0, count, 4096):
+        result[:, start : start + 4096] = sh[start : start + 4096].swapaxes(0, 1)
+    return result
+
+
+def _write(cloud, name: str, kind: str, field: str, values: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """Write an attribute, made if it is missing. Returns the values in the attribute's own type."""
+    attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
+    values = np.ascontiguousarray(values, dtype)
+    attribute.data.foreach_set(field, values.ravel())
+    return values

@@ -1,0 +1,108 @@
+"""Stand-ins for Gaussians in viewports that do not draw splats: points, or an ellipsoid for each by geometry nodes.
+
+Points are quick at any number. Ellipsoids show size, direction and opacity as they are, at a price; they are
+instances that a modifier of the point cloud makes. The modifier passes the points on with a radius of 0, so that the
+evaluated cloud still has them.
+"""
+
+import bpy
+
+from . import point_clouds
+
+POINTS, ELLIPSOIDS = "POINTS", "ELLIPSOIDS"
+ITEMS = (
+    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; quick"),
+    (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, direction and opacity; slow above 100,000"),
+)
+MODIFIER = "R5DGS Ellipsoids"
+SIGMAS = 1.5  # half axes of an ellipsoid, in standard deviations
+JOIN = "GeometryNodeJoinGeometry"
+SUBDIVISIONS = 2  # of the icosphere: 80 faces
+
+
+def show(collection: bpy.types.Collection, display: str) -> None:
+    """Have all clouds of a loaded scene shown in one way.
+
+    Args:
+        collection: A loaded scene of this .blend file.
+        display: One of `ITEMS`.
+    """
+    every = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD" and obj.library is None]
+    present = [(cloud, cloud.modifiers.get(MODIFIER)) for cloud in every]
+    used = {found.node_group for _, found in present if found is not None and found.node_group is not None}
+    if display == ELLIPSOIDS:
+        current = [found.node_group for cloud, found in present if found is not None and not hides_points(cloud)]
+        tree = next(filter(None, current), None) or _tree(point_clouds.instance_material(MODIFIER))
+        for cloud, found in present:
+            (found or cloud.modifiers.new(MODIFIER, "NODES")).node_group = tree
+        for old in used - {tree}:
+            _forget(old)
+    else:
+        for cloud, found in present:
+            if found is not None:
+                cloud.modifiers.remove(found)
+        for tree in used:
+            _forget(tree)
+    collection.r5dgs.display = display
+
+
+def hides_points(cloud: bpy.types.Object) -> bool:
+    """Return True if a cloud has ellipsoids of a version that did not pass the points on."""
+    found = cloud.modifiers.get(MODIFIER)
+    tree = None if found is None else found.node_group
+    return tree is not None and not any(node.bl_idname == JOIN for node in tree.nodes)
+
+
+def _forget(tree: bpy.types.NodeTree) -> None:
+    """Remove a tree and its materials where nothing uses them any more."""
+    if tree.users or tree.library is not None:
+        return
+    made = [node.inputs["Material"].default_value for node in tree.nodes if node.bl_idname == "GeometryNodeSetMaterial"]
+    bpy.data.node_groups.remove(tree)
+    for material in made:
+        if material is not None and not material.users:
+            bpy.data.materials.remove(material)
+
+
+def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Geometry nodes that put an ellipsoid on every point, by its attributes `scale` and `rotation`."""
+    tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
+    for in_out in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
+    entry, sphere, painted, scale, rotation, instances, hidden, join, leave = (
+        tree.nodes.new(kind)
+        for kind in (
+            "NodeGroupInput",
+            "GeometryNodeMeshIcoSphere",
+            "GeometryNodeSetMaterial",
+            "GeometryNodeInputNamedAttribute",
+            "GeometryNodeInputNamedAttribute",
+            "GeometryNodeInstanceOnPoints",
+            "GeometryNodeSetPointRadius",
+            JOIN,
+            "NodeGroupOutput",
+        )
+    )
+    for column, nodes in enumerate(
+        ((entry, sphere, scale, rotation), (painted,), (instances, hidden), (join,), (leave,))
+    ):
+        for row, node in enumerate(nodes):
+            node.location = (220 * column, -180 * row)
+    sphere.inputs["Radius"].default_value = SIGMAS
+    sphere.inputs["Subdivisions"].default_value = SUBDIVISIONS
+    painted.inputs["Material"].default_value = material
+    for node, attribute, kind in ((scale, "scale", "FLOAT_VECTOR"), (rotation, "rotation", "QUATERNION")):
+        node.data_type = kind
+        node.inputs["Name"].default_value = attribute
+    tree.links.new(entry.outputs[0], instances.inputs["Points"])
+    tree.links.new(sphere.outputs["Mesh"], painted.inputs["Geometry"])
+    tree.links.new(painted.outputs["Geometry"], instances.inputs["Instance"])
+    for node, socket in ((scale, "Scale"), (rotation, "Rotation")):
+        output = next(out for out in node.outputs if out.enabled and out.name == "Attribute")
+        tree.links.new(output, instances.inputs[socket])
+    hidden.inputs["Radius"].default_value = 0.0
+    tree.links.new(entry.outputs[0], hidden.inputs[0])
+    for made in (instances, hidden):
+        tree.links.new(made.outputs[0], join.inputs[0])
+    tree.links.new(join.outputs[0], leave.inputs[0])
+    return tree

@@ -1,0 +1,1 @@
+"""Parts shared by operators and panels: stepwise operators, status bar and plurals."""

@@ -1,0 +1,277 @@
+"""The process that runs the worker, and what is said to it and by it.
+
+The protocol is that of `r5dgs_core.worker.server`: a JSON line each way, and after an answer's line the raw bytes that
+it announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that
+dies, hangs or talks nonsense is dropped with a clear error.
+
+The Python may be a wrapper script whose child does the work and keeps the pipes open. So the whole process group is
+ended, and a pipe is closed only by the thread that uses it: closing it elsewhere would wait for that thread's lock.
+"""
+
+import base64
+import collections
+import contextlib
+import json
+import logging
+import os
+import queue
+import signal
+import subprocess
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...r5dgs_core import errors
+from .. import find_python, preferences
+from ..process_group import ProcessGroup
+
+if TYPE_CHECKING:
+    from ..scene import evaluated_points
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = preferences.ENVIRONMENT
+STDERR_LINES = 12
+LAST_WORDS_S = 0.5  # after a worker's death, for what its pipes still hold
+REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
+COMPILING = "preparing the rasterizer (first use, about 10 s)"
+
+log = logging.getLogger(__name__)
+
+
+class Worker:
+    """One running worker process; `greet` it before the first request.
+
+    Args:
+        python: Path of the Python to run it with.
+
+    Raises:
+        BackendError: It cannot be started.
+    """
+
+    def __init__(self, python: str):
+        self.python = python
+        self.hello: dict[str, Any] = {}
+        self.notice = ""  # what pictures wait for, where it is not their own making
+        self._held: set[str] = set()  # keys of the point edits that the worker holds
+        self._number = 0
+        self._answers: queue.Queue = queue.Queue()
+        self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
+        environment = find_python.environment()
+        known = environment.get("PYTHONPATH", "")
+        # The add-on's own copy of the core comes first, so that both sides are of one version.
+        environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
+        environment["PYTHONUNBUFFERED"] = "1"
+        try:
+            self._group = ProcessGroup(
+                [python, "-m", "r5dgs_core.worker.server"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=environment,
+                cwd=str(ROOT),
+            )
+        except OSError as error:
+            raise errors.BackendError(
+                f"worker: '{python}' cannot be started ({error.strerror or error}); {REMEDY}"
+            ) from error
+        self._process = self._group.process
+        self._writing = threading.Lock()
+        self._readers = [
+            threading.Thread(target=self._read_answers, name="r5dgs worker answers", daemon=True),
+            threading.Thread(target=self._read_stderr, name="r5dgs worker log", daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def greet(self, timeout_s: float) -> None:
+        """Wait until it answers, once.
+
+        Args:
+            timeout_s: Seconds to wait; the worker is stopped when they have passed.
+
+        Raises:
+            BackendError: It does not answer, or its Python lacks what rendering needs.
+        """
+        if self.hello:
+            return
+        try:
+            self.hello, _ = self.request("hello", timeout_s)
+            if self.hello.get("missing"):
+                raise errors.BackendError(
+                    f"worker: {self.python} lacks {', '.join(self.hello['missing'])}; install the core there "
+                    "('pip install r5dgs') or choose another 'Worker Python' in the add-on's preferences"
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def alive(self) -> bool:
+        """True while the process runs."""
+        return self._group.alive
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def request(self, command: str, timeout_s: float, **arguments: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Ask for something and wait for the answer.
+
+        Args:
+            command: Name of the request.
+            timeout_s: Seconds to wait; the worker is stopped when they have passed.
+            **arguments: The request's arguments, JSON values; for ``points``, ``points`` is a tuple of
+                `evaluated_points.Edit`, of which those that the worker already holds are not sent again.
+
+        Returns:
+            The result, and its arrays by name.
+
+        Raises:
+            R5dgsError: What the worker reports, by its own class.
+            BackendError: The worker died or did not answer in time.
+        """
+        if command == "points":
+            arguments = self._hand_over(arguments["points"])
+        self._number += 1
+        line = json.dumps({"id": self._number, "command": command, **arguments}, allow_nan=False) + "\n"
+        try:
+            assert self._process.stdin is not None
+            with self._writing, _broken_pipes_are_errors():
+                self._process.stdin.write(line.encode())
+                self._process.stdin.flush()
+        except (OSError, ValueError):
+            raise self._death() from None
+        while True:
+            try:
+                answer = self._answers.get(timeout=timeout_s)
+            except queue.Empty:
+                self.close()
+                raise errors.BackendError(
+                    f"worker: no answer to '{command}' within {timeout_s:g} s, so it was stopped; try again, or raise "
+                    "'Timeout' in the add-on's preferences"
+                ) from None
+            if answer is None:
+                raise self._death()
+            header, arrays = answer
+            if header.get("id") == self._number:
+                break
+        if not header.get("ok"):
+            raise _error_of(header)
+        if command == "points":
+            self._held = set(arguments["keep"])
+        return header.get("result", {}), arrays
+
+    def close(self) -> None:
+        """End the process and all that it started; whoever waits for an answer gets the error of a worker that died.
+
+        It returns within two seconds, even if a process has left the group and keeps the pipes open: that one sees the
+        end of its input.
+        """
+        self._group.end()
+        if self._writing.acquire(blocking=False):  # else the thread that writes gets an error, and closes in turn
+            try:
+                with contextlib.suppress(OSError), _broken_pipes_are_errors():
+                    assert self._process.stdin is not None
+                    self._process.stdin.close()
+            finally:
+                self._writing.release()
+        self._answers.put(None)
+
+    def _hand_over(self, edits: Iterable["evaluated_points.Edit"]) -> dict[str, Any]:
+        """The arguments of a ``points`` request."""
+        new = {
+            edit.key: {name: base64.b64encode(values.data).decode() for name, values in edit.arrays().items()}
+            for edit in edits
+            if edit.key not in self._held
+        }
+        return {"keep": [edit.key for edit in edits], "new": new}
+
+    def _death(self) -> errors.BackendError:
+        self.close()
+        for reader in self._readers:
+            reader.join(timeout=LAST_WORDS_S)
+        code = self._process.returncode or 0
+        # A shell script returns 128 and the signal that ended its child. The last words are of something else then.
+        killed = not {-code, code - 128}.isdisjoint((signal.SIGTERM, getattr(signal, "SIGKILL", None)))
+        said = "" if killed else " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
+        why = "stopped from outside; perhaps memory ran out" if killed else f"exit code {code}"
+        return errors.BackendError(
+            f"worker: {self.python} ended unexpectedly ({why})"
+            + (f": {said}" if said else "")
+            + ("; the next request starts it again" if self.hello else f" before it answered; {REMEDY}")
+        )
+
+    def _read_answers(self) -> None:
+        stream = self._process.stdout
+        assert stream is not None
+        try:
+            self._read_from(stream)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            self._stderr.append(f"unreadable answer: {error}")
+        finally:
+            self._answers.put(None)
+            stream.close()
+
+    def _read_from(self, stream: IO[bytes]) -> None:
+        while line := stream.readline():
+            header = json.loads(line)
+            if "event" in header:
+                self._hear(header)
+                continue
+            arrays = {}
+            for entry in header.get("arrays", ()):
+                dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+                size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+                blob = stream.read(size)
+                if len(blob) != size:
+                    return
+                arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
+            self._answers.put((header, arrays))
+
+    def _hear(self, event: dict[str, Any]) -> None:
+        notice = COMPILING if event["event"] == "compiling" else ""
+        if notice:
+            log.warning("R5DGS worker: %s", notice)
+        if event["event"] == "failed":
+            log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))
+        self.notice = notice  # last: who sees it finds it told already
+
+    def _read_stderr(self) -> None:
+        stream = self._process.stderr
+        assert stream is not None
+        with stream, contextlib.suppress(OSError, ValueError):
+            for line in stream:
+                self._stderr.append(line.decode(errors="replace").rstrip())
+
+
+@contextlib.contextmanager
+def _broken_pipes_are_errors() -> Iterator[None]:
+    """Let a write to a process that has ended raise BrokenPipeError in this thread.
+
+    Blender, unlike Python, leaves SIGPIPE to the system, which ends Blender.
+    """
+    if not hasattr(signal, "SIGPIPE"):  # Windows has no such signal
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGPIPE})
+    try:
+        yield
+    finally:
+        if signal.SIGPIPE not in before:
+            while signal.SIGPIPE in signal.sigpending():
+                signal.sigwait({signal.SIGPIPE})
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _error_of(header: dict[str, Any]) -> errors.R5dgsError:
+    """The error that an answer reports: a class of `errors` where the worker names one."""
+    report = header.get("error", {})
+    kind = getattr(errors, str(report.get("kind")), None)
+    message = str(report.get("message", "no reason given"))
+    if isinstance(kind, type) and issubclass(kind, errors.R5dgsError):
+        return kind(message)
+    return errors.BackendError(f"worker: {report.get('kind', 'error')}: {message}")
