@@ -30,7 +30,7 @@ from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests import scenes  # noqa: E402  (the line before finds them)
+from tests.support import scenes  # noqa: E402  (the line before finds them)
 
 CAMERAS = 10
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
-from tests.addon import motions
+from tests.support import motions, scenes
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = "r5dgs.r5dgs_core"

@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
+from tests.support import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
-from tests.addon import motions  # noqa: E402
+from tests.support import motions  # noqa: E402
 
 KINDS = ("collections", "objects", "pointclouds", "meshes", "actions", "materials", "node_groups", "images", "scenes")
 OWN_OF_BLENDER = {"Render Result", "Viewer Node"}  # images that a render makes, whatever comes of it

@@ -10,8 +10,8 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.scene import scene_file
-from tests import layouts, scenes
-from tests.addon import conftest, motions
+from tests.addon import conftest
+from tests.support import layouts, motions, scenes
 
 KINDS = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups", "scenes")
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import layouts, scenes
+from tests.support import layouts, scenes
 
 
 @pytest.fixture

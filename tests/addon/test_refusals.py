@@ -6,11 +6,11 @@ import shutil
 
 import pytest
 
-from tests import scenes
+from tests.support import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 
-from tests.addon import motions  # noqa: E402
+from tests.support import motions  # noqa: E402
 
 KINDS = ("collections", "objects", "pointclouds", "meshes", "actions", "materials", "node_groups", "images")
 LAST = 46  # frame of the last observed time

@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from r5dgs_core.scene import scene_file  # noqa: E402  (the line before finds it)
-from tests import scenes  # noqa: E402
 from tests.blender import check_playback  # noqa: E402
+from tests.support import scenes  # noqa: E402
 
 LOAD_LIMITS_S = {40_000: 0.5, 1_000_000: 5.0}
 POSITION_TOLERANCE = check_playback.POSITION_TOLERANCE  # of the scene's size

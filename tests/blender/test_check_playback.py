@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
+from tests.support import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
 

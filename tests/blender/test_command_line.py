@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from r5dgs_core.scene import scene_file
-from tests import scenes
+from tests.support import scenes
 
 pytestmark = [
     pytest.mark.blender,

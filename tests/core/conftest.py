@@ -7,13 +7,12 @@ import pytest
 from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.train import run
-from tests import datasets as tiny_datasets
-from tests import pictures, scenes
+from tests.support import pictures, scenes, tiny_datasets
 
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
-    """The data set of `tests/datasets.py` with masks."""
+    """The data set of `tests/support/tiny_datasets.py` with masks."""
     return tiny_datasets.make_dataset(tmp_path_factory.mktemp("tiny"))
 
 

@@ -12,7 +12,7 @@ from r5dgs_core import folder_lock
 from r5dgs_core.cli import associate, language, runs
 from r5dgs_core.errors import CheckpointError
 from r5dgs_core.train import checkpoint, run
-from tests import datasets as tiny_datasets
+from tests.support import tiny_datasets
 
 HOLDS = """
 import sys, pathlib

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from r5dgs_core import progress, terminal
 from r5dgs_core.cli import main
 from r5dgs_core.scene import scene_file
-from tests import scenes
+from tests.support import scenes
 
 EVIL = "[red] mug\x1b[2J\x1b]0;owned\x07\r\nr5dgs: all is well\x9b31m\u202e"
 

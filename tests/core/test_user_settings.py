@@ -11,8 +11,8 @@ from r5dgs_core.cli.exit_status import ExitStatus
 from r5dgs_core.config import config, config_keys
 from r5dgs_core.errors import ConfigError
 from r5dgs_core.train import checkpoint
-from tests import datasets as tiny_datasets
-from tests.command_line import complaint
+from tests.support import tiny_datasets
+from tests.support.command_line import complaint
 
 
 @pytest.fixture

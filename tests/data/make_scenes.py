@@ -17,7 +17,7 @@ from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import scene_file
 from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
-from tests.scenes import T_MAX, TIMES, make_scene
+from tests.support.scenes import T_MAX, TIMES, make_scene
 
 
 def tracks() -> Scene:

@@ -31,9 +31,9 @@ from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
 from r5dgs_core.scene.scene import Scene
 from r5dgs_core.search import embedding_search, object_search
 from r5dgs_core.train import checkpoint
-from tests import colmap_files, foreign_runs, scenes
 from tests.fuzz import mutations
 from tests.fuzz.campaign import Files, Reader
+from tests.support import colmap_files, foreign_runs, scenes
 
 SIDE = 8  # pixels of the pictures that accepted scenes are drawn in
 COUNT = 30
@@ -560,8 +560,8 @@ def knots_reader() -> Reader:
 
 def checkpoint_reader() -> Reader:
     """Run folders of ours: ``run.json`` and the checkpoint, with a digest of its bytes or without."""
-    from tests.core.test_checkpoint import STATE
-    from tests.core.test_checkpoint import dataset as owner
+    from tests.core.train.test_checkpoint import STATE
+    from tests.core.train.test_checkpoint import dataset as owner
 
     with tempfile.TemporaryDirectory() as folder:
         checkpoint.create_run(Path(folder), owner(), config.Config())

@@ -1,0 +1,212 @@
+"""What a scene carries follows from what was measured, and the table says so."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.bake import bake, needs
+from r5dgs_core.config import config, training_needs
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.errors import ConfigError
+from r5dgs_core.motion import rotations
+from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.scene.scene import MotionGroup
+from r5dgs_core.train import checkpoint, observed_motion, run
+from r5dgs_core.train.trainer import Trainer
+from tests.support import tiny_datasets
+
+RADIUS = 0.4
+
+
+def table(
+    travel=0.0,
+    turn=0.0,
+    *,
+    shading=0.0,
+    sky=1,
+    bases=1,
+    shadow=False,
+    bodies=1,
+    classified=True,
+    wanted=None,
+    bent=0,
+    moves=None,
+):
+    """The decisions for bodies of which the first moves by ``travel`` diameters and turns by ``turn`` radians."""
+    poses = [np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1)) for _ in range(bodies + 2)]
+    if bodies:
+        poses[1][0, :4] = rotations.rotvecs_to_quats(np.array([0, 0, turn]))
+        poses[1][0, 4] = travel * 2 * RADIUS
+    groups = [MotionGroup(0, 0, "pinned", 0, np.zeros(3), MotionModel())]
+    groups += [MotionGroup(k, k, "body", 0, np.zeros(3), MotionModel(radius=RADIUS)) for k in range(1, bodies + 1)]
+    if shadow:
+        groups.append(MotionGroup(bodies + 1, 1, "shadow", 0, np.zeros(3), MotionModel(), 1, np.eye(3)))
+    ids = np.array([0] * 5 + [1] * 5 * (bodies > 0) + [bodies + 1] * 5 * shadow)
+    gradients = np.full((len(ids), 3), shading)
+    light, behind, given = np.array([0, 0, 1.0]), np.zeros((sky, 3)), config.NeedsSection(**(wanted or {}))
+    bending = (float(bent), 0.5, bent > 0, "gain")
+    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given, bending, moves)
+    return {row["name"]: row for row in rows}
+
+
+def decisions(**given):
+    return {name: row["decision"] for name, row in table(**given).items()}
+
+
+def test_a_scene_at_rest_needs_nothing_that_moves():
+    found = decisions()
+    assert found["tracks"] == found["rotation"] == found["shading"] == found["shadows"] == "off"
+    assert found["view_dependent_colour"] == found["sky_gradient"] == "off" and found["classifier"] == "on"
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"travel": 0.01}, "tracks"),
+        ({"turn": 0.01}, "tracks"),
+        ({"turn": 0.01}, "rotation"),
+        ({"turn": 1.0, "shading": 0.1}, "shading"),
+        ({"shadow": True}, "shadows"),
+        ({"bases": 4}, "view_dependent_colour"),
+        ({"sky": 4}, "sky_gradient"),
+        ({"bent": 3}, "residuals"),
+    ],
+)
+def test_each_need_follows_its_own_cause(given, name):
+    row = table(**given)[name]
+    assert row["decision"] == "on" and row["reason"]
+    assert decisions()[name] == "off"
+
+
+def test_an_object_that_only_slides_needs_no_rotation_and_no_shading():
+    found = decisions(travel=1.0, shading=0.5)
+    assert (found["tracks"], found["rotation"], found["shading"]) == ("on", "off", "off")
+
+
+def test_the_numbers_are_those_of_the_motion():
+    rows = table(travel=1.5, turn=0.7)
+    assert rows["tracks"]["value"] == pytest.approx(1.5)
+    assert rows["rotation"]["value"] == pytest.approx(0.7)
+
+
+def test_without_objects_nothing_moves():
+    assert decisions(bodies=0)["tracks"] == "off"
+
+
+def test_a_classifier_is_on_where_one_was_trained():
+    assert decisions(classified=False)["classifier"] == "off"
+
+
+def test_what_is_off_is_not_in_the_scene(baked):
+    found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
+    assert (found["shading"] == "on") == (baked.shading is not None)
+    assert (found["classifier"] == "on") == (baked.identities is not None)
+    assert (found["sky_gradient"] == "on") == (len(baked.background_sh) > 1)
+
+
+def test_the_tiny_scene_is_judged_by_what_it_shows(baked):
+    found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
+    assert found["tracks"] == found["rotation"] == found["classifier"] == "on"
+    assert found["view_dependent_colour"] == "off"
+
+
+EVERYTHING = {"travel": 1.0, "turn": 1.0, "shading": 0.1, "sky": 9, "bases": 4, "shadow": True, "bent": 3}
+EVERYTHING["moves"] = observed_motion.Moves(3, moving=9)
+NAMES = [field.name for field in dataclasses.fields(config.NeedsSection)]
+
+
+def test_every_row_of_the_table_can_be_overridden():
+    assert list(table()) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_your_word_wins_over_the_number_and_is_marked(name):
+    measured, decided = table(**EVERYTHING)[name], table(**EVERYTHING, wanted={name: "off"})[name]
+    assert (measured["decision"], decided["decision"]) == ("on", "off")
+    assert decided["value"] == measured["value"] and decided["reason"].startswith("set off by you")
+    others = [table(**EVERYTHING, wanted={name: "off"})[other] == table(**EVERYTHING)[other] for other in NAMES]
+    assert others == [other != name for other in NAMES]
+
+
+@pytest.mark.parametrize("name", ["tracks", "rotation"])
+def test_an_object_at_rest_may_be_said_to_move(name):
+    row = table(wanted={name: "on"})[name]
+    assert row["decision"] == "on" and row["reason"].startswith("set on by you;")
+
+
+@pytest.mark.parametrize(
+    "name", ["shading", "shadows", "view_dependent_colour", "sky_gradient", "classifier", "residuals"]
+)
+def test_what_was_not_learned_cannot_be_switched_on_and_the_table_says_so(name):
+    row = table(classified=False, wanted={name: "on"})[name]
+    assert row["decision"] == "off" and "set on by you, but this run has none" in row["reason"]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("needs.shadws=off", "needs.shadws: unknown key; did you mean 'shadows'?"),
+        ("needs.shadows=no", "needs.shadows: expected auto or on or off, got 'no'"),
+    ],
+)
+def test_needs_that_are_not_known_are_refused(override, message):
+    with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
+        config.load(None, [override])
+
+
+@pytest.mark.parametrize(
+    ("need", "key"),
+    [("shading", "train.shading=false"), ("shadows", "train.shadows=false"), ("classifier", "identity.iterations=0")],
+)
+def test_contradictions_are_refused(need, key):
+    with pytest.raises(ConfigError, match=f"needs.{need} is on, but {key.split('=')[0]} is .*leave one of them out"):
+        config.load(None, [f"needs.{need}=on", key])
+
+
+def test_training_leaves_out_what_you_say_is_not_needed(tiny, tmp_path):
+    off = [f"needs.{name}=off" for name in NAMES]
+    settings = tiny_datasets.settings("train.iterations=60", *off)
+    done = run.train(tiny.root, tmp_path / "run", settings)
+    tensors = checkpoint.load(done.folder).tensors
+    assert not tensors["gaussians.shading"].any()
+    assert not [name for name in tensors if name.startswith("tracks.")]
+    assert "identities" not in tensors and len(tensors["background"]) == 1
+    assert done.config == settings  # the folder says what was asked for
+    scene = bake.bake(done, datasets.read(tiny.root))
+    assert {row["decision"] for row in scene.needs} == {"off"}
+    assert all(row["reason"].startswith("set off by you") for row in scene.needs)
+
+
+def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_needed(tiny):
+    trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings("needs.view_dependent_colour=on"))
+    assert trainer.gaussians.params["sh_rest"].shape[1] == 3
+    kept = training_needs.resolve(config.load(None, ["needs.view_dependent_colour=on", "train.sh_degree=2"]))
+    assert kept.train.sh_degree == 2
+
+
+def test_a_run_can_be_baked_without_what_it_has_learned(trained, baked, tiny, tmp_path):
+    off = [f"needs.{name}=off" for name in NAMES]
+    scene = bake.run_bake(trained.folder, tmp_path / "bare.r5dgs", None, off)
+    assert scene.identities is None and scene.shading is None and len(scene.background_sh) == 1
+    assert {group.role for group in scene.groups} == {"pinned", "body"} < {group.role for group in baked.groups}
+    assert (scene.track_poses == [1.0, 0, 0, 0, 0, 0, 0]).all()
+    assert len(scene.means) == sum(baked.groups[k].role != "shadow" for k in baked.motion_ids)
+    sliding = bake.run_bake(trained.folder, tmp_path / "sliding.r5dgs", None, ["needs.rotation=off"])
+    assert (sliding.track_poses[..., :4] == needs.STILL_QUAT).all() and np.ptp(
+        sliding.track_poses[1, :, 4:], 0
+    ).max() > 0.1
+
+
+def test_bake_takes_no_other_override_than_needs(trained, tmp_path):
+    with pytest.raises(ConfigError, match="--set train.seed=1: .*bake takes needs.NAME"):
+        bake.run_bake(trained.folder, tmp_path / "x.r5dgs", None, ["train.seed=1"])
+
+
+def test_the_table_says_what_was_regrouped():
+    row = table(moves=observed_motion.Moves(3, 2, 1, 1, 60))["regrouping"]
+    assert (row["value"], row["decision"]) == (6, "on")
+    for part in ("of 60", "3 went to another body", "2 to a shadow", "1 to rest", "1 shadows rest"):
+        assert part in row["reason"]
+    assert table(moves=observed_motion.Moves(moving=60))["regrouping"]["decision"] == "off"
+    assert table()["regrouping"]["decision"] == "off"

@@ -1,0 +1,350 @@
+"""A benchmark trains what is not trained, measures what is not measured, and goes on over what fails."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+import signal
+
+import numpy as np
+import pytest
+
+from r5dgs_core.bake import bake
+from r5dgs_core.bench import benchmark, cases, playback_speed, process, variants
+from r5dgs_core.cli import exit_status, main
+from r5dgs_core.config import config as configs
+from r5dgs_core.config import presets
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.errors import CheckpointError, ConfigError, DatasetError, Interrupted, TrainingError
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.playback import scene_player
+from r5dgs_core.render import machine
+from r5dgs_core.scene import scene_file
+from r5dgs_core.train import checkpoint
+from tests.support import tiny_datasets
+
+OVERRIDES = (*tiny_datasets.SETTINGS, "train.iterations=20", "identity.iterations=5")
+
+
+def plan_for(tiny, out, **changes):
+    return cases.Plan(
+        **{"scenes": (tiny.root,), "out": out, "variants": ("tracks",), "overrides": OVERRIDES, **changes}
+    )
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def made(tiny, tmp_path_factory):
+    """A benchmark that was stopped at its first step and gone on with: its plan, the records in between, the result."""
+    plan = plan_for(tiny, tmp_path_factory.mktemp("bench"))
+    (case,) = cases.make(plan)
+
+    @contextlib.contextmanager
+    def stopping(kind):
+        yield lambda event: signal.raise_signal(signal.SIGTERM) if event["event"] == "step" else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(benchmark, "make_progress", stopping)
+        with pytest.raises(Interrupted, match="same command"):
+            benchmark.run_bench(plan)
+    between = cases.read_record(case), checkpoint.load(case.run)
+    return plan, case, between, benchmark.run_bench(plan, progress_kind="none")
+
+
+def test_a_stopped_benchmark_keeps_what_training_had_reached(made):
+    _, _, (record, state), _ = made
+    assert not state.finished and state.iteration > 0
+    assert [sitting["status"] for sitting in record["sittings"]] == [process.STOPPED]
+    assert "measured" not in record
+
+
+def test_the_cost_of_a_case_is_that_of_all_its_sittings(made):
+    _, case, (between, _), result = made
+    first, second = cases.read_record(case)["sittings"]
+    assert first == between["sittings"][0] and second["status"] == 0
+    (found,) = result["results"]
+    assert found["train"]["cpu_seconds"] == pytest.approx(first["cpu_seconds"] + second["cpu_seconds"], abs=2e-3)
+    assert found["train"]["peak_mb"] == max(first["peak_mb"], second["peak_mb"]) > 50
+
+
+def test_a_record_holds_what_evaluate_and_playing_find(made, tiny):
+    plan, case, _, result = made
+    (found,) = result["results"]
+    assert (found["scene"], found["representation"], found["variant"], found["mode"], found["seed"]) == (
+        tiny.root.name,
+        "tracks",
+        "tracks",
+        "rigid",
+        0,
+    )
+    assert set(found["splits"]["test"]) == set(evaluate.METRICS)
+    assert found["splits"]["test"]["images"] == 4 and found["splits"]["val"]["images"] == 2
+    assert found["playback"]["frames"] >= playback_speed.LEAST_FRAMES
+    assert found["playback"]["fps"] == pytest.approx(1e3 / found["playback"]["ms_frame"])
+    assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).means)
+    assert main.main(["evaluate", str(case.run), "--progress", "none"]) == 0
+    alone = json.loads((case.run / checkpoint.EVALUATION_FILE).read_text())
+    assert alone["splits"]["test"]["rigid"]["psnr"] == pytest.approx(found["splits"]["test"]["psnr"], abs=1e-6)
+    assert json.loads((plan.out / benchmark.RESULT_FILE).read_text()) == result
+
+
+def test_what_is_finished_is_neither_trained_nor_measured_again(made, monkeypatch):
+    plan, case, _, result = made
+    before = contents(case.run)
+    monkeypatch.setattr(process, "train", None)
+    monkeypatch.setattr(playback_speed, "measure", None)
+    assert benchmark.run_bench(plan, progress_kind="none")["results"] == result["results"]
+    assert contents(case.run) == before
+
+
+def test_remeasure_keeps_the_run_and_measures_it_again(made, monkeypatch):
+    plan, case, _, result = made
+    monkeypatch.setattr(process, "train", None)
+    monkeypatch.setattr(
+        playback_speed, "measure", lambda *_: {"rigid": {**result["results"][0]["playback"], "fps": 123.0}}
+    )
+    again = benchmark.run_bench(plan, remeasure=True, progress_kind="none")
+    assert again["results"][0]["playback"]["fps"] == 123.0
+    (one,), (other,) = again["results"], result["results"]
+    assert one["train"] == other["train"]
+    assert all(one["splits"][split]["psnr"] == other["splits"][split]["psnr"] for split in ("val", "test"))
+
+
+def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path, monkeypatch):
+    plan, _, _, _ = made
+    shutil.copytree(plan.out, tmp_path / "out")
+    plan = plan_for(tiny, tmp_path / "out", modes=("rigid",))
+    plain, before = bake.bake, benchmark.run_bench(plan, remeasure=True, progress_kind="none")["results"]
+
+    def with_dynamics(run, dataset):
+        scene = plain(run, dataset)
+        still = np.zeros((len(scene.means), 12), np.float32)
+        return dataclasses.replace(scene, dynamics=still, canonical_means=scene.means)
+
+    monkeypatch.setattr(bake, "bake", with_dynamics)
+    result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
+    assert [record["mode"] for record in result] == list(scene_player.MODES)
+    assert result[0] == before[0], "what was measured before stays"
+    # Motion past t_max stops in the modes that read the dynamics, which are none; up to t_max all modes are the same.
+    rigid, hybrid, standard, literal = (record["splits"] for record in result)
+    assert hybrid["test"]["psnr"] == rigid["test"]["psnr"], "there is nothing that no group's motion explains"
+    assert standard["val"]["psnr"] == literal["val"]["psnr"] == pytest.approx(rigid["val"]["psnr"])
+    assert standard["test"]["psnr"] == literal["test"]["psnr"] != pytest.approx(rigid["test"]["psnr"])
+
+
+def test_a_case_that_fails_is_reported_and_the_others_go_on(made, tiny, capsys):
+    plan, case, _, _ = made
+    blocked = case.run.with_name("tracks_seed1")
+    blocked.write_text("mine")
+    arguments = ["bench", str(tiny.root), "--out", str(plan.out), "--variants", "tracks", "--seeds", "1", "0"]
+    options = [text for override in OVERRIDES for text in ("--set", override)]
+    try:
+        assert main.main([*arguments, *options]) == 3
+        printed = capsys.readouterr()
+        assert len(printed.err.splitlines()) == 1 and "1 of 2 runs failed" in printed.err
+        result = json.loads((plan.out / benchmark.RESULT_FILE).read_text())
+        assert [record["seed"] for record in result["results"]] == [0]
+        assert [(f["variant"], f["seed"]) for f in result["failures"]] == [("tracks", 1)]
+        assert "is not a run folder" in result["failures"][0]["error"]
+        assert result["failures"][0]["error"] in (plan.out / benchmark.TABLES_FILE).read_text()
+        assert f"{result['results'][0]['splits']['test']['psnr']:.2f}" in printed.out
+        assert blocked.read_text() == "mine"
+    finally:
+        blocked.unlink()
+
+
+def test_a_fault_in_one_case_does_not_cost_the_others(tiny, tmp_path, monkeypatch, made):
+    _, _, _, result = made
+
+    def run_case(plan, case, remeasure, progress):
+        if case.seed == 0:
+            raise ZeroDivisionError("by design")
+        return result["results"]
+
+    monkeypatch.setattr(benchmark, "run_case", run_case)
+    with pytest.raises(TrainingError, match="1 of 2 runs failed.*ZeroDivisionError: by design"):
+        benchmark.run_bench(plan_for(tiny, tmp_path, seeds=(0, 1)), progress_kind="none")
+    assert len(json.loads((tmp_path / benchmark.RESULT_FILE).read_text())["results"]) == 1
+
+
+def test_a_record_says_what_it_was_trained_and_measured_on(made):
+    _, case, _, result = made
+    (found,) = result["results"]
+    assert found["machine"] == benchmark.machine() and found["machine"]["cores"] >= 1
+    assert found["trained_on"]["torch_threads"] == 1 and found["trained_on"]["versions"] == machine.versions()
+    assert {**machine.describe(), **found["trained_on"]} == found["trained_on"]
+    assert cases.read_record(case)["measured"]["modes"]["rigid"]["machine"] == found["machine"]
+
+
+def test_what_was_measured_elsewhere_keeps_its_machine(made, monkeypatch):
+    plan, _, _, result = made
+    monkeypatch.setattr(checkpoint, "machine", lambda: {"processor": "another"})
+    (found,) = benchmark.run_bench(plan, progress_kind="none")["results"]
+    assert found["machine"] == result["results"][0]["machine"]
+
+
+def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, tiny, tmp_path):
+    plan, _, _, _ = made
+    root = tmp_path / tiny.root.name
+    shutil.copytree(tiny.root, root)
+    assert len(cases.make(plan_for(tiny, plan.out, scenes=(root,)))) == 1, "the same data in another place"
+    path = root / "transforms_val.json"
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(CheckpointError, match=r"tracks_seed0: was trained on other data.*restore the data.*--out"):
+        cases.make(plan_for(tiny, plan.out, scenes=(root,)))
+
+
+def test_a_run_that_was_begun_with_other_settings_is_refused_before_anything_is_done(made, tiny):
+    plan, case, _, _ = made
+    before = contents(plan.out)
+    with pytest.raises(ConfigError, match="train.iterations = 20, not 30"):
+        cases.make(plan_for(tiny, plan.out, overrides=(*OVERRIDES, "train.iterations=30")))
+    assert contents(plan.out) == before and case.run.is_dir()
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "words"),
+    [
+        ({"variants": ("6dgs",)}, ConfigError, "--variants 6dgs"),
+        ({"modes": ("wobbly",)}, ConfigError, "--modes wobbly"),
+        ({"seeds": (-1,)}, ConfigError, "train.seed"),
+        ({"overrides": ("losses.sim=1",)}, ConfigError, "did you mean 'ssim'"),
+        ({"preset": "nonsense"}, ConfigError, "--preset nonsense"),
+    ],
+)
+def test_a_plan_that_cannot_be_carried_out_is_refused_at_once(tiny, tmp_path, changes, kind, words):
+    with pytest.raises(kind, match=words):
+        cases.make(plan_for(tiny, tmp_path / "out", **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_are_looked_at_before_anything_is_trained(tiny, tmp_path):
+    with pytest.raises(DatasetError, match="nowhere"):
+        cases.make(plan_for(tiny, tmp_path, scenes=(tiny.root, tmp_path / "nowhere")))
+    with pytest.raises(ConfigError, match="are both called"):
+        cases.make(plan_for(tiny, tmp_path, scenes=(tiny.root, tiny.root)))
+
+
+def test_cases_go_seed_by_seed_and_their_variants_win_over_the_users_settings(tiny, tmp_path):
+    overrides = ("train.representation=tracks", "train.seed=7", "train.probe_every=9")
+    made = cases.make(plan_for(tiny, tmp_path, variants=("r5dgs", "tracks"), seeds=(0, 1), overrides=overrides))
+    assert [(case.seed, case.variant) for case in made] == [(0, "r5dgs"), (0, "tracks"), (1, "r5dgs"), (1, "tracks")]
+    settings = configs.load(None, made[2].overrides)
+    assert (settings.train.representation, settings.field.variant, settings.train.seed) == ("field", "r5dgs", 1)
+    assert settings.train.probe_every == 9
+    assert len({case.run for case in made}) == 4
+
+
+@pytest.mark.parametrize("preset", [None, *presets.PRESETS])
+def test_every_preset_can_be_benchmarked_and_the_method_is_the_same_in_all(tiny, tmp_path, preset):
+    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset=preset))
+    found = {case.variant: configs.load(None, case.overrides, preset) for case in made}
+    assert tuple(found) == variants.DEFAULT_VARIANTS
+    for name in ("r5dgs", "r5dgs_extra"):
+        identity = found[name].identity
+        assert identity.training == "joint"
+        scale = 1.0 if preset == "paper" else 0.05
+        assert (identity.weight, identity.spatial) == (scale, 2 * scale), name
+    assert found["r5dgs_extra"].identity.majority == 0.5 * scale
+    for name in ("from_tracks", "tracks"):
+        config = found[name]
+        assert (config.init.placement, config.curriculum.start, config.curriculum.stages) == ("scene", "best", 0)
+        assert config.train.shading and config.train.shadows
+    assert (found["from_tracks"].field.movers, found["from_tracks"].field.tracks_share) == ("labelled", 0.4)
+    plain = found["tracks"]
+    assert (plain.densify.strategy, plain.identity.training, plain.identity.rate) == ("share", "after", 0.01)
+    assert plain.rates == configs.Config().rates
+    assert plain.train.iterations == configs.load(None, (), preset).train.iterations
+
+
+def test_what_does_not_suit_tracks_in_a_preset_is_still_the_users_to_set(tiny, tmp_path):
+    overrides = ("train.shading=false", "identity.training=off", "identity.weight=0.3")
+    made = cases.make(cases.Plan((tiny.root,), tmp_path, preset="paper", overrides=overrides))
+    found = {case.variant: configs.load(None, case.overrides, "paper") for case in made}
+    assert not found["tracks"].train.shading and found["tracks"].identity.training == "off"
+    assert found["r5dgs"].identity.training == "joint" and found["r5dgs"].identity.weight == 0.3
+
+
+@pytest.mark.parametrize("name", ["5dgs", "r5dgs", "r5dgs_extra"])
+def test_the_method_does_not_depend_on_the_users_settings(name):
+    given = variants.settings(name, None)
+    assert {"train.representation", "field.variant", "identity.training", "identity.weight"} <= set(given)
+    weights = {"identity.weight", "identity.spatial", "identity.majority"}  # which the paper's preset has, too
+    assert set(given) - set(variants.settings(name, "paper")) == weights & set(given)
+
+
+def test_a_sitting_of_which_nothing_is_known_makes_the_sum_unknown():
+    known = {"cpu_seconds": 2.0, "wall_seconds": 3.0, "peak_mb": 100.0, "peak_gpu_mb": None}
+    more = {**known, "peak_mb": 150.0}
+    assert cases.cost([known, more]) == {
+        "cpu_seconds": 4.0,
+        "wall_seconds": 6.0,
+        "peak_mb": 150.0,
+        "peak_gpu_mb": None,
+    }
+    assert cases.cost([known, {"status": None}])["cpu_seconds"] is None
+    assert set(cases.cost([]).values()) == {None}
+
+
+def test_a_damaged_record_says_what_to_remove(tiny, tmp_path):
+    (case,) = cases.make(plan_for(tiny, tmp_path))
+    case.run.parent.mkdir()
+    for text in ("{", "[]", '{"sittings": 3}'):
+        case.beside(".json").write_text(text)
+        with pytest.raises(CheckpointError, match="tracks_seed0.json.*remove it"):
+            cases.read_record(case)
+
+
+def test_a_process_tells_its_own_memory_and_its_complaint(tmp_path):
+    ballast = np.ones(2**26)  # half a GiB here, which must not be counted there
+    log_path, ended = tmp_path / "log", []
+    log_path.write_text("an earlier complaint\n")
+    sitting = process.train(["evaluate", str(tmp_path / "gone.r5dgs")], log_path, lambda event: None, ended.append)
+    assert ended == [sitting] and sitting.status == exit_status.ExitStatus.ERROR
+    assert "gone.r5dgs" in process.reason(sitting) and not process.reason(sitting).startswith("r5dgs:")
+    assert sitting.cpu_seconds is not None and sitting.cpu_seconds > 0
+    assert sitting.peak_mb is not None and 10 < sitting.peak_mb < ballast.nbytes / 2**20
+    assert log_path.read_text().startswith("an earlier complaint\nr5dgs: ")
+
+
+@pytest.mark.parametrize(
+    ("status", "complaint", "words"), [(-9, "", "SIGKILL"), (-11, "", "SIGSEGV"), (3, "", "status 3"), (1, "no", "no")]
+)
+def test_the_end_of_a_process_is_put_into_words(status, complaint, words):
+    assert words in process.reason(process.Sitting(status, complaint, 1.0, 1.0, None, None))
+
+
+def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch):
+    drawn, frame = [], scene_player.Player.frame
+
+    def watch(player, t, origin=None):
+        drawn.append(t)
+        return frame(player, t, origin)
+
+    monkeypatch.setattr(scene_player.Player, "frame", watch)
+    views = datasets.read(tiny.root).test
+    found = playback_speed.measure(baked, views[::-1], ["rigid"])["rigid"]
+    round_ = drawn[: len(views)]
+    assert sorted(round_) == sorted(view.t for view in views) and round_ == [*tiny_datasets.LATER] * 2
+    assert drawn == round_ * (len(drawn) // len(round_)) and found["frames"] == len(drawn) - len(views)
+    assert found["ms_frame_low"] <= found["ms_frame"] <= found["ms_frame_high"]
+    assert playback_speed.measure(baked, [], ["rigid"]) == {"rigid": {**dict.fromkeys(found), "frames": 0}}
+
+
+def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
+    still = dataclasses.replace(baked, dynamics=np.zeros((len(baked.means), 12), np.float32))
+    drawn, frame = [], scene_player.frame
+
+    def watch(scene, t, mode="rigid"):
+        drawn.append(mode)
+        return frame(scene, t, mode)
+
+    monkeypatch.setattr(scene_player, "frame", watch)
+    views = datasets.read(tiny.root).test
+    found = playback_speed.measure(still, views, ["rigid", "standard"])
+    turn = ["rigid"] * len(views) + ["standard"] * len(views)
+    assert drawn == turn * (len(drawn) // len(turn))
+    assert found["rigid"]["frames"] == found["standard"]["frames"] >= playback_speed.LEAST_FRAMES

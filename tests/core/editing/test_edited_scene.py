@@ -1,0 +1,303 @@
+"""Edits that are written into a scene: untouched it is the same to the bit, and what was moved is where it was put."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.editing import edited_scene
+from r5dgs_core.editing.edited_scene import Piece
+from r5dgs_core.motion import models, rotations
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import row_runs, scene_file, validation
+from r5dgs_core.scene.lookup_table import EncoderCard, Table, View
+from tests.support.scenes import make_scene
+
+TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
+LATER = np.linspace(0.75, 1.0, 21)[1:]
+MATCHING = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "identities", "shading")
+
+
+def matrix_of(linear, offset=(0.0, 0.0, 0.0)):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, offset
+    return matrix
+
+
+def times_of(scene):
+    return np.concatenate([scene.track_times, LATER])
+
+
+def played(scene, motion_id, times):
+    """Maps from the bind state that playback gives a motion group. [T, 4, 4]"""
+    result = []
+    for t in times:
+        quats, moves = scene_player.group_poses(scene, t)
+        turn, pivot = rotations.quats_to_rotmats(quats[motion_id]), np.asarray(scene.groups[motion_id].pivot)
+        result.append(matrix_of(turn, pivot + moves[motion_id] - turn @ pivot))
+    return np.array(result)
+
+
+def pieces_of(scene, noise=0.0, before=None, after=None):
+    """The clouds of a loaded scene: their maps are those of playback between ``after`` and ``before``, by object id."""
+    random, pieces = np.random.default_rng(0), []
+    pairs = scene.object_ids.astype(np.int64) * 1000 + scene.motion_ids
+    for start, stop, pair in row_runs.runs(pairs):
+        object_id, motion_id = (pair + 1) // 1000 if pair < 0 else pair // 1000, pair % 1000
+        object_id = int(scene.object_ids[start])
+        maps = played(scene, motion_id, times_of(scene))
+        maps[:, :3] += noise * random.normal(size=maps[:, :3].shape)
+        own = np.asarray(scene.groups[motion_id].pivot)
+        outer, inner = (where.get(object_id, np.eye(4)) for where in (before or {}, after or {}))
+        pieces.append(
+            Piece(
+                f"object {object_id}",
+                object_id,
+                motion_id,
+                start,
+                stop - start,
+                f"mover {motion_id} {object_id}",
+                outer @ maps @ inner,
+                pivot=outer[:3, :3] @ own + outer[:3, 3] if motion_id else None,
+                parent=outer[:3, :3] if before else None,
+                allowed=2e-5,
+            )
+        )
+    return pieces
+
+
+def edit(scene, pieces, table=None):
+    result, notes = edited_scene.edit(scene, pieces, times_of(scene), table or {})
+    validation.check(result, "the edited scene")
+    return result, notes
+
+
+def assert_same(found, wanted, names=MATCHING):
+    for name in names:
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
+
+
+def rich_scene(**options):
+    """With residuals, dynamics, embeddings and a classifier."""
+    scene = make_scene(n=300, sh_degree=2, **options)
+    random, rows = np.random.default_rng(3), np.array([110, 150, 220])
+    offsets = random.normal(scale=0.05, size=(3, len(scene.track_times), 3)).astype(np.float32)
+    growths = random.normal(scale=0.1, size=offsets.shape).astype(np.float32)
+    offsets[:, -1], growths[:, -1] = 0, 0
+    turns = rotations.rotvecs_to_quats(0.3 * random.normal(size=offsets.shape))
+    turns[:, -1] = (1, 0, 0, 0)
+    named = sum(item.id >= 0 for item in scene.objects)
+    units = rotations.normalize(random.normal(size=(len(scene.objects), 8))).astype(np.float32)
+    views = tuple((View("obs0", 0.1 * row, 0.5, (0, 0, 9, 9)),) for row in range(len(scene.objects)))
+    card, limits = EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}",)), tuple(map(float, range(len(views))))
+    return dataclasses.replace(
+        scene,
+        residual_rows=rows.astype(np.int32), residual_offsets=offsets, residual_log_scales=growths,
+        residual_quats=turns.astype(np.float32),
+        dynamics=random.normal(size=(300, 12)).astype(np.float32), canonical_means=scene.means + np.float32(0.1),
+        classifier_weight=random.normal(size=(named, 16)).astype(np.float32),
+        classifier_bias=random.normal(size=named).astype(np.float32),
+        embeddings=units, vocabulary=("mug",), vocabulary_embeddings=units[:1], canonical_embeddings=units[:1],
+        view_embeddings=units[:, None], lookup=Table(card, ("object",), views, limits, 0.1, "mean"),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-7])
+def test_what_was_not_edited_is_the_same_to_the_bit(tmp_path, noise):
+    scene = rich_scene()
+    result, notes = edit(scene, pieces_of(scene, noise))
+    assert notes == []
+    for path, content in (("a", scene), ("b", result)):
+        scene_file.write(content, tmp_path / path)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_deleted_objects_are_gone_with_all_that_is_theirs():
+    scene = rich_scene()
+    result, notes = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 2])
+    assert [item.id for item in result.objects] == [-1, 0, 1, 3]
+    assert [group.object_id for group in result.groups] == [0, 1, 3, 1]
+    assert result.groups[3].follows == 1 and notes == []
+    keep = scene.object_ids != 2
+    assert_same(result, dataclasses.replace(scene, **{n: getattr(scene, n)[keep] for n in MATCHING}), MATCHING[:6])
+    np.testing.assert_array_equal(result.dynamics, scene.dynamics[keep])
+    np.testing.assert_array_equal(result.embeddings, scene.embeddings[[0, 1, 2, 4]])
+    np.testing.assert_array_equal(result.view_embeddings, scene.view_embeddings[[0, 1, 2, 4]])
+    assert result.lookup.thresholds == (0, 1, 2, 4) and result.lookup.views[3] == scene.lookup.views[4]
+    np.testing.assert_array_equal(result.classifier_weight, scene.classifier_weight[[0, 1, 3]])
+    for t in (0.1, 0.6, 0.95):
+        np.testing.assert_array_equal(scene_player.frame(result, t).means, scene_player.frame(scene, t).means[keep])
+
+
+def test_without_its_leader_a_shadow_goes_on_by_itself():
+    scene = rich_scene()
+    result, _ = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 1])
+    shadow = next(group for group in result.groups if group.role == "shadow")
+    assert shadow.follows is None and shadow.object_id == 0
+    rows, old = result.motion_ids == shadow.id, scene.motion_ids == 4
+    for t in (0.3, 0.9):
+        np.testing.assert_allclose(
+            scene_player.frame(result, t).means[rows], scene_player.frame(scene, t).means[old], atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("matrix", [matrix_of(1.5 * TURN, (0.2, -1.0, 0.3)), matrix_of(np.diag([1.0, 1, -1]))])
+def test_what_was_put_elsewhere_within_its_motion_moves_on_with_it(matrix):
+    scene = rich_scene()
+    result, notes = edit(scene, pieces_of(scene, after={1: matrix}))
+    rows = scene.object_ids == 1
+    assert {name.split()[0] for name in notes} == {"'dynamics'", "'canonical_means'"}
+    np.testing.assert_array_equal(result.track_poses, scene.track_poses)
+    assert result.groups[1].model == scene.groups[1].model
+    base = dataclasses.replace(scene, residual_rows=None, residual_offsets=None, residual_quats=None,
+                               residual_log_scales=None)  # fmt: skip
+    for t in (0.0, 0.31, 0.75, 0.9):
+        maps = played(scene, 1, [t])[0] @ matrix
+        wanted = base.means[rows] @ maps[:3, :3].T + maps[:3, 3]
+        bent = np.zeros(len(rows), bool)
+        bent[scene.residual_rows] = True
+        straight = ~bent[rows]
+        np.testing.assert_allclose(scene_player.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
+
+
+def test_residuals_and_shading_turn_with_what_was_turned():
+    scene = rich_scene()
+    matrix = matrix_of(1.4 * TURN, (0.2, -1.0, 0.3))
+    result, _ = edit(scene, pieces_of(scene, before={k: matrix for k in range(-1, 4)}))
+    for t in (0.02, 0.4, 0.75, 0.9):
+        found, plain = scene_player.frame(result, t), scene_player.frame(scene, t)
+        np.testing.assert_allclose(found.means, plain.means @ matrix[:3, :3].T + matrix[:3, 3], atol=5e-5)
+        np.testing.assert_allclose(found.log_scales, plain.log_scales + np.log(1.4), atol=1e-5)
+        turned = rotations.multiply(rotations.rotmats_to_quats(TURN), plain.quats.astype(np.float64))
+        np.testing.assert_allclose(np.abs((found.quats * turned).sum(-1)), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
+    scene = rich_scene(seed=2)
+    linear = 0.7 * TURN @ np.diag([mirror, 1, 1])
+    matrix = matrix_of(linear, (1.0, 0.5, 0.0))
+    result, _ = edit(scene, pieces_of(scene, before={1: matrix}))
+    model, turned = scene.groups[1].model, result.groups[1].model
+    assert turned.kind == model.kind
+    np.testing.assert_allclose(turned.velocity, linear @ model.velocity)
+    np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
+    rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residual_rows)
+    for t in (0.0, 0.31, 0.75, 0.99):
+        wanted = scene_player.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(scene_player.frame(result, t).means[rows], wanted, atol=2e-5)
+
+
+def test_a_covariance_is_turned_with_its_model():
+    covariance = np.diag(np.arange(1.0, 7.0))
+    names = tuple(f"{field}.{axis}" for field in ("velocity", "angular_velocity") for axis in "xyz")
+    model = models.MotionModel(
+        "constant_twist", velocity=(1, 0, 0), angular_velocity=(0, 1, 0), covariance=covariance, covariance_names=names
+    )
+    scene = make_scene(n=200, objects=1, shadows=False)
+    scene = dataclasses.replace(scene, groups=(scene.groups[0], dataclasses.replace(scene.groups[1], model=model)))
+    result, _ = edit(scene, pieces_of(scene, before={1: matrix_of(2 * TURN)}))
+    found = result.groups[1].model.covariance
+    np.testing.assert_allclose(found[:3, :3], 4 * TURN @ covariance[:3, :3] @ TURN.T, atol=1e-12)
+    np.testing.assert_allclose(found[3:, 3:], TURN @ covariance[3:, 3:] @ TURN.T, atol=1e-12)
+
+
+def test_new_curves_become_a_track_and_the_nearest_model():
+    scene, t = rich_scene(), times_of(rich_scene())
+    speed = np.array([0.4, 0, 0.2])
+    quats = rotations.rotvecs_to_quats(np.outer(t - 0.75, (0, 0, 2.0)))
+    turns = rotations.quats_to_rotmats(quats)
+    maps = np.tile(np.eye(4), (len(t), 1, 1))
+    maps[:, :3, :3], maps[:, :3, 3] = turns, (t - 0.75)[:, None] * speed
+    pieces = [
+        dataclasses.replace(piece, matrices=maps) if piece.object_id == 2 else piece for piece in pieces_of(scene)
+    ]
+    result, notes = edit(scene, pieces)
+    assert not [note for note in notes if "model" in note]
+    rows = scene.object_ids == 2
+    bent = np.isin(np.flatnonzero(rows), scene.residual_rows)
+    for k in (0, 5, len(t) - 1):
+        wanted = scene.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
+        np.testing.assert_allclose(scene_player.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
+    np.testing.assert_array_equal(
+        scene_player.frame(result, 0.9).means[~rows], scene_player.frame(scene, 0.9).means[~rows]
+    )
+
+
+def test_a_future_that_no_model_gives_is_said_and_met_nearly():
+    scene, t = rich_scene(), times_of(rich_scene())
+    maps = np.tile(np.eye(4), (len(t), 1, 1))
+    maps[:, 0, 3] = 0.2 * np.sin(40 * np.maximum(t - 0.75, 0))
+    pieces = [
+        dataclasses.replace(piece, matrices=maps) if piece.object_id == 2 else piece for piece in pieces_of(scene)
+    ]
+    _, notes = edit(scene, pieces)
+    assert any(note.startswith("object 2: no motion model") for note in notes)
+
+
+def test_scale_that_changes_with_time_is_said():
+    scene = rich_scene()
+    pieces = pieces_of(scene)
+    pieces[-1].matrices[:5, :3, :3] *= 1.2
+    assert any("scale changes with time" in note for note in edit(scene, pieces)[1])
+
+
+def test_a_still_object_that_was_made_to_move_gets_a_group_of_its_own():
+    scene, t = rich_scene(), times_of(rich_scene())
+    maps = np.tile(np.eye(4), (len(t), 1, 1))
+    maps[:, 2, 3] = 0.5 * (t - 0.75)
+    pieces = [
+        dataclasses.replace(piece, matrices=maps) if (piece.object_id, piece.motion_id) == (0, 0) else piece
+        for piece in pieces_of(scene)
+    ]
+    result, _ = edit(scene, pieces)
+    assert len(result.groups) == len(scene.groups) + 1
+    group = result.groups[-1]
+    assert (group.role, group.object_id, group.model.kind) == ("body", 0, "translation")
+    rows = result.motion_ids == group.id
+    np.testing.assert_allclose(
+        scene_player.frame(result, 0.95).means[rows], result.means[rows] + (0, 0, 0.1), atol=1e-5
+    )
+
+
+def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_first():
+    scene = rich_scene()
+    pieces = pieces_of(scene)
+    first = next(piece for piece in pieces if piece.object_id == 3)
+    aside = matrix_of(np.eye(3), (0.0, 2.0, 0.0))
+    copy = dataclasses.replace(first, object_id=9, mover="the copy", matrices=aside @ first.matrices,
+                               pivot=first.pivot + aside[:3, 3])  # fmt: skip
+    table = {9: dataclasses.replace(scene.object(3), id=9, name="mug two")}
+    result, _ = edit(scene, [*pieces, copy], table)
+    assert result.object(9).name == "mug two" and result.object(9).count == first.count
+    np.testing.assert_array_equal(result.embeddings[-1], scene.embeddings[-1])
+    assert result.lookup.thresholds[-1] == scene.lookup.thresholds[-1]
+    rows, old = result.object_ids == 9, scene.object_ids == 3
+    straight = ~np.isin(np.flatnonzero(old), scene.residual_rows)
+    for t in (0.2, 0.9):
+        np.testing.assert_allclose(
+            scene_player.frame(result, t).means[rows],
+            scene_player.frame(result, t).means[result.object_ids == 3] + aside[:3, 3], atol=2e-5,
+        )  # fmt: skip
+        np.testing.assert_array_equal(
+            scene_player.frame(result, t).means[result.object_ids == 3][straight],
+            scene_player.frame(scene, t).means[old][straight],
+        )
+
+
+def test_names_and_tints_are_taken_and_names_stay_unique():
+    scene = rich_scene()
+    table = {k: dataclasses.replace(scene.object(k), name="cup", aliases=("beaker",)) for k in (1, 2)}
+    pieces = [dataclasses.replace(p, tint=np.array([0.5, 1, 2])) if p.object_id == 1 else p for p in pieces_of(scene)]
+    result, _ = edit(scene, pieces, table)
+    assert [item.name for item in result.objects[2:4]] == ["cup", "cup 2"]
+    assert result.object(1).aliases == ("beaker",)
+    rows = scene.object_ids == 1
+    colour = 0.5 + 0.28209479177387814 * scene.sh[rows, 0]
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * result.sh[rows, 0], colour * (0.5, 1, 2), atol=1e-6)
+    np.testing.assert_array_equal(result.sh[~rows], scene.sh[~rows])
+
+
+def test_everything_may_be_deleted():
+    result, _ = edit(rich_scene(), [])
+    assert len(result.means) == 0 and [item.id for item in result.objects] == [0]

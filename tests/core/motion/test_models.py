@@ -1,0 +1,291 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from r5dgs_core.motion import models, rotations, se3
+from r5dgs_core.motion.models import MotionModel
+from tests.support import problems
+
+OFFSETS = {"offset_rotvec": [0.05, -0.02, 0.1], "offset_displacement": [0.02, 0.01, -0.03]}
+RNG = np.random.default_rng(5)
+WORLD_TWIST = MotionModel(
+    "world_twist",
+    velocity=[0.5, 0.3, -0.9],
+    acceleration=[-0.2, 0.8, 0.5],
+    angular_velocity=[1.2, -0.7, 2.6],
+    angular_acceleration=[0.9, 1.1, -0.4],
+    radius=0.3,
+)
+CASES = {name: model for name, (model, _) in problems.MOTIONS.items()} | {
+    "world twist": WORLD_TWIST,
+    "tumbling": problems.TUMBLING,
+}
+
+
+def with_offsets(model):
+    return MotionModel.from_dict({**model.to_dict(), **OFFSETS})
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_future_starts_at_the_bind_state_to_the_bit(name):
+    quats, displacements = models.evaluate(with_offsets(CASES[name]), np.array([0.0, 0.3]))
+    assert quats[0].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert displacements[0].tolist() == [0.0, 0.0, 0.0]
+    assert (quats[1] != quats[0]).any()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_motion_converges_to_the_fitted_curve(name):
+    model = with_offsets(CASES[name])
+    tau = 40 * model.fade_time
+    quats, displacements = models.evaluate(model, tau)
+    curve_quats, curve, _, _ = models.curve(model, tau)
+    np.testing.assert_allclose(displacements, curve + model.offset_displacement, atol=1e-12)
+    expected = rotations.multiply(curve_quats, rotations.rotvecs_to_quats(model.offset_rotvec))
+    assert rotations.angle_between(quats, expected) < 1e-12
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.013, 1.7])
+def test_many_models_at_once_are_each_by_itself(tau):
+    group = [m for case in CASES.values() for m in (case, with_offsets(case), with_offsets(models.STATIC))]
+    # A kind ignores the rates that are not its own.
+    group.append(MotionModel("translation", velocity=[1, 2, 3], angular_velocity=[3, 2, 1], center_offset=[1, 1, 1]))
+    group.append(MotionModel("static", velocity=[1, 2, 3], angular_velocity=[3, 2, 1]))
+    assert {model.kind for model in group} == set(models.KINDS)
+    quats, displacements = models.evaluate_all(group, tau)
+    for model, quat, displacement in zip(group, quats, displacements, strict=True):
+        expected = models.evaluate(model, tau)
+        allowed = 2e-9 if model.kind == "world_twist" else 1e-12  # its steps may be others
+        np.testing.assert_allclose(quat, expected[0], atol=allowed)
+        np.testing.assert_allclose(displacement, expected[1], atol=allowed)
+    assert [len(x) for x in models.evaluate_all([], tau)] == [0, 0]
+    with pytest.raises(ValueError, match="tau"):
+        models.evaluate_all(group, -0.1)
+
+
+@pytest.mark.parametrize("tau", [1.0, 10.0, 30.0])
+def test_far_in_the_future_twists_are_where_keys_put_them(tau):
+    rates = {"velocity": [1, 0, 0], "acceleration": [0, 1, 0]}
+    twist = MotionModel("world_twist", **rates, angular_velocity=[5, 0, 0], angular_acceleration=[0, 5, 0])
+    stack = models.Stack([twist])
+    quat, displacement = models.evaluate(twist, tau)
+    quats, displacements = stack.poses(tau)
+    assert rotations.angle_between(quats[0], quat) < 1e-8
+    np.testing.assert_allclose(displacements[0], displacement, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rates_are_the_exact_derivative(name):
+    model, tau, h = with_offsets(CASES[name]), np.array([0.01, 0.4, 1.7]), 1e-6
+    _, _, spins, velocities = models.evaluate_with_rates(model, tau)
+    (q0, d0), (q1, d1) = models.evaluate(model, tau - h), models.evaluate(model, tau + h)
+    np.testing.assert_allclose((d1 - d0) / (2 * h), velocities, atol=2e-7)
+    turn = rotations.quats_to_rotvecs(rotations.multiply(q1, rotations.conjugate(q0)))
+    np.testing.assert_allclose(turn / (2 * h), spins, atol=2e-7)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_distances_are_kept(name):
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    quats, displacements = models.evaluate(with_offsets(CASES[name]), 2.3)
+    moved = rotations.rotate(quats, points) + displacements
+    before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_jumps_at_t_max_and_speeds_are_finite(name):
+    model = with_offsets(CASES[name])
+    quats, displacements, spins, velocities = models.evaluate_with_rates(model, np.array([0.0, 1e-9, 1e-8]))
+    assert rotations.angle_between(quats, quats[0]).max() < 1e-6
+    assert np.abs(displacements).max() < 1e-6
+    assert np.isfinite(spins).all() and np.isfinite(velocities).all()
+    assert np.abs(velocities).max() < 100
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_single_precision_keeps_distances_relative_to_the_pivot(name):
+    points = RNG.normal(size=(30, 3))
+    quats, _ = models.evaluate(with_offsets(CASES[name]), 2.3)
+    moved = rotations.rotate(quats, points).astype(np.float32)
+    before, after = (np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (points, moved))
+    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in models.KINDS if kind != "static"])
+@pytest.mark.parametrize("rate", ["velocity", "acceleration", "angular_velocity", "angular_acceleration"])
+@pytest.mark.parametrize("size", [1e30, 1e200, 1e308])
+def test_overflow_is_finite_or_told(kind, rate, size, caplog):
+    models._warn_of_wild_motion.cache_clear()
+    inertia = np.diag([1.0, 2.0, 2.5]) if kind == "free_top" else None
+    vector = [0.3 * size, 0.0, 0.8 * size]
+    wild = MotionModel(
+        kind, inertia=inertia, **{"velocity": [0.1, 0, 0], "angular_velocity": [0, 0.1, 0], rate: vector}
+    )
+    sane = CASES["hinge"]
+    quats, displacements = models.evaluate_all([sane, wild], 0.8)
+    expected = models.evaluate_all([sane, models.STATIC], 0.8)
+    np.testing.assert_array_equal(quats[0], expected[0][0])
+    np.testing.assert_array_equal(displacements[0], expected[1][0])
+    for part in (quats, displacements, *models.evaluate_with_rates(wild, np.array([0.0, 0.8]))):
+        assert np.isfinite(part).all()
+    if quats[1].tolist() == [1, 0, 0, 0] and not displacements[1].any():
+        assert "leaves the range of numbers" in caplog.text or wild.is_static or not wild.turns
+
+
+def test_velocity_and_spin_at_t_max_are_those_of_the_model():
+    for kind in ("ballistic_spin", "constant_twist", "world_twist"):
+        model = MotionModel(kind, velocity=[1, 2, 3], angular_velocity=[0.1, -0.2, 0.3])
+        _, _, spin, velocity = models.evaluate_with_rates(model, 0.0)
+        np.testing.assert_allclose(spin, model.angular_velocity)
+        np.testing.assert_allclose(velocity, model.velocity)
+
+
+def test_a_hinge_keeps_its_axis_in_place():
+    model = problems.MOTIONS["hinge, accelerating"][0]
+    quats, displacements = models.evaluate(model, np.linspace(0, 3, 20))
+    axis_point = rotations.rotate(quats, np.broadcast_to(model.center_offset, displacements.shape)) + displacements
+    np.testing.assert_allclose(axis_point, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "spring"])
+def test_a_swing_comes_back_after_each_period(name):
+    model = CASES[name]
+    period = 2 * np.pi / model.frequency
+    tau = np.linspace(0, period, 9)
+    for here, later in zip(models.curve(model, tau), models.curve(model, tau + 3 * period), strict=True):
+        np.testing.assert_allclose(later, here, atol=1e-12)
+    assert np.abs(models.curve(model, 0.5 * period)[1]).max() > 0.1
+
+
+def test_a_pendulum_keeps_its_axis_in_place():
+    model = CASES["pendulum"]
+    quats, displacements = models.evaluate(model, np.linspace(0, 3, 20))
+    hook = rotations.rotate(quats, np.broadcast_to(model.center_offset, displacements.shape)) + displacements
+    np.testing.assert_allclose(hook, np.broadcast_to(model.center_offset, displacements.shape), atol=1e-12)
+
+
+def test_a_spring_is_pulled_back_in_proportion_to_its_way():
+    model, tau, h = CASES["spring"], np.linspace(0, 2, 11), 1e-4
+    rest = model.acceleration / model.frequency**2  # of d, where nothing pulls
+    before, here, after = (models.curve(model, tau + shift)[1] for shift in (-h, 0, h))
+    np.testing.assert_allclose((after - 2 * here + before) / h**2, -(model.frequency**2) * (here - rest), atol=1e-4)
+
+
+def test_the_clocks_run_steadily_without_a_frequency_to_the_bit_and_smoothly_towards_it():
+    tau = np.array([[-2.0], [0.0], [0.3], [7.1]])
+    once, twice = models.clocks(0.0, tau)
+    assert once.tolist() == tau.tolist()
+    assert twice.tolist() == (0.5 * tau**2).tolist()
+    for frequency in (1e-200, 1e-9, 1e-5):
+        for slow, still in zip(models.clocks(frequency, tau), (once, twice), strict=True):
+            np.testing.assert_allclose(slow, still, rtol=1e-9)
+    for frequency in (0.01, 0.07, 0.5, 3.0):
+        once, twice = models.clocks(frequency, tau)
+        np.testing.assert_allclose(once, np.sin(frequency * tau) / frequency, rtol=1e-12)
+        np.testing.assert_allclose(twice, 2 * (np.sin(0.5 * frequency * tau) / frequency) ** 2, rtol=1e-12)
+
+
+def test_a_model_that_does_not_swing_is_written_as_before():
+    assert "frequency" not in MotionModel("translation", velocity=[1, 0, 0]).to_dict()
+    assert MotionModel.from_dict(CASES["spring"].to_dict()).frequency == CASES["spring"].frequency
+
+
+def test_a_screw_is_a_hinge_where_it_does_not_advance():
+    tau = np.linspace(0, 3, 7)
+    w, u = np.array([0, 0, 2.0]), np.array([0.5, 0.2, 0.0])
+    hinge = MotionModel("ballistic_spin", angular_velocity=w, center_offset=u)
+    screw = MotionModel("constant_twist", angular_velocity=w, velocity=-np.cross(w, u))
+    for x, y in zip(models.evaluate(hinge, tau), models.evaluate(screw, tau), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-12)
+
+
+def test_world_twist_equals_many_magnus_steps():
+    m = WORLD_TWIST
+    rates = (m.angular_velocity, m.velocity, m.angular_acceleration, m.acceleration)
+    for tau in (0.1, 1.0, 4.0):
+        quats, displacements = models.evaluate(m, tau)
+        fine_quats, fine = se3.integrate(*rates, tau, 8192)
+        assert rotations.angle_between(quats, fine_quats) < 1e-8
+        np.testing.assert_allclose(displacements, fine, atol=1e-8)
+
+
+def test_world_twist_does_not_depend_on_the_other_times_asked_for():
+    together = models.evaluate(WORLD_TWIST, np.array([0.2, 9.0]))
+    alone = models.evaluate(WORLD_TWIST, 0.2)
+    for x, y in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(x[0], y)
+
+
+def test_batches_of_any_shape_equal_single_times():
+    tau = np.array([[0.0, 0.1, 0.2], [0.7, 1.5, 3.0]])
+    for model in CASES.values():
+        quats, displacements = models.evaluate(model, tau)
+        assert quats.shape == (2, 3, 4)
+        assert displacements.shape == (2, 3, 3)
+        one = models.evaluate(model, 1.5)
+        np.testing.assert_allclose(quats[1, 1], one[0], atol=1e-14)
+        np.testing.assert_allclose(displacements[1, 1], one[1], atol=1e-13)
+
+
+@settings(max_examples=50)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=3), st.floats(1e-6, 1e3), st.sampled_from(models.KINDS))
+def test_json_restores_a_model_to_the_bit(vector, number, kind):
+    names = ("velocity.x", "velocity.y")
+    model = MotionModel(
+        kind,
+        velocity=vector,
+        offset_rotvec=vector,
+        fade_time=number,
+        inertia=np.diag([number, number / 3, 1e-3]) if kind == "free_top" else None,
+        covariance=np.eye(2) / 3,
+        covariance_names=names,
+    )
+    back = MotionModel.from_dict(json.loads(json.dumps(model.to_dict())))
+    assert back == model
+    assert back.to_dict() == model.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "teleport"}, "kind"),
+        ({"velocity": [1, 2]}, "velocity"),
+        ({"velocity": [1, 2, math.nan]}, "velocity"),
+        ({"velocity": "fast"}, "velocity"),
+        ({"fade_time": 0.0}, "fade_time"),
+        ({"radius": -1.0}, "radius"),
+        ({"frequency": -1.0}, "frequency"),
+        ({"frequency": math.nan}, "frequency"),
+        ({"speed": 3}, "speed"),
+        ({"kind": "free_top"}, "inertia"),
+        ({"inertia": np.eye(3).tolist()}, "inertia"),
+        ({"kind": "free_top", "inertia": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "inertia"),
+        ({"kind": "free_top", "inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "inertia"),
+        ({"covariance": [[1.0]]}, "covariance"),
+    ],
+)
+def test_malformed_models_are_refused_by_the_name_of_the_key(change, message):
+    data = {**MotionModel().to_dict(), **change}
+    with pytest.raises(ValueError, match=message):
+        MotionModel.from_dict(data)
+
+
+def test_times_before_t_max_are_refused():
+    with pytest.raises(ValueError, match="tau"):
+        models.evaluate(MotionModel(), -0.1)
+
+
+def test_static_and_turning_are_told_apart():
+    assert MotionModel().is_static
+    assert not MotionModel(offset_displacement=[0, 0, 1e-9]).is_static
+    assert not MotionModel("translation", velocity=[1, 0, 0]).turns
+    assert MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1]).turns
+    assert MotionModel("static", offset_rotvec=[0.1, 0, 0]).turns
+    assert MotionModel("ballistic_spin", center_offset=[1, 0, 0]).is_static
+    assert MotionModel("ballistic_spin", frequency=3.0).is_static
+    assert not MotionModel("ballistic_spin", angular_acceleration=[0, 0, 1], frequency=3.0).is_static

@@ -1,0 +1,101 @@
+"""One gravity for all that falls."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion.models import MotionModel
+from r5dgs_core.motion_fit import model_selection, shared_gravity
+from tests.support import problems
+from tests.support.problems import RADIUS, SIZE, T_MAX
+
+TIMES = np.linspace(0, T_MAX, 15)
+G = np.array([0.0, 0.0, -9.0])
+
+
+def body(velocity, acceleration, spin=(0, 0, 0)):
+    kind = "ballistic_spin" if any(spin) else "translation"
+    return MotionModel(kind, velocity=velocity, acceleration=acceleration, angular_velocity=spin)
+
+
+FALLING = [body([1, 0, -2], G), body([-0.5, 1, 1], G, (1, 2, 0.5)), body([0, 0.4, -4], G)]
+BRAKING = body([1.5, 0, 0], [-3.0, 0, 0])
+SLIDING = body([0.5, 0.2, 0], [0, 0, 0])
+
+
+def observed(truths, rng, sigma=0.005 * SIZE):
+    tracks, fits, lasts = [], [], []
+    for truth in truths:
+        quats, d, last_quat, last = problems.observe(truth, TIMES, rng, sigma, 2 * sigma)
+        tracks.append(shared_gravity.Track(TIMES, quats, d, np.ones(len(TIMES))))
+        fits.append(model_selection.fit(TIMES, quats, d, radius=RADIUS))
+        lasts.append((last_quat, last))
+    return tracks, fits, lasts
+
+
+@pytest.mark.parametrize("up", [None, np.array([0, 0, 2.0])])
+def test_bodies_that_fall_share_gravity_and_are_predicted_better(up):
+    rng, alone, together, sharing = np.random.default_rng(0), [], [], []
+    for _ in range(4):
+        tracks, fits, lasts = observed(FALLING, rng)
+        shared, who = shared_gravity.share(tracks, fits, up)
+        assert {0, 2} <= set(who)
+        sharing += who
+        for i in who:
+            truth, before, after, last = FALLING[i], fits[i], shared[i], lasts[i]
+            alone.append(problems.error_percent(before.model, truth, np.array([1.25]), *last)[0])
+            together.append(problems.error_percent(after.model, truth, np.array([1.25]), *last)[0])
+            np.testing.assert_array_equal(after.model.acceleration, shared[0].model.acceleration)
+            assert after.chosen == before.chosen
+            assert (after.band <= before.band * 1.5).all()
+            if up is not None:
+                np.testing.assert_allclose(after.model.acceleration[:2], 0, atol=1e-12)
+    assert 1 in sharing  # where noise gave it no other motion
+    assert np.median(together) < 0.75 * np.median(alone)
+
+
+def test_who_disagrees_does_not_share():
+    tracks, fits, _ = observed([*FALLING[:2], BRAKING, SLIDING], np.random.default_rng(1), 0.002 * SIZE)
+    assert fits[2].chosen == "translation, quadratic"
+    shared, who = shared_gravity.share(tracks, fits)
+    assert who == (0, 1)
+    assert shared[2] is fits[2]
+    assert shared[3] is fits[3]
+    assert np.linalg.norm(shared[0].model.acceleration - G) < 0.3
+
+
+def test_two_that_disagree_or_one_alone_stay_as_they_are():
+    tracks, fits, _ = observed([FALLING[0], BRAKING], np.random.default_rng(2), 0.002 * SIZE)
+    for count in (0, 1, 2):
+        shared, who = shared_gravity.share(tracks[:count], fits[:count])
+        assert who == ()
+        assert all(x is y for x, y in zip(shared, fits, strict=False))
+
+
+def test_bodies_that_brake_alike_do_not_share_where_only_falling_counts():
+    tracks, fits, _ = observed([BRAKING, BRAKING], np.random.default_rng(3), 0.002 * SIZE)
+    assert shared_gravity.share(tracks, fits)[1] == (0, 1)
+    assert shared_gravity.share(tracks, fits, np.array([0, 0, 1.0]))[1] == ()
+
+
+def test_bodies_that_came_to_rest_do_not_share():
+    tracks, fits, _ = observed(FALLING, np.random.default_rng(4))
+    fits[0] = dataclasses.replace(fits[0], rested=True)
+    assert shared_gravity.share(tracks, fits)[1] == (1, 2)
+
+
+def test_without_noise_gravity_is_exact():
+    tracks, fits, lasts = observed(FALLING, np.random.default_rng(5), 1e-9)
+    shared, who = shared_gravity.share(tracks, fits)
+    assert who == (0, 1, 2)
+    for truth, fit, last in zip(FALLING, shared, lasts, strict=True):
+        assert problems.error_percent(fit.model, truth, np.array([1.25]), *last)[0] < 0.01
+
+
+def test_a_direction_that_is_none_is_refused():
+    for up in (np.zeros(3), np.array([1.0, np.nan, 0]), np.ones(2)):
+        with pytest.raises(ValueError, match="up"):
+            shared_gravity.share([], [], up)

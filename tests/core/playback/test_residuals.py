@@ -1,0 +1,233 @@
+"""Motion of single Gaussians in a scene: residuals before t_max, modes after it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.motion import rotations, se3
+from r5dgs_core.playback import group_dynamics, residuals, scene_info, scene_player
+from r5dgs_core.scene import row_runs, scene_file
+from r5dgs_core.scene.scene import Scene
+from tests.support.scenes import T_MAX, TIMES, make_scene
+
+
+@pytest.fixture
+def bending() -> Scene:
+    """A scene in which every third Gaussian has a residual."""
+    scene, rng = make_scene(90), np.random.default_rng(1)
+    rows = np.arange(0, 90, 3, dtype=np.int32)
+    fade = (T_MAX - TIMES)[None, :, None]
+    turns = rotations.rotvecs_to_quats(rng.normal(size=(len(rows), 1, 3)) * fade)
+    return dataclasses.replace(
+        scene,
+        residual_rows=rows,
+        residual_offsets=(rng.normal(size=(len(rows), 1, 3)) * fade).astype(np.float32),
+        residual_quats=turns.astype(np.float32),
+        residual_log_scales=(rng.normal(size=(len(rows), 1, 3)) * fade).astype(np.float32),
+    )
+
+
+def twisting(scene: Scene) -> Scene:
+    """The scene with dynamics in which each body moves by one twist."""
+    rng = np.random.default_rng(2)
+    dynamics = np.zeros((len(scene.means), 12), np.float32)
+    for group in scene.groups:
+        rows = np.flatnonzero(scene.motion_ids == group.id)
+        if group.role != "body":
+            continue
+        v, w, a, e = rng.normal(size=(4, 3))
+        v, a = se3.recentre(w, v, e, a, scene.means[rows].astype(float))
+        tile = np.ones((len(rows), 1))
+        dynamics[rows] = np.concatenate([v, tile * w, a, tile * e], -1)
+    return dataclasses.replace(scene, dynamics=dynamics, canonical_means=scene.means.copy())
+
+
+@pytest.mark.parametrize("k", [0, 3, 7])
+def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
+    frame, i = scene_player.frame(bending, float(TIMES[k])), 11
+    row = int(bending.residual_rows[i])
+    group = bending.groups[int(bending.motion_ids[row])]
+    q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
+    bent = bending.means[row] + bending.residual_offsets[i, k]
+    np.testing.assert_allclose(frame.means[row], group.pivot + rotations.rotate(q, bent - group.pivot) + d, atol=1e-5)
+    turned = rotations.multiply(bending.residual_quats[i, k].astype(float), bending.quats[row].astype(float))
+    assert rotations.angle_between(rotations.multiply(q, turned), frame.quats[row].astype(float)) < 1e-4
+    np.testing.assert_allclose(frame.log_scales[row], bending.log_scales[row] + bending.residual_log_scales[i, k])
+
+
+def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
+    times = np.linspace(0.0, T_MAX, 201)
+    paths = np.stack([scene_player.frame(bending, t).means for t in times])
+    steps = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
+    assert steps.max() < 0.2
+    np.testing.assert_array_equal(scene_player.frame(bending, T_MAX).means, bending.means)
+    np.testing.assert_array_equal(scene_player.frame(bending, -1.0).means, scene_player.frame(bending, 0.0).means)
+
+
+def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
+    flipped = bending.residual_quats.copy()
+    flipped[:, ::2] *= -1
+    other = dataclasses.replace(bending, residual_quats=flipped)
+    for t in (0.02, 0.13, 0.5):
+        a, b = scene_player.frame(bending, t).quats, scene_player.frame(other, t).quats
+        assert rotations.angle_between(a.astype(float), b.astype(float)).max() < 1e-3
+
+
+def test_equal_twists_move_a_body_rigidly_in_mode_standard():
+    scene = twisting(make_scene())
+    frame = scene_player.frame(scene, 1.0, "standard")
+    for start, stop, g in row_runs.runs(scene.motion_ids):
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-4)
+        assert scene.groups[g].role == "body" or (before == after).all()
+
+
+def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
+    scene = twisting(make_scene())
+    standard, literal = (scene_player.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
+    np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
+    body = scene.motion_ids == 1
+    turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
+    canonical = scene.canonical_means.astype(float)
+    canonical[body] = rotations.rotate(turn, canonical[body])
+    turned = dataclasses.replace(scene, canonical_means=canonical.astype(np.float32))
+    off = scene_player.frame(turned, 1.0, "rigid_paper").means.astype(float)
+    after, before = off[body], scene.means[body].astype(float)
+    pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+    assert np.abs(pairs[1] - pairs[0]).max() > 0.05
+
+
+@pytest.fixture(scope="module")
+def twisted() -> Scene:
+    return twisting(make_scene(300, shadows=False))
+
+
+@pytest.mark.parametrize("mode", scene_player.every())
+def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
+    scene = twisted
+    assert mode in scene_player.modes(scene)
+    frame, rigid = scene_player.frame(scene, T_MAX, mode), scene_player.frame(scene, 0.2)
+    for name in ("means", "quats"):
+        np.testing.assert_array_equal(getattr(frame, name), getattr(scene, name))
+        np.testing.assert_array_equal(getattr(scene_player.frame(scene, 0.2, mode), name), getattr(rigid, name))
+    np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
+
+
+@pytest.mark.parametrize("source", group_dynamics.SOURCES[1:])
+def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
+    scene = twisted
+    for t in (0.8, 1.1):
+        rigid, own = scene_player.frame(scene, t, f"rigid/{source}"), scene_player.frame(scene, t, "standard")
+        np.testing.assert_allclose(rigid.means, own.means, atol=3 * residuals.TOLERANCE * scene.extent)
+        assert rotations.angle_between(rigid.quats.astype(float), own.quats.astype(float)).max() < 2e-3
+        np.testing.assert_allclose(rigid.shading_factor, own.shading_factor, atol=2e-3)
+        since = rigid.group_quats[scene.motion_ids[own.turned_rows]]
+        assert rotations.angle_between(since, own.turned_quats).max() < 2e-3
+
+
+@pytest.mark.parametrize("mode", [mode for mode in scene_player.every() if mode.startswith("rigid/")])
+def test_sources_move_every_group_rigidly_for_long(twisted, mode):
+    scene = twisted
+    player, t = scene_player.Player(scene, mode), T_MAX + 4.0
+    _, displacements = player.group_poses(t)
+    for start, stop, g in row_runs.runs(scene.motion_ids):
+        frame = player.frame(t, scene.groups[g].pivot + displacements[g])
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=5e-7 if scene.groups[g].role == "body" else 2e-6)
+
+
+def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
+    """The scene with residuals of a size in the observed time for some rows."""
+    offsets = np.zeros((len(rows), len(TIMES), 3), np.float32)
+    offsets[:, :-1, 0] = size
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), len(TIMES), 1))
+    return dataclasses.replace(
+        scene, residual_rows=rows, residual_offsets=offsets, residual_quats=quats, residual_log_scales=0 * offsets
+    )
+
+
+@pytest.mark.parametrize("variant", ["", "/least_squares"])
+def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
+    dynamics = twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2)
+    dynamics[np.flatnonzero(twisted.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
+    scene = dataclasses.replace(twisted, dynamics=dynamics)
+    rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
+    everyone = np.arange(len(scene.means), dtype=np.int32)
+    some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
+    for rows, size in ((None, 0.0), (everyone, 1e-3), (some, 0.5), (everyone, 0.5)):
+        changed = scene if rows is None else loose(scene, rows, size)
+        frame = scene_player.frame(changed, 1.1, f"hybrid{variant}")
+        free = np.zeros(len(scene.means), bool)
+        if rows is not None and size > 0.1:
+            free[rows] = True
+        elif rows is not None:
+            free[scene.motion_ids == 0] = True  # what is pinned by rule has no motion that explains anything
+        for name in ("means", "quats", "shading_factor"):
+            np.testing.assert_array_equal(getattr(frame, name)[free], getattr(own, name)[free])
+            np.testing.assert_array_equal(getattr(frame, name)[~free], getattr(rigid, name)[~free])
+
+
+def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
+    """Where f_def is a translation, offsets in the canonical state are those at t_max."""
+    dynamics = twisted.dynamics.copy()
+    dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
+    dynamics[:, 9:] *= 0.1
+    moved = twisted.means + np.float32(0.3) * (twisted.motion_ids[:, None] == 1)
+    scene = dataclasses.replace(twisted, dynamics=dynamics, canonical_means=moved.astype(np.float32))
+    literal, rigid = (scene_player.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
+    np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
+    np.testing.assert_allclose(literal.quats, rigid.quats, atol=1e-4)
+
+
+def test_an_anchored_background_goes_with_its_representative(twisted):
+    still = twisted.motion_ids == 0
+    dynamics = twisted.dynamics.copy()
+    dynamics[still, :3] = [0.3, 0.0, -0.1]
+    scene = dataclasses.replace(twisted, dynamics=dynamics)
+    pinned, anchored = (scene_player.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
+    np.testing.assert_array_equal(pinned.means[still], scene.means[still])
+    moved = 0.25 * np.array([0.3, 0.0, -0.1])
+    np.testing.assert_allclose(anchored.means[still], scene.means[still] + moved, atol=1e-6)
+    body = scene.motion_ids == 1
+    np.testing.assert_array_equal(anchored.means[body], pinned.means[body])
+
+
+def test_modes_without_canonical_places_lack_the_literal_form():
+    scene = dataclasses.replace(twisting(make_scene(60)), canonical_means=None)
+    assert {scene_player.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
+
+
+def test_a_mode_without_data_is_refused():
+    with pytest.raises(ValueError, match="has rigid, not 'standard'"):
+        scene_player.frame(make_scene(), 1.0, "standard")
+
+
+def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
+    scene = twisting(bending)
+    exact = scene_file.read(scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True))
+    small = scene_file.read(scene_file.write(scene, tmp_path / "small.r5dgs"))
+    for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
+        np.testing.assert_array_equal(getattr(exact, name), getattr(scene, name))
+        np.testing.assert_allclose(getattr(small, name), getattr(scene, name), atol=2e-3)
+    assert scene_info.info(small)["modes"] == list(scene_player.modes(scene))
+    assert scene_info.info(small)["residuals"] == 30
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"residual_quats": None}, "all four"),
+        ({"residual_rows": np.arange(30, dtype=np.int32)[::-1].copy()}, "increasing rows"),
+        ({"residual_offsets": np.ones((30, len(TIMES), 3), np.float32)}, "zero at t_max"),
+        ({"canonical_means": np.zeros((90, 3), np.float32)}, "dynamics"),
+    ],
+)
+def test_inconsistent_residuals_are_not_written(bending, tmp_path, change, named):
+    with pytest.raises(errors.SceneFileError, match=named):
+        scene_file.write(dataclasses.replace(bending, **change), tmp_path / "bad.r5dgs")

@@ -1,0 +1,212 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.motion import key_reduction, models, rotations
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import row_runs
+from tests.support.scenes import T_MAX, make_scene
+
+AFTER = np.nextafter(T_MAX, 1.0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(objects=5, sh_degree=1)
+
+
+def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
+    frame = scene_player.frame(scene, T_MAX)
+    np.testing.assert_array_equal(frame.means, scene.means)
+    np.testing.assert_array_equal(frame.quats, scene.quats)
+    assert (frame.shading_factor == 1).all()
+    assert (frame.group_quats == rotations.identity(len(scene.groups))).all()
+    assert (frame.group_displacements == 0).all()
+
+
+def test_playback_is_continuous_at_t_max(scene):
+    for t in (np.nextafter(T_MAX, 0.0), AFTER, T_MAX + 1e-9, T_MAX - 1e-9):
+        frame = scene_player.frame(scene, t)
+        np.testing.assert_allclose(frame.means, scene.means, atol=1e-6)
+        assert rotations.angle_between(frame.group_quats, rotations.identity(1)).max() < 1e-7
+
+
+def test_knots_are_met_exactly(scene):
+    for k, t in enumerate(scene.track_times):
+        quats, displacements = scene_player.group_poses(scene, t)
+        np.testing.assert_allclose(displacements, scene.track_poses[:, k, 4:], atol=1e-12)
+        assert rotations.angle_between(quats, scene.track_poses[:, k, :4]).max() < 1e-7
+
+
+def test_before_the_first_time_the_first_pose_is_held(scene):
+    for first, early in zip(scene_player.group_poses(scene, 0.0), scene_player.group_poses(scene, -3.0), strict=True):
+        np.testing.assert_array_equal(first, early)
+
+
+def test_between_knots_the_curve_is_smooth_and_near_the_motion(scene):
+    times = np.linspace(0.001, T_MAX - 0.001, 400)
+    quats, displacements = (np.stack(x) for x in zip(*(scene_player.group_poses(scene, t) for t in times), strict=True))
+    for group in scene.groups[1:6]:
+        true_quats, true, _, _ = models.curve(group.model, times - T_MAX)
+        assert np.linalg.norm(displacements[:, group.id] - true, axis=-1).max() < 2e-3
+        assert rotations.angle_between(quats[:, group.id], true_quats).max() < 2e-3
+    inner = scene.track_times[1:-1]
+    before, at, after = (np.stack([scene_player.group_poses(scene, t + h)[1] for t in inner]) for h in (-1e-7, 0, 1e-7))
+    np.testing.assert_allclose((at - before) / 1e-7, (after - at) / 1e-7, atol=1e-4)
+
+
+def test_keys_at_the_knots_reproduce_playback(scene):
+    """Blender's Bezier keys with handles at a third are cubic Hermite curves: `key_reduction.evaluate` is their
+    rule.
+    """
+    quats, displacements = scene_player.knots(scene)
+    quat_slopes, slopes = scene_player.knot_slopes(scene)
+    times = np.linspace(0, T_MAX, 131)
+    for g in range(len(scene.groups)):
+        location = key_reduction.Keys(scene.track_times, displacements[g], slopes[g], slopes[g])
+        rotation = key_reduction.Keys(scene.track_times, quats[g], quat_slopes[g], quat_slopes[g])
+        keyed = key_reduction.evaluate(location, times), key_reduction.evaluate(rotation, times, unit=True)
+        played = [scene_player.group_poses(scene, t) for t in times]
+        np.testing.assert_allclose(keyed[0], np.stack([p[1][g] for p in played]), atol=1e-12)
+        np.testing.assert_allclose(keyed[1], np.stack([p[0][g] for p in played]), atol=1e-12)
+
+
+def test_slopes_are_exact_for_parabolas_on_uneven_times():
+    times = np.array([0.0, 0.1, 0.35, 0.4, 0.9])
+    values = np.stack([3 * times**2 - times, 2 + 0 * times], -1)
+    expected = np.stack([6 * times - 1, 0 * times], -1)
+    np.testing.assert_allclose(scene_player.slopes(times, values), expected, atol=1e-12)
+    np.testing.assert_allclose(scene_player.slopes(times[:2], values[:2])[0, 0], (values[1, 0] - values[0, 0]) / 0.1)
+    assert (scene_player.slopes(times[:1], values[:1]) == 0).all()
+
+
+def test_signs_in_the_file_do_not_matter(scene):
+    flipped = scene.track_poses.copy()
+    flipped[:, ::2, :4] *= -1
+    other = dataclasses.replace(scene, track_poses=flipped)
+    for t in (0.13, 0.5, 0.74):
+        for a, b in zip(scene_player.group_poses(scene, t), scene_player.group_poses(other, t), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-14)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.33, 0.9, 3.0])
+def test_every_group_moves_rigidly(scene, t):
+    frame = scene_player.frame(scene, t)
+    for start, stop, g in row_runs.runs(scene.motion_ids):
+        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+        np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-6)
+        pivot, q, d = scene.groups[g].pivot, frame.group_quats[g], frame.group_displacements[g]
+        np.testing.assert_allclose(after, pivot + rotations.rotate(q, before - pivot) + d, atol=1e-6)
+        own = rotations.multiply(q, scene.quats[start:stop].astype(float))
+        assert rotations.angle_between(own, frame.quats[start:stop].astype(float)).max() < 1e-6
+
+
+def test_pinned_gaussians_never_change(scene):
+    still = scene.motion_ids == 0
+    for t in (0.0, 2.0):
+        frame = scene_player.frame(scene, t)
+        np.testing.assert_array_equal(frame.means[still], scene.means[still])
+        assert (frame.shading_factor[still] == 1).all()
+
+
+def test_a_follower_takes_its_leaders_displacement_without_turning(scene):
+    shadow = next(g for g in scene.groups if g.follows is not None)
+    quats, displacements = scene_player.group_poses(scene, 1.4)
+    np.testing.assert_allclose(displacements[shadow.id], shadow.follow_matrix @ displacements[shadow.follows])
+    assert np.linalg.norm(displacements[shadow.id]) > 0.1
+    assert quats[shadow.id].tolist() == [1, 0, 0, 0]
+
+
+def test_shading_follows_the_light_in_the_objects_frame(scene):
+    frame = scene_player.frame(scene, 1.1)
+    row = int(np.flatnonzero(scene.motion_ids == 1)[0])
+    rotmat = rotations.quats_to_rotmats(frame.group_quats[1])
+    light = scene.light_direction
+    expected = 1 + (rotmat.T @ light - light) @ scene.shading[row]
+    assert frame.shading_factor[row] == pytest.approx(max(expected, 0), rel=1e-5)
+    dark = dataclasses.replace(scene, shading=scene.shading * 1e4)
+    assert scene_player.frame(dark, 1.1).shading_factor.min() == 0
+    assert scene_player.frame(make_scene(shading=False), 1.1).shading_factor is None
+
+
+def test_sh_rotations_bring_directions_into_the_bind_frame(scene):
+    quats, _ = scene_player.group_poses(scene, 0.2)
+    direction = np.array([0.6, 0.0, 0.8])
+    back = scene_player.sh_rotations(quats) @ direction
+    np.testing.assert_allclose(rotations.rotate(quats, back), np.broadcast_to(direction, back.shape), atol=1e-12)
+
+
+def test_scenes_without_gaussians_objects_or_motion_play():
+    empty = make_scene(n=0, objects=0, unassigned=0)
+    assert len(scene_player.frame(empty, 5.0).means) == 0
+    still = make_scene(n=30, objects=0)
+    np.testing.assert_array_equal(scene_player.frame(still, 5.0).means, still.means)
+    base = make_scene()
+    single = dataclasses.replace(base, track_times=base.track_times[-1:], track_poses=base.track_poses[:, -1:])
+    np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.means)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e4])
+@pytest.mark.parametrize("t", [T_MAX / 2, 2.0, 100 * T_MAX])
+def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
+    """Where the origin is the body's own place, to single precision of the body's size."""
+    away = np.array([1.0, -1.0, 0.5]) * shift
+    groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
+    moved = dataclasses.replace(scene, means=(scene.means + away).astype(np.float32), groups=groups)
+    player = scene_player.Player(moved)
+    _, displacements = player.group_poses(t)
+    for start, stop, g in row_runs.runs(moved.motion_ids):
+        if moved.groups[g].role == "body":
+            frame = player.frame(t, moved.groups[g].pivot + displacements[g])
+            before, after = moved.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+            pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+            apart = pairs[0] > 0.1
+            assert np.abs(pairs[1] / np.where(apart, pairs[0], 1) - 1)[apart].max() < 1e-6
+
+
+@pytest.mark.parametrize("t", [0.3, T_MAX, 1.2])
+def test_an_origin_only_shifts_the_centres(scene, t):
+    player, origin = scene_player.Player(scene), np.array([3.0, -40.0, 7.5])
+    plain, shifted = player.frame(t), player.frame(t, origin)
+    np.testing.assert_allclose(shifted.means + origin, plain.means, atol=5e-6)
+    np.testing.assert_array_equal(shifted.quats, plain.quats)
+    np.testing.assert_array_equal(shifted.shading_factor, plain.shading_factor)
+    assert (plain.origin == 0).all() and (shifted.origin == origin).all()
+    again = player.frame(t)
+    np.testing.assert_array_equal(again.means, plain.means)
+
+
+def test_frames_are_their_own_whatever_a_player_showed_before(scene):
+    player = scene_player.Player(scene)
+    first = player.frame(1.1)
+    kept = first.means.copy()
+    for t in (0.2, T_MAX, 1.7, 1.1):
+        frame = player.frame(t)
+        for one, other in zip(
+            dataclasses.astuple(frame), dataclasses.astuple(scene_player.frame(scene, t)), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(first.means, kept)
+
+
+def test_modes_have_one_spelling_and_a_default_variant(scene):
+    assert scene_player.split("rigid") == ("rigid", "fitted") == scene_player.split("rigid/fitted")
+    assert scene_player.split("rigid_paper") == ("rigid_paper", "pinned")
+    assert scene_player.split("hybrid/kabsch") == ("hybrid", "kabsch")
+    assert scene_player.split("standard") == ("standard", "")
+    assert scene_player.modes(scene) == ("rigid",)
+    assert len(set(scene_player.every())) == len(scene_player.every()) == 5 + 5 + 1 + 2
+    for mode in ("wobbly", "rigid/mean", "rigid/", "standard/fitted", "", None):
+        with pytest.raises(ValueError, match="mode: expected one of"):
+            scene_player.split(mode)
+
+
+def test_unknown_modes_and_times_are_refused(scene):
+    with pytest.raises(ValueError, match="mode"):
+        scene_player.frame(scene, 1.0, mode="wobbly")
+    with pytest.raises(ValueError, match="origin"):
+        scene_player.frame(scene, 1.0, origin=np.array([0.0, np.nan, 0.0]))
+    with pytest.raises(ValueError, match="finite"):
+        scene_player.frame(scene, float("nan"))

@@ -1,0 +1,57 @@
+"""Identities in a whole training: resumed to the same bits, with the geometry or beside it, and baked."""
+
+import numpy as np
+import pytest
+import torch
+
+from r5dgs_core.bake import bake
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train.trainer import Trainer
+from tests.support import tiny_datasets
+
+CHANGES = ("train.iterations=40", "identity.spatial=1.0", "identity.every=3", "identity.samples=100")
+
+
+def make(data, training):
+    return Trainer(datasets.read(data.root), tiny_datasets.settings(*CHANGES, f"identity.training={training}"))
+
+
+def train_to(trainer, iteration):
+    while trainer.iteration < iteration:
+        trainer.step()
+    return trainer
+
+
+@pytest.mark.parametrize(("training", "broken_at"), [("joint", 20), ("detached", 9)])  # at 20 Gaussians just grew
+def test_identities_go_on_to_the_same_bits_with_the_geometry(tiny, tmp_path, training, broken_at):
+    unbroken = train_to(make(tiny, training), broken_at)
+    checkpoint.save(tmp_path, unbroken.state())
+    resumed = make(tiny, training)
+    resumed.restore(checkpoint.load(tmp_path))
+    states = [train_to(trainer, 24).state() for trainer in (unbroken, resumed)]
+    assert states[0].tensors.keys() == states[1].tensors.keys()
+    for name, tensor in states[0].tensors.items():
+        assert torch.equal(tensor, states[1].tensors[name]), name
+
+
+def test_detached_identities_leave_the_geometry_as_it_is_and_joint_ones_do_not(tiny):
+    without, detached, joint = (train_to(make(tiny, how), 24) for how in ("off", "detached", "joint"))
+    assert "identities" not in without.gaussians.params
+    for name, values in without.gaussians.params.items():
+        assert torch.equal(values, detached.gaussians.params[name]), name
+    assert not torch.equal(without.gaussians.means, joint.gaussians.means[: len(without.gaussians)])
+
+
+@pytest.mark.parametrize("training", ["joint", "detached", "off"])
+def test_a_run_hands_its_identities_to_the_scene(tiny, tmp_path, training):
+    settings = tiny_datasets.settings(*CHANGES, f"identity.training={training}")
+    finished = run.train(tiny.root, tmp_path / "run", settings)
+    scene = bake.bake(finished, datasets.read(tiny.root))
+    if training == "off":
+        assert scene.identities is None and scene.classifier_weight is None
+        return
+    assert scene.identities.shape == (len(scene.means), 16) and scene.classifier_weight.shape == (3, 16)
+    answers = (scene.identities.astype(np.float32) @ scene.classifier_weight.T + scene.classifier_bias).argmax(1)
+    agreement = (answers == np.maximum(scene.object_ids, 0)).mean()
+    assert agreement > (0.5 if training == "joint" else 0.8)

@@ -1,0 +1,139 @@
+"""What images can tell of a body: texture tells its turn, masks how much is seen, backdrops whether it is there."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.scene import cameras
+from r5dgs_core.train import train_views
+from r5dgs_core.train.initialization import evidence, initialize, triangulation
+from tests.support import scenes
+
+TIMES = np.linspace(0.0, 1.0, 5)
+RADIUS = 0.5
+BALL = 3
+
+
+def ball_view(camera, t, center, paint, light=None, marked=True, shown=True, wall=(0.5, 0.5, 0.5)):
+    """A view of a ball before a wall; ``paint`` gives the colours of normals [n, 3], ``light`` shades them."""
+    rays = cameras.pixel_rays(camera)
+    arm = np.asarray(center) - camera.center
+    along = rays @ arm
+    gap = RADIUS**2 - (arm @ arm - along**2)
+    hit = (gap > 0) & shown
+    image = np.tile(np.asarray(wall, np.float64), (*hit.shape, 1))
+    normals = (camera.center + rays * (along - np.sqrt(np.maximum(gap, 0)))[..., None] - center)[hit] / RADIUS
+    shade = 1.0 if light is None else np.clip(0.7 + 0.3 * normals @ np.asarray(light), 0, 1)[:, None]
+    image[hit] = paint(normals) * shade
+    mask = np.where(hit & marked, BALL, 0).astype(np.uint16)
+    return train_views.TrainView(
+        "v", camera, float(t), np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), mask, None
+    )
+
+
+def plain(normals):
+    return np.tile([0.8, 0.7, 0.2], (len(normals), 1))
+
+
+def checkered(normals):
+    cells = np.floor(4 * normals).astype(int).sum(1) % 2
+    return np.where(cells[:, None] == 1, [0.8, 0.7, 0.2], [0.3, 0.2, 0.6])
+
+
+def banded(normals):
+    """Rings about the z axis: a turn about it does not show."""
+    return 0.5 + np.sin(5 * normals[:, 2:]) * [0.3, 0.3, -0.2]
+
+
+def ring(count=4):
+    return [scenes.orbit_camera(2 * np.pi * k / count) for k in range(count)]
+
+
+def stiffness(paint, light=None):
+    seen = [ball_view(c, t, [0, 0, 0.3], paint, light) for t in TIMES for c in ring()]
+    return evidence.turn_stiffness(seen, triangulation.locate(seen, TIMES, 5e-4), TIMES)[0]
+
+
+def test_texture_leaves_rotations_free_and_its_lack_makes_them_stiff():
+    for matrix in stiffness(checkered):
+        assert np.linalg.eigvalsh(matrix)[-1] < 1.5
+    for light in (None, [0.4, 0.3, 0.8]):  # shading is no texture: it stays as the ball turns
+        for matrix in stiffness(plain, light):
+            assert np.linalg.eigvalsh(matrix)[0] > 30
+
+
+def test_a_turn_that_does_not_show_is_stiff_about_its_own_axis_alone():
+    for matrix in stiffness(banded):
+        values, axes = np.linalg.eigh(matrix)
+        assert abs(axes[2, -1]) > 0.98 and values[-1] > 5 * values[1]
+
+
+def test_stiffness_grows_as_less_is_seen_up_to_a_limit():
+    found = evidence.shift_stiffness(np.array([[1.0, 0.5, 0.1, 0.0]]))[0]
+    assert found.tolist() == [1.0, 2.0, 10.0, evidence.STIFFEST]
+
+
+@pytest.mark.parametrize(("shown", "gone"), [(False, True), (True, False)])
+def test_an_object_without_masks_is_absent_only_if_its_place_looks_empty(shown, gone):
+    """Before time 0.5 no mask shows the ball: either it is not there, or it is not marked yet."""
+    path = np.array([-0.8, 0.0, 0.3]) + TIMES[:, None] * np.array([1.6, 0.2, 0.0])
+    seen = [
+        ball_view(c, t, p, checkered, marked=t >= 0.5, shown=shown or t >= 0.5)
+        for t, p in zip(TIMES, path, strict=True)
+        for c in ring()
+    ]
+    places = triangulation.locate(seen, TIMES, 5e-4)
+    assert places.measured[0].tolist() == [False, False, True, True, True]
+    found = evidence.absent(seen, places, TIMES)
+    assert found[0].tolist() == [gone, gone, False, False, False]
+
+
+def test_an_object_that_rests_unmarked_is_not_absent_though_it_always_looked_so():
+    seen = [ball_view(c, t, [0, 0, 0.3], checkered, marked=t > 0.6) for t in TIMES for c in ring()]
+    places = triangulation.locate(seen, TIMES, 5e-4)
+    assert not evidence.absent(seen, places, TIMES).any()
+
+
+def test_an_object_behind_another_or_out_of_the_frame_is_not_absent():
+    hidden, outside = [], []
+    for t in TIMES:
+        for camera in ring():
+            view = ball_view(camera, t, [0, 0, 0.3], checkered, marked=t > 0.3)
+            cover = np.where(t > 0.3, view.mask, 7).astype(np.uint16)  # something else fills the picture
+            hidden.append(dataclasses.replace(view, mask=cover))
+            outside.append(ball_view(camera, t, [0, 0, 0.3 if t > 0.3 else 9.0], checkered))
+    for seen in (hidden, outside):
+        places = triangulation.locate(seen, TIMES, 5e-4)
+        row = places.object_ids.tolist().index(BALL)
+        if seen is outside:
+            places.centers[row, :2, 2] = 9.0
+        assert not places.measured[row, :2].any()
+        assert not evidence.absent(seen, places, TIMES)[row].any()
+
+
+def at(camera, t):
+    return train_views.TrainView("v", camera, float(t), np.zeros((4, 4, 3), np.uint8), None, None)
+
+
+def test_knots_are_the_observed_times():
+    seen = [at(c, t) for t in (0.0, 0.1, 0.5, 0.7) for c in ring()]
+    assert initialize.observed_times(seen).tolist() == [0.0, 0.1, 0.5, 0.7]
+    assert initialize.observed_times(seen[:1]).tolist() == [0.0]
+    alone = [at(c, t) for c, t in zip(ring(), (0.0, 0.01, 0.011, 0.5), strict=True)]  # each camera one time
+    assert initialize.observed_times(alone).tolist() == [0.0, 0.01, 0.011, 0.5]
+
+
+def test_cameras_a_little_out_of_step_share_their_knots():
+    shifts = [0.0, 0.001, -0.002, 0.003]
+    seen = [at(c, 0.1 * k + shift) for k in range(1, 9) for c, shift in zip(ring(), shifts, strict=True)]
+    knots = initialize.observed_times(seen)
+    assert len(knots) == 8 and knots[0] == seen[2].t and knots[-1] == seen[-1].t
+    np.testing.assert_allclose(knots[1:-1], 0.1 * np.arange(2, 8) + 0.0005, atol=1e-9)
+
+
+def test_too_many_times_give_knots_among_them_where_they_are_dense():
+    times = np.concatenate([np.linspace(0, 0.2, 300), np.linspace(0.3, 1, 100)])
+    knots = initialize.observed_times([at(ring()[0], t) for t in times], limit=40)
+    assert len(knots) == 40 and np.isin(knots, np.round(times, 9)).all() and (np.diff(knots) > 0).all()
+    assert knots[0] == 0 and knots[-1] == 1 and (knots < 0.25).sum() == pytest.approx(30, abs=1)

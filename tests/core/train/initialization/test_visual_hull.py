@@ -1,0 +1,96 @@
+"""Points carved from masks lie in every mask, and something comes back even where nothing can be carved."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.train import normalization, train_views
+from r5dgs_core.train.initialization import visual_hull
+from tests.support import tiny_datasets
+
+
+@pytest.fixture(scope="module")
+def posed(tiny):
+    """Views of one time, the time, and the way to training coordinates."""
+    dataset = datasets.read(tiny.root)
+    norm = normalization.from_cameras([v.camera for v in dataset.train])
+    every = train_views.load(dataset, norm, None)
+    t = every[18].t
+    return [v for v in every if v.t == t], t, norm
+
+
+def carve(seen, object_id, center, count=200, seed=0):
+    return visual_hull.carve(seen, object_id, center, 0.6, count, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("object_id", [tiny_datasets.BRICK, tiny_datasets.BALL])
+def test_carved_points_fall_on_the_object_wherever_it_is_not_hidden(tiny, posed, object_id):
+    seen, t, norm = posed
+    center = (tiny.center(object_id, t) - norm.origin) / norm.scale
+    points, colors = carve(seen, object_id, center)
+    assert points.shape == colors.shape == (200, 3)
+    assert (colors >= 0).all() and (colors <= 1).all()
+    for view in seen:
+        columns, rows, valid = visual_hull.pixel_indices(view, points)
+        assert valid.all()
+        assert (view.mask[rows, columns] != 0).all()  # the object, or another one before it
+
+
+def test_carved_points_have_the_colours_of_the_object(tiny, posed):
+    seen, t, norm = posed
+    painted = [
+        dataclasses.replace(v, image=np.where((v.mask == 1)[..., None], [200, 30, 30], 60).astype(np.uint8))
+        for v in seen
+    ]
+    center = (tiny.center(1, t) - norm.origin) / norm.scale
+    _, colors = carve(painted, 1, center)
+    np.testing.assert_allclose(colors, np.tile([200, 30, 30], (200, 1)) / 255, atol=1e-6)
+
+
+def test_one_wrong_mask_does_not_empty_the_hull(tiny, posed):
+    seen, t, norm = posed
+    center = (tiny.center(1, t) - norm.origin) / norm.scale
+    wrong = [dataclasses.replace(seen[0], mask=np.zeros_like(seen[0].mask)), *seen[1:]]
+    points, _ = carve(wrong, 1, center)
+    for view in seen[1:]:
+        columns, rows, _ = visual_hull.pixel_indices(view, points)
+        assert (view.mask[rows, columns] != 0).mean() > 0.95
+
+
+def test_views_that_lack_the_objects_id_do_not_outvote_those_that_have_it(tiny, posed):
+    seen, t, norm = posed
+    center = (tiny.center(1, t) - norm.origin) / norm.scale
+    unmarked = [dataclasses.replace(v, mask=np.where(v.mask == 1, 0, v.mask)) for v in seen[2:]]
+    points, colors = carve([*seen[:2], *unmarked], 1, center)
+    for view in seen[:2]:
+        columns, rows, _ = visual_hull.pixel_indices(view, points)
+        assert (view.mask[rows, columns] != 0).all()
+    assert (colors.max(1) > 0.05).all()
+
+
+def test_a_ball_that_nothing_agrees_on_has_the_objects_mean_colour(posed):
+    seen, _, _ = posed
+    painted = [
+        dataclasses.replace(v, image=np.full_like(v.image, [90, 150, 30]), mask=np.where(v.mask == 1, 5, 0))
+        for v in seen
+    ]
+    _, colors = carve(painted, 5, np.array([0.0, 0.0, 50.0]), count=40)
+    np.testing.assert_allclose(colors, np.tile([90, 150, 30], (40, 1)) / 255, atol=1e-6)
+
+
+def test_without_any_agreement_a_small_ball_is_the_start(posed):
+    seen, _, _ = posed
+    points, colors = carve(seen, 9, np.array([0.1, 0.2, 0.3]), count=50)
+    assert points.shape == (50, 3) and np.isfinite(colors).all()
+    assert np.linalg.norm(points - [0.1, 0.2, 0.3], axis=1).max() < 0.6
+
+
+def test_views_without_mask_and_points_behind_a_camera_have_no_say(tiny, posed):
+    seen, t, norm = posed
+    center = (tiny.center(2, t) - norm.origin) / norm.scale
+    blind = [*seen, dataclasses.replace(seen[0], mask=None)]
+    np.testing.assert_array_equal(carve(blind, 2, center)[0], carve(seen, 2, center)[0])
+    _, _, valid = visual_hull.pixel_indices(seen[0], (seen[0].camera.center - 2 * seen[0].camera.forward)[None])
+    assert not valid.any()

@@ -1,0 +1,21 @@
+"""The learned sky shows each camera its own rays."""
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from r5dgs_core.train import background
+from tests.support import scenes
+
+
+def test_images_of_other_sizes_show_their_own_part_of_the_sky():
+    coefficients = np.random.default_rng(0).normal(size=(9, 3)) * 0.2
+    sky, camera = background.learned(coefficients), scenes.orbit_camera(0.3, 8, 6)
+    for width, height in ((8, 6), (12, 4), (5, 3)):  # the first two of as many pixels
+        cut = dataclasses.replace(camera, width=width, height=height)
+        shown = sky.image(cut)
+        assert shown.shape == (height, width, 3)
+        assert torch.equal(shown, background.learned(coefficients).image(cut))
+    whole, part = sky.image(camera), sky.image(dataclasses.replace(camera, width=5, height=3))
+    torch.testing.assert_close(part, whole[:3, :5])

@@ -1,0 +1,68 @@
+"""Looking at held-out views tells how a run goes and changes none of its numbers."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from r5dgs_core.data import dataset as datasets
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.train import checkpoint, run
+from r5dgs_core.train import probe as train_probe
+from r5dgs_core.train.trainer import Trainer
+from tests.support import tiny_datasets
+
+
+def events_of(root, folder, *overrides):
+    found = []
+    settings = tiny_datasets.settings("train.iterations=45", "identity.iterations=3", *overrides)
+    run.train(root, folder, settings, progress=found.append)
+    return [event for event in found if event["event"] == "step"]
+
+
+def test_a_run_that_looks_at_held_out_views_ends_with_the_same_bits(tiny, tmp_path):
+    looking = events_of(tiny.root, tmp_path / "looking", "train.probe_every=7")
+    blind = events_of(tiny.root, tmp_path / "blind", "train.probe_every=0")
+    ours, theirs = (checkpoint.load(tmp_path / name) for name in ("looking", "blind"))
+    assert all(torch.equal(ours.tensors[name], tensor) for name, tensor in theirs.tensors.items())
+    assert ours.tensors.keys() == theirs.tensors.keys() and ours.running_loss == theirs.running_loss
+    seen = [event["iteration"] for event in looking if "val_psnr" in event]
+    assert seen == [7, 14, 21, 28, 35, 42, 45] and not any("val_psnr" in event for event in blind)
+    logged = [json.loads(line) for line in (tmp_path / "looking" / checkpoint.LOG_FILE).read_text().splitlines()]
+    assert logged == looking and {10, 20, 30, 40} < {event["iteration"] for event in logged}
+
+
+def test_training_raises_what_held_out_views_say(tiny, tmp_path):
+    found = [e["val_psnr"] for e in events_of(tiny.root, tmp_path / "run", "train.probe_every=5") if "val_psnr" in e]
+    assert 5 < found[0] < found[-1] < 60
+
+
+def test_the_look_agrees_with_the_evaluation(tiny, trained, baked):
+    dataset = datasets.read(tiny.root)
+    trainer = Trainer(dataset, trained.config)
+    trainer.restore(checkpoint.load(trained.folder))
+    probe = train_probe.Probe(trainer, 5)
+    assert len(probe) == len(dataset.val) == 2
+    result = evaluate.evaluate(baked, dataset)
+    assert probe.psnr() == pytest.approx(result["splits"]["val"]["rigid"]["psnr"], abs=0.1)
+
+
+def test_few_views_are_taken_where_few_are_wanted(tiny):
+    trainer = Trainer(datasets.read(tiny.root), tiny_datasets.settings())
+    assert len(train_probe.Probe(trainer, 1)) == 1
+
+
+def test_without_held_out_views_nothing_is_looked_at(tmp_path):
+    data = tiny_datasets.make_dataset(tmp_path / "data", views=3)
+    (data.root / "transforms_val.json").unlink()
+    steps = events_of(data.root, tmp_path / "run", "train.probe_every=1", "train.iterations=3")
+    assert [event["iteration"] for event in steps] == [3] and "val_psnr" not in steps[0]
+
+
+@pytest.mark.parametrize("levels", [1, 10, 255])
+def test_the_psnr_is_that_of_a_constant_error(levels):
+    target = np.zeros((4, 5, 3), np.uint8)
+    image = np.full((4, 5, 3), levels / 255, np.float32)
+    assert train_probe.psnr(image, target) == pytest.approx(20 * np.log10(255 / levels))
+    assert train_probe.psnr(target.astype(np.float32), target) == 99

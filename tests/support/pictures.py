@@ -1,0 +1,58 @@
+"""A data set made of a synthetic scene's own pictures, id maps and poses: what is measured on it is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from r5dgs_core.data import dataset, images
+from r5dgs_core.evaluation import evaluate
+from r5dgs_core.motion import rotations
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import cameras
+from r5dgs_core.scene.scene import Scene
+from tests.support import scenes
+
+WIDTH, HEIGHT = 48, 36
+OBSERVED, LATER = (0.0, 0.3, 0.75), (0.85, 1.0)
+BACKEND = "reference"
+
+
+def write_dataset(root: Path, scene: Scene) -> dataset.Dataset:
+    """The scene's own pictures, id maps and poses, written in a layout that `dataset.read` knows and read back."""
+    views = {
+        "train": [(k, t) for t in OBSERVED for k in (0, 1)],
+        "val": [(2, 0.1), (2, 0.6)],
+        "test": [(k, t) for t in LATER for k in (0, 2)],
+    }
+    for split, wanted in views.items():
+        frames = []
+        for i, (k, t) in enumerate(wanted):
+            camera = scenes.orbit_camera(0.5 * k, WIDTH, HEIGHT)
+            shown = evaluate.render(scene, camera, t, backend=BACKEND)
+            images.write_png(root / split / f"r_{i}.png", shown.color)
+            images.write_png(root / "object_mask" / split / f"r_{i}.png", shown.ids.astype(np.uint8))
+            matrix = cameras.cam_world_to_opengl(camera.T_cam_world).tolist()
+            frame = {"file_path": f"{split}/r_{i}", "time": t, "transform_matrix": matrix, "view": f"cam{k}"}
+            frames.append(frame)
+        camera_file = {"camera_angle_x": 0.9, "frames": frames}
+        (root / f"transforms_{split}.json").write_text(json.dumps(camera_file))
+    times = sorted({*OBSERVED, *LATER})
+    bodies = [group for group in scene.groups if group.role == "body"]
+    rows = []
+    for group in bodies:
+        offset = np.eye(4)  # the object's own frame is not the scene's
+        offset[:3, :3] = rotations.quats_to_rotmats(rotations.normalize(np.array([1.0, 0.3, -0.5, group.id])))
+        offset[:3, 3] = [0.1 * group.id, -0.2, 5.0]
+        matrices = []
+        for t in times:
+            quats, displacements = scene_player.group_poses(scene, t)
+            motion = np.eye(4)
+            motion[:3, :3] = rotations.quats_to_rotmats(quats[group.id])
+            motion[:3, 3] = group.pivot + displacements[group.id] - motion[:3, :3] @ group.pivot
+            matrices.append((motion @ offset).tolist())
+        rows.append({"id": group.object_id, "name": scene.object(group.object_id).name, "matrices": matrices})
+    (root / "ground_truth.json").write_text(json.dumps({"t_max": 0.75, "times": times, "objects": rows}))
+    return dataset.read(root)
