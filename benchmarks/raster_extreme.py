@@ -3,7 +3,7 @@
 A row is a scene, drawn by the `cpu` backend in float32 and by the `reference` in float64 from the same float32 numbers.
 ``image`` is the largest difference of colours and alpha (both in [0, 1]), ``depth`` that of depth times alpha relative
 to the largest depth, ``gradient`` the largest difference of a gradient relative to the largest entry of its tensor, for
-a random gradient of image, alpha and depth. Tests hold all of them to the bars of docs/raster.md.
+a random gradient of image, alpha and depth. Tests hold all of them to the bars of docs/reference/rasterizer.md.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
         progress_kind: How progress is shown (`progress.make`).
 
     Returns:
-        What is in `RESULT_FILE` (docs/bench.md).
+        What is in `RESULT_FILE` (docs/user/bench.md).
 
     Raises:
         ConfigError, DatasetError, CheckpointError: As `cases.make`, before anything is trained.

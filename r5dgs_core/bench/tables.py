@@ -1,7 +1,7 @@
 """A benchmark as the paper's two tables: for the terminal, as Markdown, and as rows that other programs compare.
 
-Notation: a record is one case in one mode (docs/bench.md); a line of a table is what the seeds of one scene, variant
-and mode have in common: their mean, and half of their range behind a plus-minus where there are several.
+Notation: a record is one case in one mode (docs/user/bench.md); a table row summarises the seeds of one scene, variant
+and mode by their mean and, if there are several, half of their range behind a plus-minus sign.
 """
 
 from __future__ import annotations

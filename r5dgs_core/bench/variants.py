@@ -8,7 +8,7 @@ from typing import Any
 from ..config import config as configs
 from ..config.presets import PRESETS
 
-# The method has its identities trained with the geometry (docs/field.md). All their losses at a twentieth: the
+# The method has its identities trained with the geometry (docs/user/field.md). All their losses at a twentieth: the
 # encodings, whose optimizer does not feel the scale, learn as at the paper's weights, and the geometry is not harmed.
 _IDENTITIES = {"identity.training": "joint", "identity.weight": "0.05", "identity.spatial": "0.1"}
 _FIELD = {"train.representation": "field", **_IDENTITIES}

@@ -1,4 +1,4 @@
-"""All codes of `r5dgs check`; docs/check.md has the same table."""
+"""All codes of `r5dgs check`; docs/reference/check.md has the same table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..findings import ERROR, WARNING, Code
 CODES: dict[str, Code] = {
     "D00": Code(ERROR, "another fault of a data set", "follow the message"),
     "D01": Code(ERROR, "no data set in a known layout", "choose the folder with transforms_train.json or sparse"),
-    "D02": Code(ERROR, "camera file damaged", "write the file again, in the layout of docs/dataset.md"),
+    "D02": Code(ERROR, "camera file damaged", "write the file again, in the layout of docs/reference/dataset.md"),
     "D03": Code(ERROR, "frame without usable values", "correct the frame in the camera file"),
     "D04": Code(ERROR, "times for some frames only", "give all frames a time, or none"),
     "D05": Code(ERROR, "camera matrix missing or of another shape", "give a camera-to-world matrix of 4x4 numbers"),

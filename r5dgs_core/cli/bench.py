@@ -37,7 +37,7 @@ def run_bench(
         **options: Other fields of `bench.cases.Plan`.
 
     Returns:
-        The content of ``bench.json`` (docs/bench.md).
+        The content of ``bench.json`` (docs/user/bench.md).
     """
     variants, modes = variants or kinds.DEFAULT_VARIANTS, modes or scene_modes.MODES
     for option, given, known in (

@@ -1,4 +1,4 @@
-"""Exit statuses of the command line, and the status of each kind of error (docs/command_line.md)."""
+"""Exit statuses of the command line, and the status of each kind of error (docs/reference/command_line.md)."""
 
 from __future__ import annotations
 

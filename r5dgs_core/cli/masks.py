@@ -131,7 +131,7 @@ def _check(
         if model is None:
             raise errors.UsageError(
                 "--backend sam2: name the folder of the model with --model DIR, or once with "
-                "'r5dgs config --user set sam2 DIR' (docs/masks.md)"
+                "'r5dgs config --user set sam2 DIR' (docs/user/masks.md)"
             )
         misplaced = {"--from": source, "--unknown": unknown}
     else:

@@ -22,7 +22,7 @@ def parser() -> argparse.ArgumentParser:
         prog="r5dgs",
         description="Train semantic 4D Gaussians from multi-view video, bake them into a scene for Blender, and "
         "evaluate it. Training runs on the CPU.",
-        epilog=_epilog("r5dgs demo", "README.md and docs/command_line.md"),
+        epilog=_epilog("r5dgs demo", "README.md and docs/reference/command_line.md"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"r5dgs {__version__}")
@@ -57,7 +57,7 @@ def _demo(commands: Any) -> None:
         "Train the bundled data set, bake a scene file, measure it on held-out views and draw a contact sheet.\n"
         "Takes about two minutes on two cores.",
         "--out demo",
-        "training.md",
+        "user/training.md",
     )
     p.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="run folder (default: demo)")
     options.add_training(p)
@@ -70,7 +70,7 @@ def _train(commands: Any) -> None:
         "train a data set into a run folder",
         "Train 4D Gaussians from posed images and object masks. A stopped run goes on with --resume.",
         "DATA --out RUN",
-        "training.md",
+        "user/training.md",
     )
     p.add_argument("data", type=Path, help="data set folder: transforms_train.json, or images and sparse/")
     p.add_argument("--out", type=Path, required=True, metavar="RUN", help="run folder")
@@ -86,7 +86,7 @@ def _masks(commands: Any) -> None:
         "make or check the masks of the training images",
         "Make object masks with SAM2, take over masks of another program, or check the masks of a data set.",
         "DATA --backend sam2 --model SAM2_FOLDER",
-        "masks.md",
+        "user/masks.md",
     )
     p.add_argument("data", type=Path, help="data set folder")
     made = "precomputed (a folder; the default), blender (of a capture) or sam2"
@@ -115,7 +115,7 @@ def _associate(commands: Any) -> None:
         "give masks with wrong ids one numbering",
         "Renumber masks whose ids are switched, broken or numbered per video, by the geometry and motion of a run.",
         "RUN --masks FOLDER",
-        "association.md",
+        "user/associate.md",
     )
     p.add_argument("target", type=Path, metavar="RUN|SCENE", help="run folder, best trained without masks, or scene")
     p.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
@@ -133,7 +133,7 @@ def _bake(commands: Any) -> None:
         "turn a run into a scene file",
         "Turn a trained run into the .r5dgs file that Blender loads, and summarise the scene.",
         "RUN --out scene.r5dgs",
-        "training.md",
+        "user/training.md",
     )
     p.add_argument("run", type=Path, help="run folder")
     p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
@@ -151,7 +151,7 @@ def _import(commands: Any) -> None:
         "turn a run of 3DGS and related programs into a scene file",
         "Read a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave and write a scene file.",
         "OUTPUT --data DATA --out scene.r5dgs",
-        "import.md",
+        "user/import.md",
     )
     p.add_argument("run", type=Path, help="run folder of the other program")
     p.add_argument("--out", type=Path, required=True, metavar="FILE.r5dgs", help="scene file to write")
@@ -173,7 +173,7 @@ def _evaluate(commands: Any) -> None:
         "measure a run or scene on held-out views",
         "Render the held-out views of a run or scene, compare them with the images, and write evaluation.json.",
         "RUN --mode rigid --mode standard",
-        "evaluation.md",
+        "reference/evaluation.md",
     )
     p.add_argument("target", type=Path, help="run folder or .r5dgs file")
     p.add_argument("--data", type=Path, metavar="DIR", help="data set (default: the run's own)")
@@ -192,7 +192,7 @@ def _report(commands: Any) -> None:
         "Measure error against run time of motion models, playback modes and rasterizer settings. With --stability\n"
         "run the stiff and extreme cases of the motion code instead; the exit status is 1 if a case fails.",
         "RUN --out report",
-        "report.md",
+        "user/report.md",
     )
     p.add_argument("target", type=Path, nargs="?", metavar="RUN|SCENE", help="run folder or .r5dgs file")
     p.add_argument("data", type=Path, nargs="?", metavar="DATA", help="data set (default: the run's own)")
@@ -216,7 +216,7 @@ def _bench(commands: Any) -> None:
         "train variants on scenes and write the paper's tables",
         "Train variants of the method on data sets, measure each in every playback mode, and write the paper's tables.",
         "DATA1 DATA2 --out tables --seeds 0 1 2",
-        "bench.md",
+        "user/bench.md",
     )
     p.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="data set folders")
     p.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the runs and the tables")
@@ -235,7 +235,7 @@ def _info(commands: Any) -> None:
         "summarise a scene file",
         "Print duration, frames per second, extent, moving objects and quality of a scene file.",
         "scene.r5dgs",
-        "command_line.md",
+        "reference/command_line.md",
     )
     p.add_argument("file", type=Path, help=".r5dgs file")
     p.add_argument("--needs", action="store_true", help="print the table of what the scene needs, too")
@@ -250,7 +250,7 @@ def _check(commands: Any) -> None:
         "List all faults of a data set, run folder, .r5dgs, .ply or .toml file, each with its remedy, errors first.\n"
         "Ends with status 1 if there are errors.",
         "DATA",
-        "check.md",
+        "reference/check.md",
     )
     p.add_argument("target", type=Path, metavar="DATA|RUN|FILE", help="what to check")
     p.add_argument("--json", action="store_true", help="print JSON")
@@ -263,7 +263,7 @@ def _objects(commands: Any) -> None:
         "list the objects of a run or scene, in a table and a picture",
         "List ids, names and sizes of the objects of a run or scene, and draw a picture that names them.",
         "scene.r5dgs --legend legend.png",
-        "objects.md",
+        "user/objects.md",
     )
     p.add_argument("target", type=Path, metavar="RUN|SCENE", help="run folder or .r5dgs file")
     p.add_argument("--data", type=Path, metavar="DIR", help="data set to count pixels in (default: the run's)")
@@ -279,7 +279,7 @@ def _lookup(commands: Any) -> None:
         "store in a scene what words its objects mean",
         "Compute embeddings of the objects and of common nouns with an encoder, and store them in the scene file.",
         "scene.r5dgs --encoder CLIP_FOLDER",
-        "words.md",
+        "user/words.md",
     )
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
     encoder = "folder of the encoder, or 'text' for a small one (default: encoder of 'config --user')"
@@ -298,7 +298,7 @@ def _query(commands: Any) -> None:
         "find the objects that a text names or means",
         "Find the objects of a scene that a text names or means. The exit status is 1 if nothing is found.",
         'scene.r5dgs "red mug"',
-        "words.md",
+        "user/words.md",
     )
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file")
     p.add_argument("text", help="one or several things: 'red mug', 'mugs and lemon'")
@@ -318,7 +318,7 @@ def _name(commands: Any) -> None:
         "name an object of a scene",
         "Change name, aliases and caption of an object in a scene file.",
         'scene.r5dgs 3 "glazed donut" --alias pastry',
-        "words.md",
+        "user/words.md",
     )
     p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file, which is changed")
     p.add_argument("object", help="id or name of the object")
@@ -335,7 +335,7 @@ def _config(commands: Any) -> None:
         "Print every training key with meaning, unit, default and the value in force: of a run, of a TOML file, or\n"
         "the defaults. With --user print the user's settings (paths of weights), or change one of them.",
         "RUN\n  r5dgs config --user set encoder ~/models/clip",
-        "command_line.md",
+        "reference/command_line.md",
     )
     where = p.add_mutually_exclusive_group()
     where.add_argument("target", type=Path, nargs="?", metavar="RUN|FILE.toml", help="run folder or TOML file")
@@ -351,7 +351,7 @@ def _warm_up(commands: Any) -> None:
         "compile the kernels now instead of on first use",
         "Compile the kernels of rasterizer and training once, so that the first picture or training does not wait.",
         "",
-        "raster.md",
+        "reference/rasterizer.md",
     )
     options.add_progress(p)
 

@@ -103,7 +103,7 @@ def measure(
                 )
                 rows.append(row)
     if missing:
-        absent.append(f"images: not computed: {', '.join(missing)} (docs/evaluation.md says what each needs)")
+        absent.append(f"images: not computed: {', '.join(missing)} (docs/reference/evaluation.md says what each needs)")
     return rows, absent
 
 

@@ -81,7 +81,7 @@ def markdown(report: dict[str, Any]) -> str:
         f"## How\n\n`ms` is {CLOCKS[report['clock']]}. Medians of {report['rounds']} rounds in which all methods took "
         f"turns, on {machine['processor']}, "
         f"{machine['cores']} usable cores, {machine['raster_threads']} threads of the rasterizer, "
-        f"GPU: {machine['gpu'] or 'none'}. Docs: docs/report.md.\n"
+        f"GPU: {machine['gpu'] or 'none'}. Docs: docs/user/report.md.\n"
     )
     return "\n".join(parts)
 

@@ -1,7 +1,7 @@
 """A baked scene against the images, masks and true poses of its data set.
 
-The result has one fixed shape (docs/evaluation.md), so that it can be compared across versions. Renderings are rounded
-to 8 bits before they are measured, as a file would hold them.
+The result has one fixed shape (docs/reference/evaluation.md), so that it can be compared across versions. Renderings
+are rounded to 8 bits before they are measured, as in image files.
 """
 
 from __future__ import annotations

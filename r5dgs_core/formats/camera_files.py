@@ -61,7 +61,7 @@ def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
     """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically; the points are none.
 
     Images are named by their paths without the leading folder ``images``, as COLMAP has it. Where views have times,
-    ``times.json`` beside ``sparse`` says them (docs/dataset.md), which COLMAP does not know.
+    ``times.json`` beside ``sparse`` says them (docs/reference/dataset.md), which COLMAP does not know.
 
     Args:
         folder: An existing folder.

@@ -1,4 +1,4 @@
-"""`r5dgs import`: a run folder of others to a scene. docs/import.md says what is taken over and what is not."""
+"""`r5dgs import`: a run folder of others to a scene. docs/user/import.md says what is taken over and what is not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/scene_format.md).
+"""Reading and writing `.r5dgs`: one zip of `.npy` arrays and a `scene.json` (docs/reference/scene_format.md).
 
 Members hold what `Scene` holds, under the same names. Some are stored with fewer bits and restored to float32 on
 reading: quats, log_scales and opacity_logits as int16 fixed point, sh, shading and residuals as float16 (rotations of

@@ -63,7 +63,7 @@ def draw(rows: Sequence[dict[str, Any]]) -> bytes:
     """Loss, PSNR of held-out views (where there are any) and Gaussians over steps and over seconds, as PNG.
 
     Args:
-        rows: Lines of the log (docs/training.md).
+        rows: Lines of the log (docs/reference/run_folder.md).
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""Take the pictures of docs/blender.md in a real Blender with a window.
+"""Take the pictures of docs/user/blender.md in a real Blender with a window.
 
     xvfb-run -a -s "-screen 0 1600x1400x24 +extension GLX" blender --factory-startup --window-geometry 0 0 1600 1400 \\
         --python tests/blender/pictures.py -- SCENE.r5dgs FOLDER [PICTURE ...]
@@ -255,7 +255,7 @@ def run(path: Path, folder: Path, shots: list):
 
 def main(arguments: list[str]) -> None:
     """Take the pictures, then quit Blender."""
-    parser = argparse.ArgumentParser(description="Take the pictures of docs/blender.md.")
+    parser = argparse.ArgumentParser(description="Take the pictures of docs/user/blender.md.")
     parser.add_argument("scene", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument("pictures", nargs="*", choices=[[], *(shot.__name__ for shot in SHOTS)])

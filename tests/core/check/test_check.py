@@ -20,7 +20,7 @@ from r5dgs_core.scene import scene_file
 from tests.core.data.test_dataset import HEIGHT, WIDTH, camera_matrix, write_flat
 from tests.support import colmap_files, scenes
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "check.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "reference" / "check.md"
 CASES = {}
 
 

@@ -117,7 +117,7 @@ def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views
     together.numbering = mask_notes.SCENE
     with pytest.raises(errors.DatasetError, match=r"other settings \(numbering\)"):
         make_masks.make(views, together, tmp_path)
-    mask_notes.write(mask_notes.MaskNotes(unknown=255), tmp_path)  # by hand, as docs/masks.md says
+    mask_notes.write(mask_notes.MaskNotes(unknown=255), tmp_path)  # by hand, as docs/user/masks.md says
     with pytest.raises(errors.DatasetError, match="were made with what masks.json does not say; name another folder"):
         make_masks.make(views, Numbered(), tmp_path)
 
