@@ -56,7 +56,7 @@ def train(
         resume: Go on from the last checkpoint; where training is finished, nothing is done.
         overwrite: Begin again where the folder holds a run; its files stay until the first step can be taken.
         go_on: The command that resumes this run, for messages; by default that of ``r5dgs train``.
-        progress: Called with a dictionary per event (docs/reference/run_folder.md). The time left that a `Timed` reports
+        progress: Called with a dictionary per event (docs/reference/run_folder.md). The time left of a `Timed`
             includes the phases that the caller has added.
 
     Returns:
