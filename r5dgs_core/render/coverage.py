@@ -1,7 +1,7 @@
-"""How much of each pixel belongs to whom: soft masks, the largest shares first, as Cryptomatte keeps them.
+"""Per-pixel coverage of groups of Gaussians: soft masks ranked by share, as in Cryptomatte.
 
-Every group of Gaussians is a channel that is 1 on its own and 0 elsewhere; blended, it is the part of a pixel that the
-group covers before the eye, and all groups together are the pixel's alpha.
+Each group is blended as a channel that is 1 for its own Gaussians and 0 for all others. The result is the part of the
+pixel in which the group is visible; the shares of all groups sum to the pixel's alpha.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 from . import scene_renderer
 
-CHANNELS = 11  # groups in one pass: three as colour, the others as features, so that memory stays small
+CHANNELS = 11  # groups per pass: three as colour, the rest as features; bounds the memory
 
 
 def shares(
@@ -27,19 +27,19 @@ def shares(
     settings: RasterSettings,
     backend: str = "auto",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The groups that cover each pixel most, and how much of it.
+    """Return the groups with the largest shares of each pixel.
 
     Args:
         posed: Gaussians in the world.
-        groups: Group of each Gaussian, -1 for one that covers others without being of interest. [N] int
+        groups: Group of each Gaussian; Gaussians with -1 only occlude others. [N] int
         camera: The camera.
-        ranks: How many groups to keep for each pixel, >= 1.
-        settings: Of the rasterizer.
+        ranks: Number of groups to keep per pixel, >= 1.
+        settings: Rasterizer settings.
         backend: Rasterizer, as for `rasterize`.
 
     Returns:
-        Groups, -1 where there are fewer [H, W, ranks] int32, and their shares in falling order, of at most alpha in
-        all [H, W, ranks] float32.
+        Groups, padded with -1 [H, W, ranks] int32, and their shares in descending order, which sum to at most alpha
+        [H, W, ranks] float32.
     """
     size = (ranks, camera.height * camera.width)
     best, found = np.zeros(size, np.float32), np.full(size, -1, np.int32)
@@ -54,7 +54,7 @@ def shares(
             output = rasterize(
                 gaussians, seen, channels[:, 3:], None, colors=channels[:, :3], settings=settings, backend=backend
             )
-        assert output.features is not None  # they were asked for
+        assert output.features is not None  # features were passed
         image = torch.cat([output.color, output.features], -1)[..., : len(chosen)]
         values = scene_renderer.to_numpy(image, np.float32).reshape(-1, len(chosen))
         for column, group in enumerate(chosen):
@@ -64,7 +64,7 @@ def shares(
 
 
 def _insert(best: np.ndarray, found: np.ndarray, values: np.ndarray, group: int) -> None:
-    """Sort a group's shares [P] into the largest ones so far, [ranks, P] each; most groups are in few pixels."""
+    """Merge the shares of one group [P] into the ranked ones [ranks, P]. Visits only pixels with a share."""
     pixels = np.flatnonzero(values > 0)
     shares, names = values[pixels], np.full(len(pixels), group, np.int32)
     for rank in range(len(best)):

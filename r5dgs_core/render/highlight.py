@@ -1,6 +1,6 @@
-"""Pictures of some objects of a scene: alone on transparency, or among the others, which are dimmed.
+"""Pictures of selected objects: isolated on transparency, or highlighted in the dimmed scene.
 
-Whose a Gaussian is decides its label. An object that is alone shows also what other objects hide of it.
+Selection goes by object id. An isolated object also shows the parts that other objects occlude.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import scene_renderer
 
-DIMMED = 0.3  # of its brightness is left to what is not asked for, and none of its colour
-_ABSENT = -40.0  # logit of an opacity that nothing sees
+DIMMED = 0.3  # brightness factor of unselected objects, which also lose their colour
+_ABSENT = -40.0  # opacity logit of an invisible Gaussian
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601, for display-referred colours
 
 
@@ -29,18 +29,18 @@ def isolate(
     *,
     backend: str = "auto",
 ) -> np.ndarray:
-    """Draw some objects alone.
+    """Render some objects alone.
 
     Args:
         scene: The scene.
         object_ids: The objects.
         camera: The camera, in the scene's world.
-        t: Scene time, past t_max too.
-        mode: Way to move past t_max.
+        t: Scene time, may exceed t_max.
+        mode: Extrapolation mode after t_max.
         backend: Rasterizer.
 
     Returns:
-        Display-referred sRGB and straight alpha, within [0, 1]; black where alpha is 0. [H, W, 4] float32
+        Display-referred sRGB and straight alpha, in [0, 1]; black if alpha is 0. [H, W, 4] float32
     """
     frame = scene_player.frame(scene, t, mode)
     wanted = np.isin(frame.object_ids, list(object_ids))
@@ -48,7 +48,7 @@ def isolate(
         frame, opacity_logits=np.where(wanted, frame.opacity_logits, np.float32(_ABSENT)).astype(np.float32)
     )
     output = scene_renderer.render_frame(scene, alone, camera, background=None, backend=backend)
-    color = scene_renderer.to_numpy(output.color, np.float32)  # over black: alpha is in it
+    color = scene_renderer.to_numpy(output.color, np.float32)  # premultiplied: blended over black
     alpha = np.clip(scene_renderer.to_numpy(output.alpha, np.float32), 0, 1)[..., None]
     straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 1e-6)
     return np.concatenate([np.clip(straight, 0, 1), alpha], axis=-1)
@@ -63,13 +63,12 @@ def highlight(
     *,
     backend: str = "auto",
 ) -> np.ndarray:
-    """Draw the whole scene, gray and dark but for some objects.
+    """Render the whole scene, dark and gray except for some objects.
 
-    A pixel keeps its colour by the share that the objects have in it, so their edges are as soft as they are drawn.
-    Arguments as of `isolate`.
+    Each pixel is blended by the objects' share of it, so their edges stay soft. Arguments as in `isolate`.
 
     Returns:
-        Display-referred sRGB within [0, 1]. [H, W, 3] float32
+        Display-referred sRGB in [0, 1]. [H, W, 3] float32
     """
     frame = scene_player.frame(scene, t, mode)
     wanted = np.isin(frame.object_ids, list(object_ids)).astype(np.float32)

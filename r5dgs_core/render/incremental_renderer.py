@@ -1,8 +1,8 @@
-"""Scenes drawn together frame after frame by one camera: what has not moved since the last frame is not drawn again.
+"""Incremental rendering of scenes with one camera: instances that have not moved since the last frame are reused.
 
-Which instances move is learned from the frames themselves. Under a new camera, or after another change of what is
-shown or behind it, everything is drawn; from the next frame on, the instances that have kept their place are a
-`Backdrop`, and only those that have ever left theirs are drawn into it. The pictures are those of
+Moving instances are detected from the frames themselves. The first frame after a change of camera, background or
+visible instances renders everything. From the next frame on, the instances that have not moved form a `Backdrop`, and
+only instances that have moved at least once are drawn into it. The images equal those of
 `scene_renderer.render_frame`.
 """
 
@@ -23,16 +23,16 @@ from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
 from .scene_renderer import Instance
 
-WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; with more, keeping the rest costs what it saves
+WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; above it, the static layer costs more than it saves
 
 
 @dataclass(frozen=True)
 class Sky:
-    """Whose sky lies behind everything.
+    """Scene whose sky is the background.
 
     Attributes:
-        scene: Which of the scenes.
-        matrix: Map from that scene's world to the world of the picture; what it shifts has no effect. [4, 4]
+        scene: Index of the scene.
+        matrix: Map from that scene's world to the world of the picture; its translation has no effect. [4, 4]
     """
 
     scene: int = 0
@@ -40,13 +40,13 @@ class Sky:
 
 
 class Stage:
-    """Draws one scene, or several in one world, again and again, on the CPU in float32.
+    """Renderer of frame sequences of one or several scenes in one world, on the CPU in float32. Thread-safe.
 
     Args:
-        scenes: What instances are of.
+        scenes: Scenes that the instances refer to.
 
     Attributes:
-        ms_motion: What bringing Gaussians to their places took in the last frame, milliseconds.
+        ms_motion: Time spent posing Gaussians in the last frame, milliseconds.
     """
 
     def __init__(self, scenes: Scene | Sequence[Scene]):
@@ -54,8 +54,8 @@ class Stage:
         self._lock = threading.Lock()
         self._scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         self._gathered = scene_renderer.gather(self._scenes)
-        self._shown: tuple | None = None  # camera, background, ranges and looks of the last frame
-        self._places: list[np.ndarray] = []  # of all instances, where they stood first
+        self._shown: tuple | None = None  # camera, background, ranges and tints of the last frame
+        self._places: list[np.ndarray] = []  # first pose of each instance
         self._moving: set[int] = set()
         self._backdrop = None
 
@@ -68,31 +68,31 @@ class Stage:
         near: float | None = None,
         distance: float = 0.0,
     ) -> RenderOutput:
-        """Render ranges of the scenes' Gaussians, each moved by a matrix of its own.
+        """Render ranges of the scenes' Gaussians, each transformed by its own matrix.
 
         Args:
-            instances: As for `scene_renderer.pose_instances`; compared with those of the last frame one by one.
+            instances: As for `scene_renderer.pose_instances`; compared one by one with those of the last frame.
             camera: The camera, in the world of the picture.
-            sky: The sky behind everything; None for black.
-            near: Gaussians whose centre lies nearer than this depth are not drawn; where None, the scenes' own near
-                plane, of those that have an instance the smallest one in this world.
-            distance: How far before the camera the plane lies that the depths of the result are counted from. A camera
-                that stands very far away has its depths as sharp as one that does not.
+            sky: Sky behind everything; None for black.
+            near: Near plane: Gaussians whose centre has a smaller depth are culled. None for the smallest near plane of
+                the scenes with an instance, in this world's units.
+            distance: Depth in front of the camera at which the returned depths start. It keeps the depths of a very
+                distant camera precise.
 
         Returns:
-            Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance that has the largest share of each
-            pixel, -1 where there is too little of all; tensors without gradient. Hold-outs are black in the colour, and
-            their share of each pixel is ``holdout``; all else is of the other instances alone.
+            Colour (not clamped at 1), alpha, depth and, as ``ids``, the instance with the largest share of each pixel,
+            -1 if the pixel is nearly empty; tensors without gradient. Hold-outs are black in the colour, and
+            ``holdout`` is their share of each pixel; alpha, depth and ids describe the other instances only.
 
         Raises:
-            ValueError: As `scene_renderer.pose_instances`.
+            ValueError: As for `scene_renderer.pose_instances`.
         """
         with self._lock:
             try:
                 return self._render(instances, camera, sky, near, distance)
             except ValueError:
                 self._shown = None
-                scene_renderer.pose_instances(self._gathered, instances)  # numbers the bad one as the caller does
+                scene_renderer.pose_instances(self._gathered, instances)  # raises again, with the caller's numbering
                 raise
 
     def coverage(
@@ -104,17 +104,17 @@ class Stage:
         ranks: int,
         near: float | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How much of each pixel belongs to whom.
+        """Return the groups of instances with the largest shares of each pixel.
 
         Args:
             instances: As for `render`.
             groups: Group of each instance, -1 for none.
             camera: The camera, in the world of the picture.
-            ranks: How many groups to keep for each pixel.
+            ranks: Number of groups to keep per pixel.
             near: As for `render`.
 
         Returns:
-            Groups and shares, of `coverage.shares`. [H, W, ranks] each
+            Groups and shares, as in `coverage.shares`. [H, W, ranks] each
         """
         with self._lock:
             settings = RasterSettings(near_plane=self._near(instances) if near is None else near)
@@ -161,17 +161,17 @@ class Stage:
         return RenderOutput(picture.image[..., :3], picture.alpha, depth, None, picture.ids)
 
     def _place(self, instance: Instance) -> np.ndarray:
-        """What of an instance changes as it moves: its matrix, that of its world, and its time where it bends. [33]"""
+        """Pose of an instance: its matrix, its world matrix, and its time if it has residuals. [33]"""
         world = np.eye(4) if instance.world is None else instance.world
         t = np.array([instance.t if posed_scene.bends(self._gathered, instance) else np.inf], np.float64)
         return np.concatenate([np.ravel(instance.matrix), np.ravel(world), t]).astype(np.float64)
 
     def _near(self, instances: Sequence[Instance]) -> float:
-        """The near plane of the scenes that have an instance, in the world of the picture."""
+        """Return the smallest near plane of the scenes with an instance, in units of the picture's world."""
         planes = {
             self._scenes[one.scene].near_plane * _scale(one)
             for one in instances
-            if 0 <= one.scene < len(self._scenes)  # who asks for another is refused later
+            if 0 <= one.scene < len(self._scenes)  # `pose_instances` reports other indices
         }
         return min((plane for plane in planes if plane > 0), default=NEAR_PLANE)
 
@@ -212,7 +212,7 @@ class Stage:
     def _splats(
         self, instances: Sequence[Instance], part: list[int], camera: Camera, distance: float
     ) -> tuple[torch.Tensor, ...]:
-        """Means, quats, scales, opacities, channels and owners of some instances; channels are colours, and depths."""
+        """Means, quats, scales, opacities, channels and owners of some instances; channels are colours, then depths."""
         posed = self._pose([instances[i] for i in part])
         gaussians = scene_renderer.PosedGaussians(posed)
         channels = scene_renderer.tensor(scene_renderer.colors(posed, camera))
@@ -264,13 +264,13 @@ class Stage:
 
 
 def _depths(posed: scene_renderer.PosedScene, camera: Camera, distance: float) -> torch.Tensor:
-    """Depths of centres beyond a distance, computed in float64. [N, 1] float32"""
+    """Depths of centres minus ``distance``, computed in float64. [N, 1] float32"""
     depths = (posed.means + posed.origin) @ camera.T_cam_world[2, :3] + (camera.T_cam_world[2, 3] - distance)
     return scene_renderer.tensor(depths[:, None])
 
 
 def _mean(blended: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
-    """What was blended without a background, per alpha; 0 where that is 0. [H, W]"""
+    """Divide a blend without background by its alpha; 0 if alpha is 0. [H, W]"""
     return torch.where(alpha > 0, blended / torch.where(alpha > 0, alpha, 1), 0)
 
 
@@ -279,18 +279,18 @@ def _look(instance: Instance) -> tuple | None:
 
 
 def _scale(instance: Instance) -> float:
-    """How many units of the picture's world one of the scene's own is, over all directions; NaN where that is none."""
+    """Units of the picture's world per unit of the scene's, averaged over all directions; NaN for a NaN matrix."""
     if instance.world is None:
         return 1.0
     return float(abs(np.linalg.det(np.asarray(instance.world, np.float64)[:3, :3])) ** (1 / 3))
 
 
 def _owners(instances: Sequence[Instance], part: Sequence[int]) -> np.ndarray:
-    """Which instance each Gaussian of some instances belongs to. [n] int32"""
+    """Instance that each Gaussian of some instances belongs to. [n] int32"""
     return np.repeat(np.asarray(part, np.int32), [instances[i].count for i in part])
 
 
 def _ranks(instances: Sequence[Instance], part: list[int]) -> np.ndarray:
-    """Place of each Gaussian of some instances among those of all. [n]"""
+    """Index of each Gaussian of some instances among the Gaussians of all instances. [n]"""
     starts = np.cumsum([0, *(instance.count for instance in instances)])
     return np.concatenate([np.arange(starts[i], starts[i + 1]) for i in part] or [np.arange(0)])

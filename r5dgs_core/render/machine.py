@@ -1,4 +1,4 @@
-"""What times, and in the last bits numbers, depend on: versions and the machine."""
+"""Package versions and machine description, which timings and the last bits of results depend on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..raster.cpu import compilation
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result may depend on."""
+    """Versions of Python and of the packages that affect results."""
     import numba
     import OpenImageIO as oiio
 
@@ -30,13 +30,13 @@ def versions() -> dict[str, str]:
 
 
 def describe() -> dict[str, Any]:
-    """What a run's times, and in the last bits its numbers, depend on beside the versions."""
+    """Description of the machine: system, processor, cores, threads and GPU."""
     processor = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         processor = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), processor)
     except OSError:
-        pass  # another system
+        pass  # no procfs on this system
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "system": platform.platform(),

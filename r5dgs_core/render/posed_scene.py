@@ -1,4 +1,4 @@
-"""Gaussians in the pose of a picture: a frame of playback, or ranges of scenes' Gaussians, each moved by a matrix."""
+"""Posed Gaussians for one picture: a playback frame, or ranges of scenes' Gaussians, each with its own matrix."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from ..playback import affine_transform, posing, scene_player
 from ..playback.residuals import Residuals
 from ..scene.scene import Scene
 
-MANY = 16  # stretches that are worth gathering their rows
+MANY = 16  # shortest run of equal instances whose rows are gathered
 
 
 @dataclass(frozen=True)
 class Instance:
-    """A range of a scene's Gaussians somewhere else than in its bind state.
+    """A transformed range of a scene's Gaussians.
 
     Attributes:
         start: First row.
         count: Number of rows.
         matrix: Affine map from the bind state to the world of the picture. [4, 4]
-        scene: Which of several scenes.
-        world: Map from that scene's own world, in which its light stands, to the world of the picture; None where they
-            are the same. [4, 4]
-        tint: Factors >= 0 on the display-referred red, green and blue; None for 1.
-        t: Scene time at which Gaussians with residuals are bent, before the matrix moves them; None for not at all.
+        scene: Index of the scene.
+        world: Map from the scene's own world, which its light is fixed to, to the world of the picture; None for the
+            identity. [4, 4]
+        tint: Factors >= 0 on display-referred red, green and blue; None for 1.
+        t: Scene time at which residuals are applied, before the matrix; None to leave them out.
         holdout: True if the Gaussians cut a hole into the picture instead of being visible.
     """
 
@@ -46,16 +46,16 @@ class Instance:
 
 @dataclass(frozen=True)
 class Gathered:
-    """The Gaussians of several scenes one after the other, as one set of arrays. S scenes.
+    """The Gaussians of several scenes, concatenated. S scenes.
 
     Attributes:
         means, quats, log_scales, opacity_logits, object_ids: As in `Scene`.
-        sh: Of the largest degree, zero where a scene's is smaller. [N, K, 3]
+        sh: Padded with zeros to the largest degree. [N, K, 3]
         starts: First row of each scene, and N. [S + 1]
-        shading: As in `Scene`, zero for scenes without; None where no scene has it. [N, 3]
-        shading_rest: Factor in the bind state, not bounded. [N]
-        lights: The scenes' light directions, None for those without shading.
-        residuals: Gives what the scenes' residuals say; made when it is first asked for.
+        shading: As in `Scene`, zero for scenes without shading; None if no scene has it. [N, 3]
+        shading_rest: Shading factor in the bind state, not clamped. [N]
+        lights: Light direction of each scene, None for those without shading.
+        residuals: Function per scene that returns its residuals, computed on the first call.
         harmonics_turn: As in `Scene`.
     """
 
@@ -74,7 +74,7 @@ class Gathered:
 
 
 def gather(scenes: Sequence[Scene]) -> Gathered:
-    """The Gaussians of scenes as one set; of one scene, or none, nothing is copied."""
+    """Concatenate the Gaussians of scenes. A single scene is not copied."""
     lit = [scene.shading is not None and scene.light_direction is not None for scene in scenes]
     bases = max((scene.sh.shape[1] for scene in scenes), default=1)
 
@@ -111,16 +111,16 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
 
 @dataclass(frozen=True)
 class PosedScene:
-    """Gaussians in the world, with what their colour needs of the bind state. P poses.
+    """Gaussians in the world, with the bind-state data that their colours depend on. P poses.
 
     Attributes:
-        means: Centres, world. [N, 3] float32
+        means: Centres relative to ``origin``, world axes. [N, 3] float32
         quats: Unit wxyz. [N, 4] float32
         log_scales: Logarithms of the standard deviations. [N, 3] float32
-        opacity_logits: Before the sigmoid. [N] float32
+        opacity_logits: Opacities before the sigmoid. [N] float32
         sh: Spherical harmonics in the bind frame. [N, K, 3] float32
-        object_ids: [N] int32
-        view_maps: Linear maps that bring world directions into the bind frame, up to length. [P, 3, 3]
+        object_ids: Object of each Gaussian. [N] int32
+        view_maps: Linear maps from world directions to the bind frame, not normalised. [P, 3, 3]
         pose_ids: Pose of each Gaussian, a row of ``view_maps``. [N] int64
         shading_factor: Factor on the colour, or None. [N] float32
         origin: Point of the world that ``means`` are relative to. [3] float64
@@ -141,7 +141,7 @@ class PosedScene:
 
 
 def pose_frame(scene: Scene, frame: scene_player.Frame) -> PosedScene:
-    """The Gaussians of a frame of `scene_player`."""
+    """Return the Gaussians of a frame of `scene_player`."""
     view_maps, pose_ids = scene_player.sh_rotations(frame.group_quats), frame.motion_ids.astype(np.int64)
     if frame.turned_rows is not None and frame.turned_quats is not None and frame.sh.shape[1] > 1:
         pose_ids[frame.turned_rows] = len(view_maps) + np.arange(len(frame.turned_rows))
@@ -161,21 +161,21 @@ def pose_frame(scene: Scene, frame: scene_player.Frame) -> PosedScene:
 
 
 def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> PosedScene:
-    """Ranges of the Gaussians of a scene or of several, each moved by a matrix of its own.
+    """Transform ranges of the Gaussians of one or several scenes, each by its own matrix.
 
-    A range may appear several times, or not at all. Rotation, translation and uniform scale are exact in every respect;
-    under any other linear map the ellipsoids are still mapped exactly and the viewing direction is brought back by the
-    inverse. Shading turns with the rotation that is nearest to the map, seen from the scene's own world.
+    Ranges may repeat or be left out. Rotations, translations and uniform scales are exact. Under any other linear map
+    the ellipsoids are mapped exactly, and the viewing direction by the inverse. Shading follows the rotation nearest to
+    the map, relative to the scene's own world.
 
     Args:
-        scene: The scene, or several that were gathered.
+        scene: One scene, or several from `gather`.
         instances: Ranges and their maps.
 
     Returns:
         The Gaussians, in the order of ``instances``.
 
     Raises:
-        ValueError: A range leaves its scene, a matrix flattens space or is not finite, or a tint is negative.
+        ValueError: A range leaves its scene, a matrix is singular or not finite, or a tint is negative.
     """
     given = scene if isinstance(scene, Gathered) else gather([scene])
     ranges = [_rows(given, index, instance) for index, instance in enumerate(instances)]
@@ -228,9 +228,9 @@ def pose_instances(scene: Scene | Gathered, instances: Sequence[Instance]) -> Po
 
 @dataclass(frozen=True)
 class _Bent:
-    """Gaussians that have left their group's motion, in the bind state: rows among those gathered [R], places among
-    the part's [R], offsets [R, 3], rotations unit wxyz [R, 4], the turns that led there [R, 4], and growths of log
-    scales [R, 3]."""
+    """Gaussians with residuals, in the bind state: rows in the `Gathered` arrays [R], indices within the part [R],
+    offsets [R, 3], resulting rotations, unit wxyz [R, 4], residual rotations [R, 4] and residuals of the log scales
+    [R, 3]."""
 
     rows: np.ndarray
     places: np.ndarray
@@ -241,7 +241,7 @@ class _Bent:
 
 
 def bends(given: Gathered, instance: Instance) -> bool:
-    """Whether an instance has Gaussians that may be bent."""
+    """Return True if an instance contains Gaussians with residuals."""
     if instance.t is None or not 0 <= instance.scene < len(given.residuals):
         return False
     rows = given.residuals[instance.scene]().rows
@@ -272,10 +272,10 @@ def _bent(given: Gathered, instance: Instance, part: slice | np.ndarray) -> _Ben
 def _parts(
     instances: Sequence[Instance], ranges: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[int, slice | np.ndarray]]:
-    """What is moved in one go: the first instance of each part, and the part's rows among those gathered.
+    """Yield the parts that are transformed in one call: index of the first instance, and the part's gathered rows.
 
-    A part is one instance, but for many stretches one after the other that share everything else, as they are left of a
-    cloud of which points were deleted.
+    A part is usually one instance. Long runs of instances that differ only in their ranges form one part: a point
+    cloud with deleted points consists of many such ranges.
     """
     keys = [(one.scene, np.asarray(one.matrix).tobytes(), _bytes(one.world), one.tint, one.t) for one in instances]
     index = 0
@@ -293,7 +293,7 @@ def _bytes(matrix: np.ndarray | None) -> bytes:
 
 
 def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Linear part and translation of a [4, 4] matrix that can be undone."""
+    """Linear part and translation of an invertible [4, 4] matrix; errors name the instance."""
     try:
         return affine_transform.affine(matrix)
     except ValueError as error:
@@ -301,7 +301,7 @@ def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
-    """First row of an instance among those gathered, and the one past its last."""
+    """First gathered row of an instance, and the one past its last."""
     if not 0 <= instance.scene < len(given.starts) - 1:
         raise ValueError(f"instance {index}: scene {instance.scene} of {len(given.starts) - 1} is not there")
     first, end = given.starts[instance.scene : instance.scene + 2]
@@ -312,7 +312,7 @@ def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
 
 
 def _tint(instance: Instance, index: int) -> np.ndarray:
-    """Factors on the colours of an instance. [3]"""
+    """Colour factors of an instance, checked. [3]"""
     if instance.tint is None:
         return np.ones(3)
     tint = np.asarray(instance.tint, np.float64)
@@ -322,7 +322,7 @@ def _tint(instance: Instance, index: int) -> np.ndarray:
 
 
 def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
-    """Rows of ranges, one after the other; the array itself where they are all of it in order."""
+    """Concatenate ranges of rows; return the array itself if they cover it in order."""
     edges = [0, *(edge for start, stop in ranges for edge in (start, stop)), len(array)]
     if all(before == after for before, after in zip(edges[::2], edges[1::2], strict=True)):
         return array
@@ -330,7 +330,7 @@ def _take(array: np.ndarray, ranges: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def _shading(given: Gathered, rows: slice | np.ndarray, turns: np.ndarray, light: np.ndarray | None) -> np.ndarray:
-    """Shading factors of rows that have turned under a light, all alike or each. [3, 3] or [n, 3, 3] -> [n] float32"""
+    """Shading factors of rotated rows under a light; one rotation [3, 3], or one per row [n, 3, 3]. [n] float32"""
     if given.shading is None or given.shading_rest is None or light is None:
         return np.ones(len(given.means[rows]), np.float32)
     return posing.lit(given.shading_rest[rows], given.shading[rows], light, turns)

@@ -1,10 +1,8 @@
-"""A posed scene to a picture: the one place where evaluation, the worker and export turn Gaussians of a `Scene` into
-pixels.
+"""Renderer of posed scenes: the only place where evaluation, the worker and export turn a `Scene` into pixels.
 
-Colour of a Gaussian: max(0, 0.5 + SH(A^-1 d)) times max(0, shading factor) as in training, with d the viewing
-direction in the world and A the map that brought the Gaussian from its bind state; times a tint where it has one.
-Behind everything lies the scene's sky, the spherical harmonics `Scene.background_sh` along each pixel's ray, within
-[0, 1] as in training.
+Colour of a Gaussian: tint * max(0, 0.5 + SH(A^-1 d)) * max(0, shading factor), as in training. d is the viewing
+direction in the world and A the map that moved the Gaussian from its bind state. The background is the scene's sky:
+the spherical harmonics `Scene.background_sh` along each pixel's ray, clamped to [0, 1] as in training.
 """
 
 from __future__ import annotations
@@ -43,12 +41,12 @@ def render_frame(
 
     Args:
         scene: The scene; its sky is the background.
-        pose: A frame of `scene_player`, or what `pose_frame` and `pose_instances` give.
+        pose: A frame of `scene_player`, or the result of `pose_frame` or `pose_instances`.
         camera: The camera, in the scene's world.
         background: "scene" for the sky, None for black, or a colour [3] or image [H, W, 3].
         backend: Rasterizer: "auto", "cpu", "cuda" or "reference".
-        features: More channels to blend beside the colour. [N, F]
-        settings: Of the rasterizer; the defaults with the scene's near plane where None.
+        features: Channels to blend besides the colour. [N, F]
+        settings: Rasterizer settings; None for the defaults with the scene's near plane.
 
     Returns:
         Colour (not clamped at 1), alpha, depth, features and object ids, tensors without gradient.
@@ -71,22 +69,22 @@ def render_frame(
 
 
 def sky(scene: Scene, camera: Camera) -> np.ndarray:
-    """The scene's background as this camera sees it, display-referred sRGB. [H, W, 3] float32"""
+    """Return the scene's background for a camera, display-referred sRGB. [H, W, 3] float32"""
     return shade.sky(scene.background_sh, camera)
 
 
 def in_world_of(camera: Camera, matrix: np.ndarray) -> Camera:
-    """A camera whose rays have the directions that another's have in a world that a map brings to that other's.
+    """Transform a camera into another world, for viewing directions only.
 
     Args:
         camera: The camera.
-        matrix: Affine map to the camera's world; what it shifts has no part in directions. [4, 4]
+        matrix: Affine map from that world to the camera's; its translation is ignored. [4, 4]
 
     Returns:
-        A camera for `sky`, and for nothing else: it is rigid only where the map turns alone.
+        A camera for `sky` only: its transform is rigid only if the map is a rotation.
 
     Raises:
-        ValueError: The matrix flattens space or is not finite.
+        ValueError: The matrix is singular or not finite.
     """
     linear, _ = posed_scene.affine(matrix, 0)
     T_cam_world = np.eye(4)
@@ -95,12 +93,12 @@ def in_world_of(camera: Camera, matrix: np.ndarray) -> Camera:
 
 
 def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
-    """Display-referred colour of every Gaussian as this camera sees it, >= 0. [N, 3] float32"""
+    """Return the display-referred colour of each Gaussian for a camera, >= 0. [N, 3] float32"""
     factor = posed.shading_factor
     if posed.sh.shape[1] == 1:
         rgb = np.maximum(sh_color.dc_to_rgb(np.asarray(posed.sh[:, 0], np.float32)), 0)
         if factor is not None:
-            for channel in range(3):  # a column at a time: numpy is slow at rows of three
+            for channel in range(3):  # by column, as numpy is slow on rows of three
                 rgb[:, channel] *= factor
     else:
         with torch.no_grad():
@@ -112,28 +110,27 @@ def colors(posed: PosedScene, camera: Camera) -> np.ndarray:
                 pose_ids=posed.pose_ids,
                 factor=None if factor is None else tensor(factor),
             ).numpy()
-    if posed.tints is not None:  # >= 0: the same as on the harmonics, t (0.5 + SH), before the bound at 0
+    if posed.tints is not None:  # commutes with the clamp at 0, as tints are >= 0
         for channel in range(3):
             rgb[:, channel] *= posed.tints[:, channel][posed.pose_ids]
     return rgb
 
 
 def behind(scene: Scene, camera: Camera) -> np.ndarray:
-    """`sky`, but one colour where it is one. [3] or [H, W, 3]"""
+    """Return `sky`, or a single colour if the sky is constant. [3] or [H, W, 3]"""
     image = sky(scene, camera)
     return image[0, 0] if len(scene.background_sh) == 1 else image
 
 
 def to_numpy(value: Any, dtype: type) -> np.ndarray:
-    """A tensor of a `RenderOutput` as an array on the host."""
+    """Copy a tensor of a `RenderOutput` to a host array."""
     return value.detach().cpu().numpy().astype(dtype, copy=False)
 
 
 class PosedGaussians:
-    """What the rasterizer reads of a posed scene, beside its colours.
+    """Rasterizer inputs of a posed scene, except colours.
 
-    numpy computes it, like everything else of a frame before the kernels: torch would wake its threads for that, and
-    they get in the way of ours.
+    Computed with numpy, because waking torch's threads would slow down the numba kernels.
     """
 
     def __init__(self, posed: PosedScene):
@@ -146,6 +143,6 @@ class PosedGaussians:
 
 
 def tensor(array: np.ndarray) -> torch.Tensor:
-    """A float32 tensor of an array, which stays as it is."""
+    """Convert an array to a float32 tensor that never aliases read-only memory."""
     array = np.ascontiguousarray(array, np.float32)
     return torch.from_numpy(array if array.flags.writeable else array.copy())

@@ -1,4 +1,4 @@
-"""What each Gaussian gives to each segment of an image: the blending weights, summed over the segment's pixels."""
+"""Blending weight of each Gaussian in each segment of an image, summed over the segment's pixels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..raster import backends, rasterizer
 from ..raster.settings import RasterSettings
 from ..scene.cameras import Camera
 
-TOGETHER = 32  # segments in one backward pass, so that many take no more memory than some
+TOGETHER = 32  # segments per backward pass; bounds the memory
 
 
 def segment_weights(
@@ -26,7 +26,7 @@ def segment_weights(
     settings: RasterSettings | None = None,
     backend: str = "auto",
 ) -> sparse.csr_matrix:  # [S, N]
-    """Weights of the Gaussians in each segment of an image.
+    """Return the weights of the Gaussians in each segment of an image.
 
     Args:
         means: Centres, world. [N, 3]
@@ -34,17 +34,17 @@ def segment_weights(
         scales: Standard deviations, world units. [N, 3]
         opacities: In [0, 1]. [N]
         camera: The view.
-        segments: Segment of each pixel, 0 to ``count`` - 1; pixels of others belong to none. [H, W] integers
+        segments: Segment of each pixel, 0 to ``count`` - 1; other values belong to no segment. [H, W] integers
         count: Number of segments S.
-        settings: Of the rasterizer.
-        backend: As of `rasterizer.rasterize_splats`.
+        settings: Rasterizer settings.
+        backend: As for `rasterizer.rasterize_splats`.
 
     Returns:
-        Sum over the segment's pixels of alpha times the transmittance before it, where it is not 0; columns sum to
-        what the image shows of the Gaussian, in pixels. [S, N] float32
+        Sparse sums of alpha times transmittance over the segment's pixels. A column sums to the Gaussian's visible
+        area in the segments, in pixels. [S, N] float32
 
     Raises:
-        ValueError, BackendError: As `rasterizer.rasterize_splats`.
+        ValueError, BackendError: As for `rasterizer.rasterize_splats`.
     """
     fixed = means.detach(), quats.detach(), scales.detach(), opacities.detach()
     if tuple(segments.shape) != (camera.height, camera.width):
@@ -60,7 +60,7 @@ def segment_weights(
 
     known = torch.where((segments >= 0) & (segments < count), segments, -1).to(torch.int32).contiguous().numpy()
     rows, names, weights = cpu_backend.segment_weights(*fixed, camera, known, count, settings)
-    by_gaussian = sparse.coo_matrix((weights, (rows, names)), (len(means), count)).tocsr()  # entries of tiles add up
+    by_gaussian = sparse.coo_matrix((weights, (rows, names)), (len(means), count)).tocsr()  # sums over the tiles
     return sparse.csr_matrix(by_gaussian.T)
 
 
@@ -72,7 +72,7 @@ def _by_gradients(
     settings: RasterSettings,
     backend: str,
 ) -> sparse.csr_matrix:
-    """The same from any differentiable backend: a weight is the derivative of the segment's blended sum by a value."""
+    """Compute the weights by autograd: the derivative of a segment's blended sum by the Gaussian's value."""
     means, parts = fixed[0], []
     for first in range(0, count, TOGETHER):
         some = torch.arange(first, min(first + TOGETHER, count), device=segments.device)

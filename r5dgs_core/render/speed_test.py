@@ -1,4 +1,4 @@
-"""How fast this machine draws: one made picture, timed."""
+"""Rendering speed of this machine, measured on a synthetic picture."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ REPEATS = 7
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of it.
+    """Result of a speed test.
 
     Attributes:
-        milliseconds: Median of a few pictures.
+        milliseconds: Median time per picture.
         gaussians: Number of Gaussians.
         size: Width and height in pixels.
-        device: What drew them.
+        device: Description of the device.
     """
 
     milliseconds: float
@@ -36,7 +36,7 @@ class Trial:
 
 
 def run() -> Trial:
-    """Draw a ball of Gaussians a few times, after the kernels are ready. Raises BackendError without a rasterizer."""
+    """Time the rasterization of a ball of Gaussians, after compilation. Raises BackendError without a rasterizer."""
     random = np.random.default_rng(0)
     directions = random.normal(size=(GAUSSIANS, 3))
     means = (

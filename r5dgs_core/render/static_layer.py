@@ -1,8 +1,8 @@
-"""What stands still before a camera that does: rasterized once, while what moves is drawn into it frame by frame.
+"""Static Gaussians of a fixed camera, rasterized once; moving Gaussians are drawn into the result frame by frame.
 
-A tile that nothing moving touches is the same in every frame, and is copied. In the others the two lists of Gaussians,
-each sorted once, are merged by depth and blended anew. The result is that of rasterizing everything, to the bit, in
-whatever order of depth the parts lie; what is saved is all work on still Gaussians but that.
+Tiles that no moving Gaussian touches are copied. In all others, the static and the moving lists, each sorted once, are
+merged by depth and blended again. The result is bit-identical to rasterizing everything, for any depth order. Static
+Gaussians cost only the merge and the blend of the touched tiles.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _NOTHING = np.empty((0, 0), np.float32)
 
 
 class Backdrop:
-    """Gaussians that stand still, drawn once for one camera by the backend `cpu_backend`, without gradients.
+    """Static Gaussians, rendered once for one camera by `cpu_backend`, without gradients.
 
     Args:
         means, quats, scales, opacities, channels, camera, background: As for `rasterize_splats`; copied.
-        labels: As there; for both parts or for neither. [N]
-        ranks: Place of each Gaussian among all, rising, which decides at equal depths; before all that moves where
-            None. [N]
+        labels: As there; required for both the static and the moving Gaussians, or for neither. [N]
+        ranks: Increasing index of each Gaussian among all, which breaks ties of depth. None puts them before all
+            moving Gaussians. [N]
         settings: As there.
 
     Raises:
-        ValueError, BackendError: As `rasterize_splats` does.
+        ValueError, BackendError: As for `rasterize_splats`.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Backdrop:
         self._camera = camera
         self._view, self._limits = cpu_backend.pack_view(camera, settings), cpu_backend.pack_limits(settings)
         self._background = cpu_backend.pack_background(background, channels.shape[1]).copy()
-        # Rows of the tables: first what is still, padded, then what moves.
+        # Rows of the tables: static Gaussians, padding, moving Gaussians.
         n, rows = len(means), projection.padded_rows(len(means))
         self._count = self._end = rows
         self._geometry = cpu_backend.aligned((rows, projection.GEOMETRY), np.float64)
@@ -91,18 +91,18 @@ class Backdrop:
         labels: torch.Tensor | None = None,  # [M]
         ranks: np.ndarray | None = None,  # [M]
     ) -> SplatImage:
-        """Draw what moves into what stands still; from several threads one call waits for the other.
+        """Draw moving Gaussians into the static layer. Thread-safe; concurrent calls are serialized.
 
         Args:
             means, quats, scales, opacities, channels: As for `rasterize_splats`.
-            labels: As there; only, and always, where the backdrop has labels. [M]
-            ranks: Place of each Gaussian among all, rising; after all that stands still where None. [M]
+            labels: As there; required if and only if the static layer has labels. [M]
+            ranks: Increasing index of each Gaussian among all. None puts them after all static Gaussians. [M]
 
         Returns:
-            What `rasterize_splats` gives for all Gaussians in the order of their ranks, without gradients.
+            The output of `rasterize_splats` for all Gaussians in the order of their ranks, without gradients.
 
         Raises:
-            ValueError, BackendError: As `rasterize_splats` does; the backdrop stays as it was.
+            ValueError, BackendError: As for `rasterize_splats`; the static layer stays unchanged.
         """
         rasterizer.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
         backends.choose_backend("cpu", means)
@@ -126,7 +126,7 @@ class Backdrop:
         return SplatImage(image, alpha, depth, None if labels is None else ids)
 
     def _place(self, shapes, channels, numbers, ranks) -> None:
-        """Put what moves behind what is still in the tables."""
+        """Write moving Gaussians to the tables, after the static ones."""
         begin, n = self._count, len(channels)
         self._end = begin + projection.padded_rows(n)
         if self._end > len(self._geometry):
@@ -142,7 +142,7 @@ class Backdrop:
             self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
 
     def _make_room(self) -> None:
-        """Let the tables have rows up to the end."""
+        """Enlarge the tables to ``self._end`` rows."""
 
         def longer(table, fill):
             result = np.full((self._end, *table.shape[1:]), fill, table.dtype)
@@ -160,7 +160,7 @@ class Backdrop:
             self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
 
     def _assign(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of some rows: where those of each tile begin, and the rows."""
+        """Assign rows to tiles: start of each tile's pairs, and row of each pair."""
         order = cpu_tiles.sort_by_depth(self._depths[begin:end], self._radii[begin:end]) + np.int32(begin)
         starts, rows, _, _ = cpu_tiles.assign_tiles(
             order, self._boxes, self._geometry, self._camera.width, self._camera.height, False
@@ -168,7 +168,7 @@ class Backdrop:
         return starts, rows
 
     def _merge(self, tiles, moving_starts, moving_rows):
-        """Pairs of some tiles, still and moving ones: where those of each tile begin, and the rows."""
+        """Merge static and moving pairs of some tiles: start of each tile's pairs, and row of each pair."""
         still = np.stack([self._starts[tiles], self._starts[tiles + 1]], 1)
         moving = np.stack([moving_starts[tiles], moving_starts[tiles + 1]], 1)
         starts = np.zeros(len(tiles) + 1, np.int64)

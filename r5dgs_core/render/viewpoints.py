@@ -1,6 +1,6 @@
-"""Where to look at a scene from, and when: one of its cameras, chosen by name, by number or by what it sees.
+"""Viewpoints of a scene: a camera chosen by name, number or visible objects, and a time.
 
-What a camera sees is counted in small pictures, as shares of the picture, so that the size of images has no part in it.
+Visibility is measured in small pictures as a share of the picture, so it does not depend on the image size.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from ..scene.scene import Scene
 from . import scene_renderer
 
 LOOK = 160  # longest side of the small pictures, pixels
-MOST_CAMERAS = 16  # that are tried
-NOTICED = 5e-4  # share of the picture from which on an object is seen
+MOST_CAMERAS = 16  # number of cameras to try
+NOTICED = 5e-4  # smallest share of the picture that counts as visible
 
 Item = TypeVar("Item")
 
@@ -39,10 +39,10 @@ class Standpoint:
 
 
 def named(scene: Scene, which: str) -> Camera:
-    """The camera of a scene with a name, or else with a number that counts from 0.
+    """Return the camera of a scene with a name, or else with a number that counts from 0.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: The scene has no such camera.
     """
     for camera in scene.cameras:
         if camera.name == which:
@@ -58,15 +58,15 @@ def named(scene: Scene, which: str) -> Camera:
 
 
 def candidates(scene: Scene, camera: str | None = None, t: float | None = None) -> list[Standpoint]:
-    """Standpoints to choose among.
+    """List viewpoints to choose from.
 
     Args:
         scene: The scene.
-        camera: Name or number of the camera; some that are spread over all where None.
-        t: Scene time; the first, middle and last observed one where None.
+        camera: Name or number of the camera; None for cameras spread over all.
+        t: Scene time; None for the first, middle and last observed time.
 
     Raises:
-        ConfigError: There is no such camera, or the time is not a number.
+        ConfigError: The scene has no such camera, or the time is not finite.
     """
     if t is not None and not np.isfinite(t):
         raise errors.ConfigError(f"--time {t}: expected a number, in the scene's time (t_max is {scene.t_max:g})")
@@ -89,13 +89,13 @@ def best(
     *,
     backend: str = "auto",
 ) -> Standpoint:
-    """The standpoint that sees most of some objects: as many of them as there can be, then large and uncut.
+    """Return the viewpoint that shows most of some objects: as many as possible first, then large and uncut ones.
 
     Args:
         scene: The scene.
-        among: The standpoints, the first of equal ones is taken; at least one.
+        among: At least one viewpoint; the first wins a tie.
         object_ids: The objects.
-        mode: Way to move past t_max.
+        mode: Extrapolation mode after t_max.
         backend: Rasterizer.
     """
     if len(among) == 1:
@@ -106,19 +106,19 @@ def best(
 
 
 def spread(items: Sequence[Item], most: int) -> list[Item]:
-    """At most so many of some items, evenly, with the first and the last."""
+    """Select at most ``most`` items, evenly spaced, including the first and the last."""
     at = np.linspace(0, max(len(items) - 1, 0), min(most, len(items))).round()
     return [items[int(k)] for k in at]
 
 
 def sized(camera: Camera, longest: int) -> Camera:
-    """The same picture with so many pixels along its longer side."""
+    """Resize a camera so that its longer side has ``longest`` pixels."""
     scale = longest / max(camera.width, camera.height)
     return axes.resize(camera, max(round(scale * camera.width), 1), max(round(scale * camera.height), 1))
 
 
 def overview(scene: Scene) -> Camera:
-    """A camera that sees the whole scene from above its side, for scenes that store none."""
+    """Return a camera that sees the whole scene obliquely from above, for scenes without cameras."""
     up = axes.WORLD_TO_BLENDER[scene.world_convention].T @ np.array([0.0, 0.0, 1.0])
     seen = scene.means[scene.object_ids > 0]
     points = (seen if len(seen) else scene.means).astype(np.float64)
@@ -140,7 +140,7 @@ def overview(scene: Scene) -> Camera:
 def _score(
     scene: Scene, player: scene_player.Player, standpoint: Standpoint, object_ids: Collection[int], backend: str
 ) -> tuple[int, float]:
-    """How many of the objects are seen, and how well: roots of their shares, halved where the border cuts them."""
+    """Number of visible objects, and sum of the square roots of their shares, halved for those at the border."""
     frame = player.frame(standpoint.t)
     output = scene_renderer.render_frame(scene, frame, sized(standpoint.camera, LOOK), backend=backend)
     ids = scene_renderer.to_numpy(output.ids, np.int32)

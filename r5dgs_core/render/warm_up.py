@@ -1,4 +1,4 @@
-"""Compiling the kernels of the `cpu` backend before they are needed, or loading them where an earlier process did."""
+"""Compilation of the kernels of the `cpu` backend ahead of use, or loading from the cache of an earlier process."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ _SH = 4  # coefficients: degree 1, the least that has kernels
 
 
 def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:
-    """Make every kernel of the `cpu` backend ready.
+    """Compile or load all kernels of the `cpu` backend.
 
-    The first call of a fresh installation takes ten to fifteen seconds, later processes well below one.
+    The first call after installation takes ten to fifteen seconds; later processes take well below one.
 
     Args:
-        gradients: Whether those that training needs are wanted, too; viewers do without.
+        gradients: True to include the kernels that only training needs.
         progress: Called with the name of each stage before it begins.
 
     Returns:
-        The seconds it took.
+        Elapsed time in seconds.
 
     Raises:
-        BackendError: There is no numba.
+        BackendError: numba is missing.
     """
     start = time.perf_counter()
     stages: list[tuple[str, Callable[[], object]]] = [
@@ -43,7 +43,7 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
     for name, stage in stages:
         if progress is not None:
             progress(name)
-        with torch.inference_mode(False), torch.enable_grad():  # whatever the caller is in the middle of
+        with torch.inference_mode(False), torch.enable_grad():  # independent of the caller's grad mode
             stage()
     return time.perf_counter() - start
 
@@ -66,7 +66,7 @@ def _splats() -> None:
 
 
 def _backdrop() -> None:
-    from . import static_layer  # needs numba, which whoever imports the package may do without
+    from . import static_layer  # imports numba, which is optional
 
     still = moving = _inputs(torch.ones(1, 3))
     static_layer.Backdrop(*still, _VIEW).draw(*moving)
@@ -77,7 +77,7 @@ def _splat_gradients() -> None:
 
 
 def _segment_weights() -> None:
-    from . import segment_weights  # needs scipy, which is slow to import
+    from . import segment_weights  # imports scipy, which is slow
 
     segments = torch.zeros(_VIEW.height, _VIEW.width, dtype=torch.int64)
     segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1, backend="cpu")
