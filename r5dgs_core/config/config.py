@@ -1,4 +1,4 @@
-"""The configuration of a run: `sections` read from TOML, from a preset, and changed by ``--set section.key=value``."""
+"""Configuration of a run: sections read from TOML, presets and ``--set section.key=value`` overrides."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from .sections import (
     TrainSection,
 )
 
-_MOST_BYTES = 1 << 20  # of a configuration file
+_MOST_BYTES = 1 << 20  # largest size of a configuration file
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,15 @@ class Config:
     needs: NeedsSection = dataclasses.field(default_factory=NeedsSection)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain nested dictionary, ready for JSON."""
+        """Return the configuration as nested dictionaries, ready for JSON."""
         return dataclasses.asdict(self)
 
     def replace(self, **changes: Any) -> Config:
-        """A copy with some keys changed: ``replace(**{"train.iterations": 100})``."""
+        """Return a copy with some keys changed: ``replace(**{"train.iterations": 100})``."""
         return from_dict(_merge(self.to_dict(), changes))
 
     def override(self, overrides: Sequence[str]) -> Config:
-        """A copy with ``section.key=value`` overrides applied, as of ``--set``."""
+        """Return a copy with ``section.key=value`` overrides applied, as given to ``--set``."""
         return self.replace(**_parsed(overrides))
 
 
@@ -82,11 +82,12 @@ def from_dict(values: dict[str, Any], guard: findings.Guard = findings.STRICT) -
 
     Args:
         values: Keys by section.
-        guard: Entered around each key and rule, for callers that want all faults (`findings`). A value whose error it
-            keeps is `findings.UNREAD`.
+        guard: Context manager around the check of each key and rule. A guard that collects errors instead of raising
+            them (`findings`) leaves `findings.UNREAD` as the value of a faulty key.
 
     Raises:
-        ConfigError: A section or key is unknown (the nearest name is suggested), or a value is of the wrong type.
+        ConfigError: A section or key is unknown (the message suggests the nearest name), a value is invalid, or keys
+            contradict each other.
     """
     config = _built(values, guard)
     _validate(config, guard)
@@ -94,7 +95,7 @@ def from_dict(values: dict[str, Any], guard: findings.Guard = findings.STRICT) -
 
 
 def _built(values: dict[str, Any], guard: findings.Guard = findings.STRICT) -> Config:
-    """A configuration whose single keys are checked, but not how they go together."""
+    """Build a configuration with each key checked by itself, without the rules between keys."""
     sections = {f.name: f for f in dataclasses.fields(Config)}
     hints = get_type_hints(Config)
     built: dict[str, Any] = {}
@@ -124,7 +125,7 @@ def _section(section: str, keys: dict[str, Any], kind: type, guard: findings.Gua
 
 
 def require_needs(overrides: Sequence[str]) -> None:
-    """Raise `UsageError` if ``--set`` of a finished run names something else than a need."""
+    """Raise `UsageError` if an override for a finished run names a key outside of ``needs``."""
     for text in overrides:
         if not text.strip().startswith("needs."):
             raise UsageError(f"--set {text}: the run keeps its configuration; bake takes needs.NAME=on|off alone")
@@ -137,16 +138,17 @@ def load(
     preset: str | None = None,
     guard: findings.Guard = findings.STRICT,
 ) -> Config:
-    """Read a TOML file (or none) and apply ``section.key=value`` overrides, values written as in TOML.
+    """Read a TOML file and apply a preset and ``section.key=value`` overrides.
 
     Args:
-        path: The file, or None.
-        overrides: These win over the file.
-        preset: Name of one of `PRESETS`; the file and the overrides win over it.
-        guard: As of `from_dict`.
+        path: The file; None for the defaults.
+        overrides: Overrides with values written as in TOML; they take precedence over the file.
+        preset: Name of one of `PRESETS`; the file and the overrides take precedence over it.
+        guard: See `from_dict`.
 
     Raises:
-        ConfigError: The file is missing or not TOML, the preset is unknown, or a key or value cannot be used.
+        ConfigError: The file is missing, too large or not valid TOML, or a key or value is invalid.
+        UsageError: The preset is unknown, or an override is invalid.
     """
     if preset is not None and preset not in PRESETS:
         raise UsageError(f"--preset {preset}: unknown preset{_suggest(preset, PRESETS)}")
@@ -163,7 +165,7 @@ def load(
             raise ConfigError(f"{path}: expected at most {_MOST_BYTES >> 10} KiB, found more")
         try:
             values = tomllib.loads(data.decode("utf-8"))
-        except (ValueError, RecursionError) as error:  # ValueError: no TOML, no UTF-8, a number of too many digits
+        except (ValueError, RecursionError) as error:  # ValueError: not TOML or UTF-8, or a number with too many digits
             raise ConfigError(f"{path}: not valid TOML: {error}") from None
     if preset is not None:
         values = _merge_under(values, PRESETS[preset])
@@ -171,7 +173,7 @@ def load(
 
 
 def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
-    """Values by ``section.key``. Raises `UsageError` if no configuration can hold one of them."""
+    """Parse overrides into values by ``section.key``. Raises `UsageError` if one of them is invalid."""
     found: dict[str, Any] = {}
     for text in overrides:
         name, value = _parse_override(text)
@@ -184,7 +186,7 @@ def _parsed(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _merge_under(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Add the changes whose keys have no value yet; what is no section stays for `from_dict` to refuse."""
+    """Add the changes whose keys have no value yet. Values that are not sections stay for `from_dict` to reject."""
     missing = {}
     for name, value in changes.items():
         section, _, key = name.partition(".")
@@ -200,7 +202,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
         raise UsageError(f"--set {text}: expected SECTION.KEY=VALUE, for example losses.ssim=0.1")
     try:
         return name.strip(), tomllib.loads(f"x = {value}")["x"]
-    except (ValueError, RecursionError):  # no TOML: text without quotes
+    except (ValueError, RecursionError):  # not TOML: text without quotes
         return name.strip(), value.strip()
 
 
@@ -220,7 +222,7 @@ def _suggest(name: str, known: Any) -> str:
 
 
 def _check_writable(name: str, value: object) -> None:
-    """Raise ConfigError for integers and text that ``run.json`` cannot hold."""
+    """Raise `ConfigError` for integers and text that ``run.json`` cannot store."""
     if isinstance(value, int) and abs(value) >= 1 << 63:
         raise ConfigError(f"{name}: expected a number of at most 64 bits, got a longer one")
     try:
@@ -245,7 +247,7 @@ def _check(name: str, value: Any, kind: type) -> Any:
 
 
 def _validate(config: Config, guard: findings.Guard) -> None:
-    """Raise `ConfigError` naming the first keys whose values exclude each other."""
+    """Raise `ConfigError` if the values of two keys contradict each other."""
     with guard():
         if config.train.representation == "field" and config.needs.rotation == "off":
             raise ConfigError("needs.rotation: only tracks can be trained without rotation; leave it out for a field")
@@ -272,9 +274,9 @@ def _value(config: Config, name: str) -> Any:
     return getattr(getattr(config, section), key)
 
 
-# What may not be switched off where the need is said to be there.
+# Keys that must be non-zero if the need is "on".
 _CONTRADICTED = {"shading": "train.shading", "shadows": "train.shadows", "classifier": "identity.iterations"}
-# Other settings under which a need can not be there, as (need, key, value that excludes it).
+# Settings that exclude a need: (need, key, value).
 _EXCLUDED = (
     ("classifier", "identity.training", "off"),
     ("residuals", "train.representation", "field"),
@@ -285,7 +287,7 @@ _AT_LEAST_1: tuple[Callable[[Any], bool], str] = (lambda value: value >= 1, "at 
 _SHARE: tuple[Callable[[Any], bool], str] = (lambda value: 0 <= value <= 1, "0 to 1")
 _POSITIVE: tuple[Callable[[Any], bool], str] = (lambda value: value > 0, "more than 0")
 _INSIDE: tuple[Callable[[Any], bool], str] = (lambda value: 0 < value < 1, "between 0 and 1")
-# What a value must be beyond its type; all numbers are finite and not negative (`_check`).
+# Constraints beyond the type; `_check` ensures that all numbers are finite and not negative.
 _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "data.min_registered": _SHARE,
     "train.iterations": _AT_LEAST_1,

@@ -1,4 +1,4 @@
-"""The keys of the configuration with meaning, unit, default and value, for ``r5dgs config``."""
+"""Keys of the configuration with description, unit, default and value, as listed by ``r5dgs config``."""
 
 from __future__ import annotations
 
@@ -59,19 +59,19 @@ _KEYS_BY_UNIT = {
     "integer": "train.seed",
 }
 _UNITS = {key: unit for unit, keys in _KEYS_BY_UNIT.items() for key in keys.split()}
-_MEANING = re.compile(r"^        (\w+): (.*(?:\n {12}.*)*)", re.MULTILINE)  # in the docstring of a section
+_MEANING = re.compile(r"^        (\w+): (.*(?:\n {12}.*)*)", re.MULTILINE)  # an entry under "Attributes:"
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key of the configuration.
+    """Key of the configuration.
 
     Attributes:
         name: ``section.key``.
-        meaning: Description, from the section's docstring.
+        meaning: Description, taken from the section's docstring.
         unit: Unit of a number, "text" or "true or false".
-        default: Value if nothing is given.
-        value: Value in force.
+        default: Default value.
+        value: Current value.
     """
 
     name: str
@@ -98,6 +98,6 @@ def keys(config: Config) -> list[Key]:
 
 @functools.cache
 def _meanings(section: type) -> dict[str, str]:
-    """Meanings of the keys of a section, from its docstring."""
+    """Parse the descriptions of a section's keys from its docstring."""
     found = _MEANING.findall(section.__doc__ or "")
     return {key: " ".join(text.replace("``", "'").split()) for key, text in found}

@@ -1,10 +1,12 @@
-"""Presets: named sets of configuration keys, for ``--preset``.
+"""Presets: named sets of configuration keys for ``--preset``.
 
-``paper`` has the hyper-parameters of R5DGS and of what it builds on (TRACE, 3DGS, Gaussian Grouping), for a GPU: 40000
-steps and networks of width 256. It keeps our networks' heads that start at zero, our learned sky, Adam's usual epsilon
-for the networks, rates of the centres that fall over the whole run (3DGS: over 30000 steps), and our normalised
-coordinates, in which these rates mean about what they mean in scenes of a few units. ``cpu`` is the same method made
-for processors; ``fast`` is a first look at a data set.
+- ``paper``: hyper-parameters of R5DGS and of the methods that it builds on (TRACE, 3DGS, Gaussian Grouping), for a GPU:
+  40000 steps and networks of width 256. It departs from them in five points: the networks' heads start at zero; the sky
+  is learned; Adam has its usual epsilon for the networks; the learning rates of the centres decay over the whole run
+  (3DGS: over 30000 steps); and coordinates are normalised, in which the rates correspond to those for scenes of a few
+  units.
+- ``cpu``: the same method with defaults made for CPUs.
+- ``fast``: a short run for a first impression of a data set.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "init.placement": "random",
         "init.background_points": 100000,
         "init.opacity": 0.1,
-        # 3DGS as TRACE runs it; of the centres 1.6e-4 to 1.6e-6 times a spatial scale of 5.
+        # 3DGS rates as used by TRACE; the centres' fall from 1.6e-4 to 1.6e-6, times a spatial scale of 5.
         "rates.means": 8e-4,
         "rates.log_scales": 5e-3,
         "rates.sh": 2.5e-3,

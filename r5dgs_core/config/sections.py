@@ -1,7 +1,8 @@
-"""The sections of a run's configuration: what each key means and its default.
+"""Sections of the configuration; the docstring of each describes its keys.
 
-Lengths are relative: training runs in normalised coordinates in which the cameras stand about four units from what they
-look at (`normalization.py`), and iterations are for ``train.iterations`` = 6000 unless said.
+Lengths are in the normalised coordinates of training, in which the cameras are about 4 units from the point that they
+look at (`train/normalization.py`). Numbers of steps are meant for runs of ``train.iterations`` = 6000, unless stated
+otherwise.
 """
 
 from __future__ import annotations
@@ -23,22 +24,25 @@ INCLUDE_SELF = ("auto", "on", "off")
 
 @dataclass(frozen=True)
 class TrainSection:
-    """What is trained and for how long.
+    """Representation, length and reporting of the run.
 
     Attributes:
-        iterations: Optimisation steps; one view each.
+        iterations: Optimisation steps, one view each.
         seed: Seed of all random draws.
-        representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field and TRD, the paper's).
-        background: ``learned`` sky, ``white`` or ``black``; ``auto`` is white where images carry alpha, else learned.
-        sh_degree: Degree of the view-dependent colour, 0 to 3.
-        sh_every: Steps after which one more degree of it is trained (1000 in 3DGS); 0 trains all from the start.
-        threads: Threads of torch; the small arrays of this trainer gain nothing from more than one.
+        representation: Motion representation: ``tracks`` (one SE(3) track per object) or ``field`` (deformation field
+            and TRD, as in the paper).
+        background: Colour behind the scene: ``learned`` (a sky), ``white`` or ``black``. ``auto`` is white if the
+            images have alpha, else learned.
+        sh_degree: Degree of the spherical harmonics of view-dependent colour, 0 to 3.
+        sh_every: Steps between raising the trained degree by one, up to ``sh_degree`` (1000 in 3DGS). 0 trains all
+            degrees from the start.
+        threads: CPU threads of torch. More than one does not make training faster, as its arrays are small.
         checkpoint_every: Steps between checkpoints.
-        log_every: Steps between log lines.
-        probe_every: Steps between looks at held-out views (split ``val``); 0 never looks.
-        probe_views: Held-out views that are looked at.
-        shading: Learn how colours change as objects turn in fixed light.
-        shadows: Learn shadow Gaussians that follow their caster on the plane that supports the objects.
+        log_every: Steps between lines of the log.
+        probe_every: Steps between measurements of the PSNR on held-out views (split ``val``). 0 turns them off.
+        probe_views: Largest number of held-out views to measure.
+        shading: Learn how the colours of an object change as it turns in fixed light.
+        shadows: Learn shadow Gaussians, which follow their objects on the supporting plane.
     """
 
     iterations: int = 6000
@@ -58,10 +62,10 @@ class TrainSection:
 
 @dataclass(frozen=True)
 class DataSection:
-    """What is read of the data set.
+    """Reading of the data set.
 
     Attributes:
-        masks: Folder of the training views' masks, within the data set or anywhere; ``none`` passes them over.
+        masks: Folder with the masks of the training views, inside the data set or elsewhere. ``none`` ignores masks.
         min_registered: Smallest share of the images that a COLMAP reconstruction must have registered.
     """
 
@@ -71,17 +75,17 @@ class DataSection:
 
 @dataclass(frozen=True)
 class InitSection:
-    """How Gaussians are placed before training.
+    """Initial placement of Gaussians.
 
     Attributes:
-        placement: ``scene``: objects in the hulls of their masks, background by a plane sweep; ``random``: everything
-            at random where cameras look, as the paper's data comes.
-        object_points: Gaussians of each object.
+        placement: ``scene`` places objects in the visual hulls of their masks and the background by a plane sweep.
+            ``random`` spreads all Gaussians at random over the space that the cameras see, as in the paper's data.
+        object_points: Gaussians per object.
         background_points: Gaussians of the background.
-        shadow_points: Gaussians of each shadow.
-        sweep_depths: Depths tried per ray when the background is placed.
-        opacity: Initial opacity of bodies and background.
-        min_mask_pixels: Smaller masks do not vote on an object's place, as a share of the image.
+        shadow_points: Gaussians per shadow.
+        sweep_depths: Depths per ray that the plane sweep compares.
+        opacity: Initial opacity of objects and background.
+        min_mask_pixels: Size of the smallest mask that helps to locate an object, as a share of the image's pixels.
     """
 
     placement: str = "scene"
@@ -98,25 +102,26 @@ class RatesSection:
     """Learning rates of Adam, in normalised units per step.
 
     Attributes:
-        means: Centres.
-        log_scales: Logarithms of the standard deviations.
-        sh: Constant colour, as harmonics.
-        sh_rest: Colour that depends on the view.
-        opacity_logits: Opacities before the sigmoid.
+        means: Centres of the Gaussians.
+        log_scales: Sizes, as logarithms of the standard deviations.
+        sh: Constant colour (harmonics of degree 0).
+        sh_rest: View-dependent colour (harmonics of degree 1 and higher).
+        opacity_logits: Opacities, before the sigmoid.
         quats: Orientations.
-        shading: How colours change as objects turn.
-        light: Direction of the light that they turn in.
-        translations: Displacements of the tracks.
-        rotvecs: Rotations of the tracks, rad.
-        slope: How shadows follow their casters.
+        shading: Shading vectors, by which colours change as objects turn.
+        light: Direction of the light that the shading assumes.
+        translations: Translations of the object tracks.
+        rotvecs: Rotations of the object tracks, rad.
+        slope: Shift of a shadow along the plane per unit that its object rises.
         field: Weights of the deformation field.
         trd: Weights of the TRD network.
-        residual: Residual motion of bodies that bend or breathe.
+        residual: Residual motion of non-rigid objects.
         background: Harmonics of the sky.
-        decay: Factor by which rates have fallen at the end of the run.
-        decay_networks: The same for the networks of ``field``.
-        decay_floor_appearance: Appearance falls no lower than this factor.
-        decay_from: Share of the run before the rates begin to fall.
+        decay: Final learning rate as a factor of the initial one; the decay is exponential. It applies to the geometry
+            (centres, tracks, light, residuals) and the appearance (sizes, colours, opacities, sky).
+        decay_networks: The same factor for the two networks of ``field``.
+        decay_floor_appearance: Smallest factor to which the decay lowers the rates of the appearance.
+        decay_from: Share of the run at which the decay begins (for ``residual``: ``residual.start``).
     """
 
     means: float = 1e-3
@@ -142,33 +147,38 @@ class RatesSection:
 
 @dataclass(frozen=True)
 class FieldSection:
-    """The representation ``field``: a deformation field for the observed time, the TRD for what follows.
+    """Representation ``field``: a deformation field for the observed time, and the TRD for extrapolation.
 
     Attributes:
-        variant: ``5dgs`` (every Gaussian by its own dynamics), ``r5dgs`` (the same training, played rigidly) or
-            ``r5dgs_extra`` (trained with the rigidity and majority losses too).
-        size: Networks: ``complex`` (8 x 256 and 10 x 256, the paper's), ``light`` (6 x 128 and 8 x 128) or ``small``
-            (4 x 128 and 5 x 64, for processors).
-        horizon: Scene time up to which the deformation field reaches; later observed frames supervise the
-            extrapolation. 0 leaves out the last fifteenth of the observed span, as 0.70 of 0.75.
-        step: Time that the TRD bridges in a training step: plain where times lie in [0, 1], else as a share of the
-            observed span; 0 takes two observed intervals.
-        warm_up: Steps without deformation, so that the first time is the canonical state.
-        trd_share: Share of the steps within the horizon that go through the TRD; 1 is TRACE's scheme.
-        movers: Gaussians that the networks move: ``all``; ``labelled``: those that the masks put on an object or in its
-            shadow; or ``measured``: all until those that rest are set still exactly. ``labelled`` is ``measured`` where
-            there are no masks.
-        gate: Share of the field's run after which ``measured`` looks for what rests; not before every time takes part.
-        still: What leaves its place by less over the observed times rests; normalised units.
-        calm: Weight of the mean distance from the canonical state until then, so that what no image moves rests.
-        place_steps: Steps that fit the field to the triangulated places of the objects before the first image.
-        tracks_share: Share of the run that is one of ``tracks``, from which the field then starts; 0 for none.
-        distill_steps: Steps that fit field and TRD to the motion of those tracks.
-        trd_steps: Steps that fit the TRD to the motion of the field, without images, at every ``trd_every``.
-        trd_every: Steps between two such fits, as a share of the run; 0 for none.
-        twist: Weight of the cross-Gaussian twist loss in these fits: one twist must carry its neighbours too.
-        stiffness: Weight of the squared distance of moved Gaussians from the best rigid motion of their group.
-        chunk: Gaussians that pass the networks at once; bounds memory.
+        variant: ``5dgs`` extrapolates each Gaussian by its own dynamics, ``r5dgs`` trains in the same way but
+            extrapolates objects rigidly, ``r5dgs_extra`` also trains with the rigidity and majority losses.
+        size: Depth and width of field and TRD: ``complex`` (8 x 256 and 10 x 256, as in the paper), ``light`` (6 x 128
+            and 8 x 128) or ``small`` (4 x 128 and 5 x 64, for CPUs).
+        horizon: Last scene time of the deformation field; later observed frames train the extrapolation. 0 leaves out
+            the last fifteenth of the observed span (0.70 of 0.75 in NVFi).
+        step: Time that the TRD bridges in a training step: a scene time if all times lie in [0, 1], else a share of the
+            observed span. 0 uses two observed intervals.
+        warm_up: Steps without deformation at the start of the run, which make the first time the canonical state.
+        trd_share: Share of the steps up to the horizon that train field and TRD together; the others train the field
+            alone. 1 is TRACE's scheme.
+        movers: Gaussians that the networks move: ``all``; ``labelled`` (those that masks assign to an object or its
+            shadow); or ``measured`` (all at first, and after ``gate`` only those that were found to move). Without
+            masks, ``labelled`` means ``measured``.
+        gate: Share of the field's run after which ``measured`` freezes Gaussians at rest, but not before all times take
+            part.
+        still: Displacement over the observed times below which a Gaussian is at rest, normalised units.
+        calm: Weight of the mean distance from the canonical state, which brings Gaussians to rest that no image moves.
+            Used with ``measured``, until ``gate``.
+        place_steps: Steps that fit the field to the triangulated positions of the objects, before the first image.
+        tracks_share: Share of the run that trains ``tracks`` first; the field then starts from them. 0 starts with the
+            field.
+        distill_steps: Steps that fit field and TRD to the motion of these tracks.
+        trd_steps: Steps of each fit of the TRD to the motion of the field, without images. 0 turns these fits off.
+        trd_every: Interval between these fits, as a share of the run. 0 fits only at the start.
+        twist: Weight of the cross-Gaussian twist loss in these fits, by which the twist of each Gaussian must also move
+            another Gaussian of its group.
+        stiffness: Weight of the mean squared distance of moved Gaussians from the best rigid motion of their group.
+        chunk: Gaussians per forward pass of the networks; bounds memory.
     """
 
     variant: str = "r5dgs"
@@ -198,8 +208,9 @@ class LossSection:
     Attributes:
         ssim: Share of 1 - SSIM in the photometric loss; the rest is L1.
         roughness: Weight of the mean squared second difference of the tracks.
-        rigid: Weight of the change of distance to the representative of the object (variant ``r5dgs_extra``).
-        rigid_start: Share of the run after which it counts.
+        rigid: Weight of the rigidity loss, the change of each Gaussian's distance to the representative of its object
+            (variant ``r5dgs_extra`` only).
+        rigid_start: Share of the run after which the rigidity loss is active.
     """
 
     ssim: float = 0.2
@@ -210,14 +221,14 @@ class LossSection:
 
 @dataclass(frozen=True)
 class CurriculumSection:
-    """When observed times enter training, as steps.
+    """Order in which observed times enter training; runs of fewer than 2000 steps shorten the schedule in proportion.
 
     Attributes:
-        start: Time that training begins with: ``best``, at which most objects are well seen, or ``first``.
-        first: Steps on that time alone.
-        grow: Steps over which the other times enter, from there outwards.
-        stages: Steps in which they enter; 0 for one knot after the other.
-        newest: Share of draws on the newest times while they enter.
+        start: First time to train: ``best`` (the time at which most objects are well visible) or ``first``.
+        first: Steps that train the first time alone.
+        grow: Steps during which the other times enter, from the first one outwards.
+        stages: Number of stages in which they enter. 0 adds one time after another.
+        newest: Share of the steps that draw a view of the newest times while times enter.
     """
 
     start: str = "best"
@@ -227,30 +238,35 @@ class CurriculumSection:
     newest: float = 0.4
 
     def steps(self, iterations: int) -> tuple[int, int]:
-        """Steps on the first time alone, and step at which all times have entered, in a run of some length."""
+        """Return the number of steps on the first time alone, and the step at which all times have entered.
+
+        Args:
+            iterations: Length of the run, steps.
+        """
         scale = min(1.0, iterations / 2000)
         return int(self.first * scale), int((self.first + self.grow) * scale)
 
 
 @dataclass(frozen=True)
 class DensifySection:
-    """When Gaussians are split, cloned and removed; but for cap and strategy, the thresholds of ``share``.
+    """Schedule and limits of densification; all keys but ``strategy`` and ``max_gaussians`` apply to ``share`` alone.
 
     Attributes:
-        strategy: ``share`` (the largest gradients grow, a share of all in a round), ``default`` (that of 3DGS) or
-            ``mcmc`` (3DGS as Markov Chain Monte Carlo).
-        start: First step.
-        stop: Last step, as a share of the run.
+        strategy: ``share`` (in each round, the Gaussians with the largest gradients grow, up to a share of all),
+            ``default`` (adaptive density control of 3DGS) or ``mcmc`` (3DGS as Markov Chain Monte Carlo).
+        start: First step of densification.
+        stop: Last step of densification, as a share of the run.
         every: Steps between two rounds.
-        gradient: Mean screen gradient above which a Gaussian grows, per half image width (the measure of 3DGS).
-        share: Largest share of Gaussians that grow in a round.
-        split_pixels: Larger ones (standard deviation in pixels) are split, smaller ones cloned.
-        max_gaussians: Cap; 0 chooses it from the image size (3/4 of an image's pixels, at most 60000).
-        prune_opacity: Fainter ones are removed.
-        prune_width: Wider ones are removed; standard deviation as a share of the image width.
-        prune_near: Background that is nearer to a camera and that no second camera sees is removed; normalised units
-            (the cameras' focus is at about 4); 0 keeps it.
-        opacity: Weight of the mean opacity in the loss, so that what no image needs fades; 0 for none.
+        gradient: Mean screen-space gradient above which a Gaussian grows, per half image width (as in 3DGS).
+        share: Largest share of the Gaussians that grow in a round.
+        split_pixels: Standard deviation in pixels above which a growing Gaussian is split; smaller ones are cloned.
+        max_gaussians: Largest number of Gaussians. 0 chooses it from the image size (3/4 of an image's pixels, at most
+            60000).
+        prune_opacity: Opacity below which a Gaussian is removed.
+        prune_width: Standard deviation, as a share of the image width, above which a Gaussian is removed.
+        prune_near: Distance from a camera below which background Gaussians in the view of fewer than two cameras are
+            removed, normalised units (the cameras' focus is at about 4). 0 keeps them.
+        opacity: Weight of the mean opacity in the loss, by which Gaussians fade that no image needs. 0 turns it off.
     """
 
     strategy: str = "share"
@@ -269,19 +285,21 @@ class DensifySection:
 
 @dataclass(frozen=True)
 class DensifyDefaultSection:
-    """Thresholds of the strategy ``default``, those of 3DGS; its runs begin with ``init.opacity`` 0.1.
+    """Strategy ``default``, with the thresholds of 3DGS, which starts from ``init.opacity`` = 0.1.
 
     Attributes:
         start: Step after which Gaussians grow.
-        stop: Share of the run after which they do not (15000 of 30000 steps).
+        stop: Share of the run after which they no longer grow (15000 of 30000 steps).
         every: Steps between two rounds.
-        gradient: Mean screen gradient from which on a Gaussian grows, per half image width.
-        percent_dense: Larger ones (standard deviation as a share of the cameras' extent) are split, others cloned.
-        prune_opacity: Fainter ones are removed.
-        prune_radius: Ones with a larger radius in some view, px, are removed after the first reset.
-        prune_extent: So are those with a larger standard deviation, as a share of the cameras' extent.
-        reset_every: Steps between two resets of the opacities, while Gaussians grow; 0 for none.
-        reset_opacity: No opacity is larger after a reset.
+        gradient: Mean screen-space gradient from which on a Gaussian grows, per half image width.
+        percent_dense: Standard deviation, as a share of the cameras' extent, above which a growing Gaussian is split;
+            smaller ones are cloned.
+        prune_opacity: Opacity below which a Gaussian is removed.
+        prune_radius: Radius in a view, px, above which a Gaussian is removed, after the first reset of the opacities.
+        prune_extent: Standard deviation, as a share of the cameras' extent, above which a Gaussian is removed, after
+            the first reset of the opacities.
+        reset_every: Steps between two resets of the opacities while Gaussians grow. 0 turns resets off.
+        reset_opacity: Largest opacity after a reset.
     """
 
     start: int = 500
@@ -298,15 +316,15 @@ class DensifyDefaultSection:
 
 @dataclass(frozen=True)
 class DensifyMcmcSection:
-    """Thresholds of the strategy ``mcmc``, those of its paper.
+    """Strategy ``mcmc``, with the thresholds of its paper.
 
     Attributes:
-        start: Step after which Gaussians are moved and added.
-        stop: Share of the run after which they are not (25000 of 30000 steps).
+        start: Step after which Gaussians are relocated and added.
+        stop: Share of the run after which they no longer are (25000 of 30000 steps).
         every: Steps between two rounds.
-        grow: Share that is added in a round, up to ``densify.max_gaussians``.
-        dead_opacity: Fainter ones are moved onto live ones.
-        noise: Noise on the centres, per variance and learning rate of the centres; 0 for none.
+        grow: Share of the Gaussians that a round adds, up to ``densify.max_gaussians``.
+        dead_opacity: Opacity below which a Gaussian is dead; dead Gaussians are relocated onto live ones.
+        noise: Scale of the noise on the centres, per variance and learning rate of the centres. 0 turns it off.
         opacity: Weight of the mean opacity in the loss.
         scale: Weight of the mean standard deviation in the loss.
     """
@@ -323,13 +341,15 @@ class DensifyMcmcSection:
 
 @dataclass(frozen=True)
 class DiscoverySection:
-    """What moves where there are no masks (`discovery.py`): a short run of a field, and its rigidly moving parts.
+    """Discovery of moving objects in data without masks (`train/object_discovery.py`).
+
+    A short run of ``field`` is trained, and its rigidly moving parts become the objects.
 
     Attributes:
-        iterations: Steps of that run; 0 trains data without masks as one static scene.
-        gate: Share of it after which what rests is set still.
-        still: What leaves its place by less rests; normalised units.
-        fewest: Parts of fewer Gaussians are left to the background.
+        iterations: Steps of the short run. 0 trains data without masks as one static scene.
+        gate: Share of the short run after which Gaussians at rest are frozen.
+        still: Displacement over the observed times below which a Gaussian is at rest, normalised units.
+        fewest: Smallest number of Gaussians of an object; smaller parts join the background.
     """
 
     iterations: int = 1200
@@ -340,15 +360,16 @@ class DiscoverySection:
 
 @dataclass(frozen=True)
 class ResidualSection:
-    """Residual motion of bodies that bend or breathe (`residual.py`).
+    """Residual motion of non-rigid objects (`train/residual_trial.py`).
 
     Attributes:
-        start: Share of the run after which all bodies are tried; not before every time takes part.
-        trial_steps: Steps of the trial, in runs of 2000 steps or more.
-        threshold: Bodies on which the error grows by more without them keep their residuals, dB.
-        nodes: Places on a body that carry its residuals.
-        size: Weight of the mean squared residual, per length of the body.
-        roughness: Weight of its mean squared second difference over the knots.
+        start: Share of the run after which all objects are tested for residual motion, but not before all times take
+            part.
+        trial_steps: Steps of the test; fewer in runs of fewer than 2000 steps.
+        threshold: Gain in PSNR on an object, dB, above which it keeps its residual motion.
+        nodes: Control points per object.
+        size: Weight of the mean squared residual, relative to the object's size.
+        roughness: Weight of the mean squared second difference of the residual over time.
     """
 
     start: float = 0.4
@@ -361,24 +382,26 @@ class ResidualSection:
 
 @dataclass(frozen=True)
 class IdentitySection:
-    """Identity encodings (Gaussian Grouping).
+    """Identity encodings and their classifier (Gaussian Grouping).
 
     Attributes:
-        training: ``after`` the run on frozen geometry, ``joint`` with it from the first step (the paper), ``detached``
-            with it, without gradient to the geometry; ``off`` leaves encodings and classifier out.
-        iterations: Steps of ``after``; 0 is ``off``.
+        training: ``after`` trains them after the run, on frozen geometry; ``joint`` from the first step together with
+            the geometry (the paper); ``detached`` during the run, without gradients to the geometry; ``off`` leaves
+            them out.
+        iterations: Steps of ``after``. 0 has the effect of ``off``.
         rate: Learning rate of the encodings.
         classifier_rate: Learning rate of the classifier.
-        weight: Weight of the pixel cross-entropy (divided by ln C) beside the photometric loss.
-        every: Steps between two pixel losses of ``detached``.
-        spatial: Weight of the divergence between neighbours' classes (L_3d); 0 for none.
-        majority: Weight of the distance from the neighbours' mean class (L_major); 0 for none.
-        regularise_every: Steps between two evaluations of these two (tau_reg).
-        neighbours: Neighbours that are compared.
-        include_self: Whether L_3d counts a Gaussian among its own neighbours, as Gaussian Grouping does; "auto" does
-            in a ``field``.
-        samples: Gaussians that are compared with theirs each time.
-        hygiene: Whether labels that the masks leave undecided follow neighbours and motion (`label_hygiene.py`).
+        weight: Weight of the pixel cross-entropy (divided by ln C for C classes) relative to the photometric loss.
+        every: Steps between two evaluations of the pixel loss with ``detached``.
+        spatial: Weight of the divergence between the classes of neighbouring Gaussians (L_3d). 0 turns it off.
+        majority: Weight of the distance to the mean class of the neighbours (L_major). 0 turns it off.
+        regularise_every: Steps between two evaluations of L_3d and L_major (tau_reg).
+        neighbours: Neighbours per Gaussian in L_3d and L_major.
+        include_self: Count a Gaussian as its own neighbour in L_3d, as Gaussian Grouping does: ``on``, ``off`` or
+            ``auto`` (on with ``field``).
+        samples: Gaussians per evaluation of L_3d and L_major.
+        hygiene: Correct uncertain labels after the run by the neighbours and the motion of their Gaussians
+            (`train/identity/label_cleanup.py`).
     """
 
     training: str = "after"
@@ -398,18 +421,21 @@ class IdentitySection:
 
 @dataclass(frozen=True)
 class NeedsSection:
-    """Your word on what a scene needs, by the names of the table of `needs.decide`: "auto" measures, "on", "off".
+    """User's overrides of the decisions in the needs table (`bake/needs.py`).
+
+    "auto" decides from measurements, "on" keeps the feature, "off" leaves it out.
 
     Attributes:
         tracks: Motion of the objects.
-        rotation: Rotation of the objects; without it they only slide.
+        rotation: Rotation of the objects; without it, they only translate.
         shading: Colours that change as objects turn.
         shadows: Shadow Gaussians.
-        view_dependent_colour: Harmonics of the colour, to ``train.sh_degree`` (at least 1 where this is on).
-        sky_gradient: Harmonics of the sky; without them it has one colour.
+        view_dependent_colour: Harmonics of the colour up to ``train.sh_degree`` ("on" raises it to at least 1).
+        sky_gradient: Harmonics of the sky; without them, the sky has one colour.
         classifier: Identity encodings and their classifier.
-        residuals: Motion of objects that bend or breathe.
-        regrouping: Gaussians of a field that go with the group that explains their motion, not that of their object.
+        residuals: Residual motion of non-rigid objects.
+        regrouping: Assignment of a field's Gaussians to the group that explains their motion best, instead of the group
+            of their object.
     """
 
     tracks: str = "auto"

@@ -1,4 +1,4 @@
-"""Effects of the user's ``needs.*`` overrides on a run."""
+"""Effects of the user's ``needs.*`` overrides on training."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from .config import Config
 
 
 def resolve(config: Config) -> Config:
-    """Apply the user's ``needs.*`` overrides to the configuration that training follows.
+    """Apply the user's ``needs.*`` overrides to the training configuration.
 
     Args:
-        config: As the user gave it; its ``needs`` stay in the result.
+        config: Configuration as given by the user; the result keeps its ``needs``.
     """
     wanted = config.needs
     changes: dict[str, Any] = {}
@@ -33,19 +33,19 @@ def resolve(config: Config) -> Config:
 
 
 def discovery(dataset: Dataset, config: Config) -> bool:
-    """True if a run looks for moving objects: it starts with tracks, and has several times but no mask."""
+    """True if a run must discover its moving objects: it starts with tracks and has several times and no masks."""
     tracks = config.train.representation == "tracks" or config.field.tracks_share > 0
     return tracks and _looks_for_parts(dataset, config)
 
 
 def sorting(dataset: Dataset, config: Config) -> bool:
-    """True if a finished run sorts its Gaussians into rigid parts: it is a field, and has several times but no mask."""
+    """True if a finished run must sort its Gaussians into rigid parts: a field with several times and no masks."""
     field = config.train.representation == "field" and config.field.tracks_share == 0
     return field and _looks_for_parts(dataset, config)
 
 
 def _looks_for_parts(dataset: Dataset, config: Config) -> bool:
-    """True if motion has to show the objects: there are several times but no mask."""
+    """True if objects must be found by their motion: there are several times but no masks."""
     unmasked = all(view.mask_path is None for view in dataset.train)
     several = len({view.t for view in dataset.train}) > 1
     return unmasked and several and config.discovery.iterations > 0 and config.needs.tracks != "off"
