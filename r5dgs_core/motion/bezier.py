@@ -1,4 +1,4 @@
-"""Bezier segments between two keys of a curve over time, as animation editors keep them: cut without changing them.
+"""Cubic Bezier segments of animation curves: evaluation and exact subdivision.
 
 A segment is four points (time, value): a key, its right handle, the next key's left handle, that key. [4, 2]
 """
@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-_HALVINGS = 54  # of the parameter's range: down to rounding
+_HALVINGS = 54  # bisection steps of the curve parameter, down to rounding
 
 
 def within(segment: np.ndarray) -> np.ndarray:
-    """The segment as Blender evaluates it: a handle that reaches past the other key is shortened. [4, 2] -> [4, 2]
+    """Shorten handles that reach past the other key, as Blender does on evaluation. [4, 2] -> [4, 2]
 
-    Handles may overlap: the curve goes on in time all the same.
+    Handles may still overlap; time stays monotonic along the curve.
     """
     segment = np.array(segment, np.float64)
     length = segment[3, 0] - segment[0, 0]
@@ -25,16 +25,17 @@ def within(segment: np.ndarray) -> np.ndarray:
 
 
 def line(start: np.ndarray, stop: np.ndarray) -> np.ndarray:
-    """The segment that goes straight and steadily from one point to another. [2], [2] -> [4, 2]"""
+    """Straight segment with constant speed between two points. [2], [2] -> [4, 2]"""
     return start + np.array([[0.0], [1 / 3], [2 / 3], [1.0]]) * (stop - start)
 
 
 def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut a segment at a time into segments that are the same curve together (de Casteljau).
+    """Split a segment at a time without changing the curve (de Casteljau).
 
-    A handle of a part may reach past that part's other key, which `within` would shorten: it does so only where both
-    handles of the whole reach over more than two thirds of it, and the part spans the point at which time goes on
-    slowest. That part is cut there once more: on either side of that point the thirds of a cubic lie between its ends.
+    A part's handle can reach past that part's other key only if both handles of the whole segment span more than two
+    thirds of it and the part contains the parameter at which time advances slowest. `within` would then shorten the
+    handle, so that part is split once more there: on either side of that point the control times of the cubic lie
+    between its ends.
 
     Args:
         segment: Key, handle, handle, key, the keys in order of time. [4, 2]
@@ -62,19 +63,19 @@ def split(segment: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slowest(times: np.ndarray) -> float:
-    """Share at which a cubic with these control times turns from slowing down to speeding up; NaN where it is none."""
+    """Parameter at which a cubic with these control times is slowest, or NaN if it has no minimum speed."""
     bends = np.diff(times, 2)
     return float(-bends[0] / (bends[1] - bends[0])) if bends[1] > bends[0] else np.nan
 
 
 def _halves(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """The curve up to a share of its parameter, and from there on. [4, 2] each"""
+    """Split the control points at a parameter value. [4, 2] each"""
     levels = _levels(points, share)
     return np.stack([level[0] for level in levels]), np.stack([level[-1] for level in reversed(levels)])
 
 
 def _levels(points: np.ndarray, share: float) -> list[np.ndarray]:
-    """The points and their repeated means: [4, 2], [3, 2], [2, 2], [1, 2]."""
+    """Control points of each de Casteljau level: [4, 2], [3, 2], [2, 2], [1, 2]."""
     levels = [points]
     while len(levels[-1]) > 1:
         levels.append((1 - share) * levels[-1][:-1] + share * levels[-1][1:])
@@ -82,11 +83,11 @@ def _levels(points: np.ndarray, share: float) -> list[np.ndarray]:
 
 
 def evaluate(segments: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values and slopes of a curve of segments, at times within it; at a key, those of the segment that starts there.
+    """Values and slopes of a piecewise curve. At a key, those of the segment that starts there.
 
     Args:
-        segments: Consecutive, each ending at the key where the next begins. [K, 4, 2]
-        times: [S]
+        segments: Consecutive, each ending at the key at which the next begins. [K, 4, 2]
+        times: Within the curve. [S]
 
     Returns:
         Values [S] and slopes per unit of time [S].
@@ -106,14 +107,14 @@ def evaluate(segments: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _cubic(points: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """[S, 4], [S] -> [S]"""
+    """Evaluate Bezier control values at a parameter. [S, 4], [S] -> [S]"""
     rest = 1 - share
     weights = np.stack([rest**3, 3 * share * rest**2, 3 * share**2 * rest, share**3], axis=-1)
     return (weights * points).sum(-1)
 
 
 def _rate(points: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Derivative of `_cubic` by the share. [S, 4], [S] -> [S]"""
+    """Derivative of `_cubic` with respect to the parameter. [S, 4], [S] -> [S]"""
     rest = 1 - share
     weights = np.stack([rest**2, 2 * share * rest, share**2], axis=-1)
     return 3 * (weights * np.diff(points, axis=-1)).sum(-1)

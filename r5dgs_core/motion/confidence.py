@@ -1,4 +1,4 @@
-"""How far a motion model can be trusted: the standard deviation of a body's place that its covariance implies."""
+"""Position uncertainty of an extrapolated body, from the covariance of its motion model."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import numpy as np
 
 from . import models, rotations
 
-_STEP = 1e-4  # of a rate's own standard deviation: small against its effect, large against rounding
+_STEP = 1e-4  # finite-difference step, in standard deviations of the rate
 _TURNED = 2 / 3  # mean over a sphere of |dtheta x r|^2 for |r| = 1
 
 
 def position_sigma(model: models.MotionModel, tau: np.ndarray) -> np.ndarray:
-    """One standard deviation of the place of a point of the body, to first order in the rates' errors.
+    """Standard deviation of a body point's position, to first order in the rate errors.
 
-    What a change of rates does to the displacement of the pivot and, by turning the body, to a point at its radius is
-    added up over all directions. Other models that explain the observed poses as well, and the noise of the bind state
-    itself, are not in it: the truth leaves it more often than a third of the time.
+    Propagates the covariance of the rates to the displacement of the pivot and, through rotation, to a point at
+    ``model.radius``, averaged over directions. It ignores the noise of the bind state and alternative models that fit
+    the observed poses equally well. The true error therefore exceeds one sigma more often than a third of the time.
 
     Args:
         model: The motion.
         tau: Times since t_max, >= 0. [H]
 
     Returns:
-        World units, 0 at tau = 0; 0 throughout where the model carries no covariance. [H]
+        World units, 0 at tau = 0; all zero if the model has no covariance. [H]
     """
     tau = np.asarray(tau, np.float64)
     if model.covariance is None or len(model.covariance_names) == 0:
@@ -47,11 +47,11 @@ def position_sigma(model: models.MotionModel, tau: np.ndarray) -> np.ndarray:
 
 
 def without(model: models.MotionModel, names: set[str]) -> models.MotionModel:
-    """The model with some of its vectors taken for certain: their rows of the covariance are zero.
+    """Zero the covariance of some of the model's fields, so that they count as exact.
 
     Args:
         model: The motion.
-        names: Fields of it, such as "velocity".
+        names: Names of the fields, such as "velocity".
     """
     if model.covariance is None or not names:
         return model
@@ -60,7 +60,7 @@ def without(model: models.MotionModel, names: set[str]) -> models.MotionModel:
 
 
 def _has(model: models.MotionModel, name: str) -> bool:
-    """Whether a rate takes part in the motion; "frequency" of a model that does not swing has no slope."""
+    """Return False for a rate that does not affect the motion: "frequency" of a model that does not oscillate."""
     return name != "frequency" or model.frequency > 0
 
 

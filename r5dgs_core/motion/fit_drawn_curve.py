@@ -1,8 +1,8 @@
-"""The motion model that comes nearest to a curve that somebody drew after t_max.
+"""Fit a motion model to a curve that the user drew after t_max.
 
-Unlike `model_selection`, which looks for the law behind noisy observations, this takes the poses as they are: the
-plainest kind that holds a tolerance, else the one with the least error. Notation: tau = t - t_max > 0, radius the size
-that rotations are weighed with.
+`model_selection` identifies a motion law behind noisy observations. This module takes the poses as exact: it returns
+the simplest kind within a tolerance, else the kind with the smallest error. Notation: tau = t - t_max > 0; radius
+weights rotations against displacements.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from . import models, rotations
 from .models import MotionModel
 
-# Plainest first: a kind of `MotionModel` and its free rates.
+# Kinds of `MotionModel` and their free rates, simplest first.
 _KINDS = (
     ("static", ()),
     ("translation", ("velocity", "acceleration")),
@@ -48,7 +48,7 @@ def fit(
             break
         model = _solve(kind, free, taus, quats, displacements, radius)
         missed = pose_errors(*models.evaluate(model, taus), quats, displacements, radius).max()
-        if missed < 0.9 * error:  # more numbers have to pay
+        if missed < 0.9 * error:  # a kind with more parameters must be clearly better
             best, error = model, missed
     return best, float(error)
 
@@ -56,7 +56,7 @@ def fit(
 def pose_errors(
     quats_a: np.ndarray, moves_a: np.ndarray, quats_b: np.ndarray, moves_b: np.ndarray, radius: float
 ) -> np.ndarray:
-    """At most how far two poses bring a point apart that lies within ``radius`` of the pivot. [S, 4], [S, 3] -> [S]"""
+    """Upper bound of the distance between two poses of a point within ``radius`` of the pivot. [S, 4], [S, 3] -> [S]"""
     turn = rotations.angle_between(quats_a, quats_b)
     return np.linalg.norm(moves_a - moves_b, axis=-1) + 2 * radius * np.sin(0.5 * turn)
 
@@ -64,7 +64,7 @@ def pose_errors(
 def _solve(
     kind: str, free: tuple[str, ...], taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray, radius: float
 ) -> MotionModel:
-    """Levenberg-Marquardt over the free rates, from the rates that a parabola through the first poses has."""
+    """Fit the free rates by Levenberg-Marquardt, starting from `_rates`."""
     span = float(taus[-1])
     rate = {"velocity": radius / span, "acceleration": radius / span**2, "center_offset": radius}
     rate |= {"angular_velocity": 1 / span, "angular_acceleration": 1 / span**2}
@@ -99,7 +99,7 @@ def _solve(
 
 
 def _rates(taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray) -> dict[str, np.ndarray]:
-    """Rates at t_max of parabolas through the displacements and the angles turned."""
+    """Rates at t_max of parabolas fitted to the displacements and to the accumulated rotation angles."""
     whole = rotations.make_continuous(np.concatenate([rotations.identity(1), quats]))
     turns = rotations.quats_to_rotvecs(rotations.multiply(whole[1:], rotations.conjugate(whole[:-1])))
     design = np.stack([taus, 0.5 * taus**2], axis=-1)[:, : min(2, len(taus))]

@@ -1,11 +1,11 @@
-"""A body that turns freely, without any torque: a thrown box that tumbles.
+"""Torque-free rotation of a rigid body (free asymmetric top), such as a thrown box that tumbles.
 
-Notation: J inertia in the world at tau = 0, only its ratios matter; I1, I2, I3 its principal moments, A the turn from
-the principal axes to the world; w_k spins in the principal axes, L = |J w|, 2E = w J w. Both are kept for ever. With
-the axes named so that the spin circles the third, and the clock u = p tau + u_0, Euler's equations give
-w_1 = w_1m cn u, w_2 = w_2m sn u, w_3 = w_3m dn u, Jacobi's elliptic functions of parameter m. Seen along the fixed
-vector J w, an axis k of the body turns at the rate L (2E - I_k w_k^2) / (L^2 - I_k^2 w_k^2), whose integral is a mean
-rate and a Fourier series: everything is in closed form, and any time costs the same.
+Notation: J inertia in the world at tau = 0, up to a factor; I1, I2, I3 its principal moments; A the rotation from the
+principal axes to the world; w_k spins about the principal axes; L = |J w| and 2E = w J w, both conserved. The axes are
+ordered so that the spin circles the third. With u = p tau + u_0, Euler's equations give w_1 = w_1m cn u, w_2 = w_2m sn
+u, w_3 = w_3m dn u, Jacobi's elliptic functions of parameter m. About the fixed vector J w, a body axis k precesses at
+the rate L (2E - I_k w_k^2) / (L^2 - I_k^2 w_k^2), whose integral is a mean rate plus a Fourier series. The solution is
+in closed form, so any time costs the same.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import numpy as np
 
 from . import rotations
 
-DISTINCT = 0.1  # moments nearer to each other than this share make a body turn steadily, as far as poses can tell
-LINE = 1e-3  # a smallest moment below this share of the largest is that of a line, which has no spin about itself
-_GAP = 1e-9  # relative; moments are this far apart at least, as Euler's solution divides by their differences
-_SAMPLES = 256  # of a rate over a period; its series converges like exp(-n), near a separatrix more slowly
+DISTINCT = 0.1  # least relative difference of moments that makes a visible tumble
+LINE = 1e-3  # smallest / largest moment; a line, which has no spin about itself, is below
+_GAP = 1e-9  # least relative gap between moments; Euler's solution divides by their differences
+_SAMPLES = 256  # per period; the Fourier series converges like exp(-n), more slowly near a separatrix
 _LEAST = 1e-300
-_LEAST_M1 = 1e-20  # a spin is never exactly on the separatrix, where the period is infinite
+_LEAST_M1 = 1e-20  # keeps spins off the separatrix, where the period is infinite
 
 
 def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Inertia of a cloud of points about its centroid, scaled to trace 1; that of a ball where it has no extent.
+    """Inertia of a point cloud about its centroid, scaled to trace 1; that of a ball if the cloud has no extent.
 
     Args:
         points: In the world. [n, 3]
@@ -46,13 +46,13 @@ def inertia(points: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray
 
 
 def tumbles(body: np.ndarray) -> bool:
-    """Whether an inertia is so far from that of a ball that poses can tell, and not that of a line. [3, 3]"""
+    """Return True if a body with this inertia tumbles visibly: it is neither nearly a ball nor a line. [3, 3]"""
     moments = np.linalg.eigvalsh(body)
     return bool(LINE * moments[2] < moments[0] < (1 - DISTINCT) * moments[2])
 
 
 def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations of a free body, and its spins.
+    """Rotations and angular velocities of a free body.
 
     Args:
         body: Inertia J in the world at tau = 0, symmetric with positive moments. [3, 3]
@@ -60,8 +60,8 @@ def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray,
         tau: Times of either sign. [S]
 
     Returns:
-        Rotations since tau = 0, unit wxyz with w >= 0 [..., S, 4]; the identity to the bit at tau = 0. Angular
-        velocities in the world frame [..., S, 3].
+        Rotations since tau = 0, unit wxyz with w >= 0 [..., S, 4], exactly the identity at tau = 0; angular velocities
+        in the world frame [..., S, 3].
 
     Source: Euler's equations; Jacobi's solution by arithmetic-geometric means.
     """
@@ -76,7 +76,7 @@ def turns(body: np.ndarray, w: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray,
 
 
 class Tops:
-    """Several free bodies at any time: what does not depend on it is computed once.
+    """Several free bodies, evaluated together. Time-independent quantities are precomputed.
 
     Args:
         bodies: Inertia of each in the world at tau = 0. [K, 3, 3]
@@ -92,7 +92,7 @@ class Tops:
         self._from_start = self._path.axes @ np.swapaxes(frames[:, 0], -1, -2)
 
     def turns(self, tau: float) -> np.ndarray:
-        """Rotations since tau = 0, as `turns`. [K, 4]"""
+        """Rotations since tau = 0, as from the function `turns`. [K, 4]"""
         frames, _ = self._path.at(np.array([tau], np.float64))
         quats = rotations.rotmats_to_quats(self._from_start @ frames[:, 0] @ np.swapaxes(self._path.axes, -1, -2))
         return np.where((self._still | (tau == 0))[:, None], rotations.identity(), quats)
@@ -100,16 +100,16 @@ class Tops:
 
 @dataclass(frozen=True)
 class _Path:
-    """The solution for B spins; principal axes in Jacobi's order.
+    """Elliptic-function solution for B spins, with principal axes in Jacobi's order.
 
     Attributes:
         axes: Columns are the principal axes in the world at tau = 0. [B, 3, 3]
-        moments: [B, 3]
+        moments: Principal moments. [B, 3]
         peaks: w_1m, w_2m, w_3m with their signs. [B, 3]
         rate: p. [B]
         phase: u_0. [B]
         m1: 1 - m. [B]
-        pole: Index of the axis k whose turn is followed, the one that stays farther from the fixed vector. [B]
+        pole: Index of the axis k whose precession is integrated, the one farther from the fixed vector. [B]
     """
 
     axes: np.ndarray
@@ -121,12 +121,12 @@ class _Path:
     pole: np.ndarray
 
     def spins(self, u: np.ndarray) -> np.ndarray:
-        """Spins in the principal axes at clocks u. [B, S] -> [B, S, 3]"""
+        """Angular velocities about the principal axes. [B, S] -> [B, S, 3]"""
         sn, cn, dn = elliptic(u, self.m1[..., None])
         return np.stack([cn, sn, dn], -1) * self.peaks[..., None, :]
 
     def precession(self, spins: np.ndarray) -> np.ndarray:
-        """Rate of the turn of axis `pole` about the fixed vector. [B, S, 3] -> [B, S]"""
+        """Precession rate of axis `pole` about the fixed vector. [B, S, 3] -> [B, S]"""
         momenta = self.moments[..., None, :] * spins
         squares, energies = momenta**2, momenta * spins
         k = np.broadcast_to(self.pole[..., None, None], (*spins.shape[:-1], 1))
@@ -136,7 +136,7 @@ class _Path:
         return np.sqrt(length) * energy / np.maximum(across, _LEAST)
 
     def at(self, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Turns from the principal axes to a frame that stands still in the world [B, S, 3, 3]; spins [B, S, 3]."""
+        """Rotations from the principal axes to a world-fixed frame [B, S, 3, 3] and spins [B, S, 3]."""
         u = self.rate[..., None] * tau + self.phase[..., None]
         spins = self.spins(u)
         momenta = self.moments[..., None, :] * spins
@@ -152,19 +152,19 @@ class _Path:
 
     @functools.cached_property
     def _waves(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean rate of the precession [B, 1], sizes of the waves of its integral, and their numbers per clock."""
+        """Mean precession rate [B, 1]; amplitudes and frequencies in u of the Fourier series of its integral."""
         quarter = complete(self.m1)
-        grid = 2 * quarter[..., None] * np.arange(_SAMPLES) / _SAMPLES  # a period of the squares
+        grid = 2 * quarter[..., None] * np.arange(_SAMPLES) / _SAMPLES  # one period of the squared spins
         waves = np.fft.rfft(self.precession(self.spins(grid)), axis=-1) / _SAMPLES
         numbers = np.arange(1, _SAMPLES // 2)
         pace = np.where(self.rate > 0, self.rate * np.pi / quarter, 1.0)
-        # The rates are even in u, so that their series has cosines alone; sines integrate them.
+        # The rates are even in u, so their series has only cosines, which integrate to sines.
         sizes = 2 * waves[..., 1:-1].real / (numbers * pace[..., None])
         sizes = np.where(self.rate[..., None] > 0, sizes, 0.0)
         return waves[..., :1].real, sizes, (np.pi / quarter)[..., None] * numbers
 
     def _angle(self, tau: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Integral of the precession from a time of its own to tau. [B, S]"""
+        """Integral of the precession rate, up to a constant per body. [B, S]"""
         mean, sizes, numbers = self._waves
         return mean * tau + (np.sin(u[..., None] * numbers[..., None, :]) @ sizes[..., None])[..., 0]
 
@@ -179,7 +179,7 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     middle = max(values[1], values[0] + _GAP)
     values = np.array([values[0], middle, max(values[2], middle + _GAP)])
     spins = w @ vectors
-    # L^2 - 2E I2: where it is negative, the spin circles the axis of the smallest moment, which then is the third.
+    # L^2 - 2E I2. If negative, the spin circles the axis of the smallest moment, which becomes the third.
     circling = (values * spins**2 * (values - values[1])).sum(-1)
     flip = (circling < 0)[..., None]
     spins = np.where(flip, spins[..., ::-1] * [1, -1, 1], spins)
@@ -187,7 +187,7 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
     axes = np.where(flip[..., None], vectors[:, ::-1] * [1, -1, 1], vectors)
 
     i1, i2, i3 = (moments[..., k] for k in range(3))
-    # |2E I3 - L^2| and |L^2 - 2E I1|, as sums without cancellation.
+    # |2E I3 - L^2| and |L^2 - 2E I1|, as sums that do not cancel.
     low = np.abs((moments * spins**2 * (moments - moments[..., 2:])).sum(-1))
     high = np.abs((moments * spins**2 * (moments - moments[..., :1])).sum(-1))
     gap12, gap13, gap23 = np.abs(i1 - i2), np.abs(i1 - i3), np.abs(i2 - i3)
@@ -206,7 +206,7 @@ def _solve(body: np.ndarray, w: np.ndarray) -> _Path:
 
 
 def _means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Arithmetic and geometric means a, b, and half differences c, from 1 and sqrt(1 - m)."""
+    """Arithmetic and geometric means a, b and half differences c of the AGM iteration from 1 and sqrt(1 - m)."""
     a, b = [np.ones_like(m1)], [np.sqrt(m1)]
     c = [np.sqrt(np.maximum(1 - m1, 0.0))]
     while len(a) < 12 and (c[-1] > 1e-17 * a[-1]).any():
@@ -217,12 +217,12 @@ def _means(m1: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray], list[np.
 
 
 def complete(m1: np.ndarray) -> np.ndarray:
-    """K, a quarter of the period of sn, for parameters m = 1 - m1. [...]"""
+    """Complete elliptic integral K, a quarter period of sn, for parameters m = 1 - m1. [...]"""
     return 0.5 * np.pi / _means(np.asarray(m1, np.float64))[0][-1]
 
 
 def incomplete(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
-    """F: the clock u at which sn u = sin(amplitude), cn u = cos(amplitude). Angles of any size. [...]"""
+    """Incomplete elliptic integral F: u with sn u = sin(amplitude), cn u = cos(amplitude). Any angle. [...]"""
     a, b, _ = _means(np.asarray(m1, np.float64))
     phi = np.asarray(amplitude, np.float64)
     for x, y in zip(a[:-1], b[:-1], strict=True):
@@ -232,7 +232,7 @@ def incomplete(amplitude: np.ndarray, m1: np.ndarray) -> np.ndarray:
 
 
 def elliptic(u: np.ndarray, m1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobi's sn, cn, dn at clocks u, for parameters m = 1 - m1, broadcast. [...] each"""
+    """Jacobi's sn, cn, dn of u for parameters m = 1 - m1, broadcast. [...] each"""
     a, _, c = _means(np.asarray(m1, np.float64))
     phi = 2.0 ** (len(a) - 1) * a[-1] * u
     for x, z in zip(a[:0:-1], c[:0:-1], strict=True):

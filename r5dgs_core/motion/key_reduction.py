@@ -1,4 +1,4 @@
-"""Few keys that reproduce a rigid motion within a tolerance, for editors that interpolate with cubic Bezier curves.
+"""Keyframe reduction: few keys that reproduce a rigid motion within a tolerance, for cubic Bezier interpolation.
 
 Between two keys each component is the cubic with the given values and slopes at both ends; in Blender: BEZIER keys with
 free handles at a third of the interval. Quaternions are interpolated by component and normalised, as Blender does.
@@ -16,17 +16,17 @@ import numpy as np
 
 from . import models, rotations
 
-_ROUNDING = 1e-9  # of the largest value
+_ROUNDING = 1e-9  # largest relative change of a curve by a dropped key
 MAX_STEP_RAD = math.radians(120.0)
-MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame: near half a turn, frames no longer show which way it goes
-FEWEST_INTERVALS = 64  # that are tried first, however short the motion
+MAX_FRAME_TURN_RAD = math.radians(160.0)  # per frame; near half a turn, frames no longer show the direction
+FEWEST_INTERVALS = 64  # first grid between two forced times
 MOST_INTERVALS = 1 << 15
-_FINER = 4  # points of the checking grid per possible key time
-_PER_FRAME = 4  # possible key times
-_STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # of integration, in one pass over a motion
-_ENOUGH_STEPS = 1 << 16  # in a pass over few samples
-_ONE_BY_ONE = 256  # keys; what needs more is cut into stripes that are walked side by side
-_PER_STRIPE = 32  # keys: each stripe adds one at most
+_FINER = 4  # checking grid points per candidate key time
+_PER_FRAME = 4  # candidate key times
+_STEPS_PER_SAMPLE, _STEPS_PER_INTERVAL = 4, 16  # integration steps
+_ENOUGH_STEPS = 1 << 16  # upper bound of integration steps for few samples
+_ONE_BY_ONE = 256  # keys found sequentially; the rest is split into stripes searched in parallel
+_PER_STRIPE = 32  # keys per stripe; each stripe adds at most one
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 Sampler = Callable[[np.ndarray], Samples]
@@ -38,9 +38,9 @@ class Keys:
 
     Attributes:
         times: Increasing. [K]
-        values: [K, C]
-        left_slopes: Slope with which the curve arrives, per unit of time. [K, C]
-        right_slopes: Slope with which it leaves; differs from the left one at a kink. [K, C]
+        values: Values at these times. [K, C]
+        left_slopes: Incoming slopes per unit of time. [K, C]
+        right_slopes: Outgoing slopes; they differ from the incoming ones at a kink. [K, C]
     """
 
     times: np.ndarray
@@ -54,9 +54,9 @@ class Curves:
     """Keys of a rigid motion.
 
     Attributes:
-        location: [K, 3]
+        location: Displacements of the pivot. [K, 3]
         rotation: Unit wxyz with continuous signs. [K', 4]
-        followed: False if the motion is too fast for keys: they are exact only at their own times.
+        followed: False if the motion is too fast for keys, so that the curve is exact only at the keys.
     """
 
     location: Keys
@@ -66,14 +66,14 @@ class Curves:
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Times at which an editor shows frames: ``zero + k * duration`` for whole k."""
+    """Times of an editor's frames: ``zero + k * duration`` for integers k."""
 
     zero: float
     duration: float
 
 
 def model_sampler(model: models.MotionModel, t_max: float, most: int = MOST_INTERVALS) -> Sampler:
-    """Poses and slopes of a motion model at scene times >= t_max, for `reduce` with the same ``most``."""
+    """Return a sampler of a motion model at scene times >= t_max, for `reduce` with the same ``most``."""
 
     def sample(times: np.ndarray) -> Samples:
         steps = max(_STEPS_PER_SAMPLE * len(times), min(_STEPS_PER_INTERVAL * most, _ENOUGH_STEPS))
@@ -103,24 +103,24 @@ def reduce(
 
     Args:
         sample: Function of times [S] that gives quaternions [S, 4], displacements [S, 3] and their slopes per unit of
-            time [S, 4], [S, 3]. It should be smooth between t0 and t1: where it has a kink, reduce both sides and
-            `join` them.
+            time [S, 4], [S, 3]. It should be smooth between t0 and t1; at a kink, reduce both sides and `join` them.
         t0: First time.
         t1: Last time, > t0.
-        tolerance: Largest distance of any point from its place, world units, > 0.
+        tolerance: Largest allowed position error of any point, world units, > 0.
         radius: Largest distance of a point from the pivot, world units.
-        forced_times: Times inside (t0, t1) that get a key in any case.
-        nearest: Least time between possible keys, for editors that drop keys which are nearer.
-        frames: Frames of the editor. A curve that four keys per frame do not follow, and a rotation by more than
-            `MAX_FRAME_TURN_RAD` per frame, gets a key at every frame instead.
-        most: Largest number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, the keys of a
-            curve that cannot be followed lie at every second frame, every third and so on.
+        forced_times: Times inside (t0, t1) that always get a key.
+        nearest: Least time between candidate keys, for editors that merge closer keys.
+        frames: Frames of the editor. A curve that four keys per frame do not reproduce gets one key per frame; so does
+            a rotation of more than `MAX_FRAME_TURN_RAD` per frame.
+        most: Largest number of intervals between keys, >= `FEWEST_INTERVALS`. If there are more frames, a curve with
+            one key per frame gets a key at every n-th frame.
 
     Returns:
         Location and rotation keys; one key for a curve that is constant within its share of the tolerance. The error
-        |dd| + 2 radius sin(dtheta / 2) holds on a grid four times finer than the possible key times, whose own density
-        doubles until single steps hold the tolerance; no rotation step is above 120 degrees. A motion too fast for
-        ``nearest``, ``frames`` or ``most`` gets what they allow, exact at its keys, and is marked as not followed.
+        |dd| + 2 radius sin(dtheta / 2) is checked on a grid four times finer than the candidate key times, which are
+        doubled until single intervals are within the tolerance. No rotation step exceeds 120 degrees. A motion too fast
+        for ``nearest``, ``frames`` or ``most`` gets as many keys as they allow, is exact at the keys, and has
+        ``followed`` False.
     """
     if not (math.isfinite(t0) and math.isfinite(t1) and t1 > t0):
         raise ValueError(f"t0, t1: expected t0 < t1, got {t0} and {t1}")
@@ -162,7 +162,7 @@ def reduce(
 def _at_frames(
     sample: Sampler, t0: float, t1: float, frames: FrameTimes, nearest: float, most: int
 ) -> tuple[Keys, Keys]:
-    """Location and rotation keys at t0, t1 and all frames between them, or at every n-th if these are over ``most``."""
+    """Location and rotation keys at t0, t1 and the frames between them, or every n-th frame if more than ``most``."""
     first, last = math.ceil((t0 - frames.zero) / frames.duration), math.floor((t1 - frames.zero) / frames.duration)
     stride = 1 + max(last - first, 0) // most
     inside = frames.zero + frames.duration * np.arange(first, last + 1, stride, dtype=np.float64)
@@ -177,10 +177,11 @@ def _at_frames(
 
 
 def join(first: Curves, second: Curves) -> Curves:
-    """Curves of two motions that meet: the end of ``first`` is the start of ``second``; the kink between them stays.
+    """Join the curves of two motions, the second starting where the first ends; a kink between them is kept.
 
-    A curve of one key is constant: it is held until the other motion starts, and stays one key where that is constant
-    too. The key at the meeting goes where it changes nothing: a straight and steady path has two keys in all.
+    A curve of one key is constant. It is held until the second motion starts, and remains one key if that is constant
+    too. The key at the joint is dropped if it changes nothing, so a straight line at constant speed has two keys in
+    total.
     """
 
     def chain(a: Keys, b: Keys, flip: float) -> Keys:
@@ -212,7 +213,7 @@ def join(first: Curves, second: Curves) -> Curves:
 
 
 def _without(keys: Keys, time: float) -> Keys:
-    """The keys without the one at a time, if the cubic between its neighbours is the same curve to rounding."""
+    """Drop the key at a time if the cubic between its neighbours is the same curve up to rounding."""
     k = int(np.searchsorted(keys.times, time))
     if not 0 < k < len(keys.times) - 1 or keys.times[k] != time:
         return keys
@@ -225,12 +226,12 @@ def _without(keys: Keys, time: float) -> Keys:
 
 
 def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray:
-    """Value of the curve as Blender evaluates it; held before the first and after the last key.
+    """Curve values as Blender evaluates them; constant before the first and after the last key.
 
     Args:
         keys: The keys.
-        times: [...]
-        unit: Normalise, for quaternions.
+        times: Any shape. [...]
+        unit: Normalise the values, for quaternions.
 
     Returns:
         [..., C]
@@ -247,7 +248,7 @@ def evaluate(keys: Keys, times: np.ndarray, *, unit: bool = False) -> np.ndarray
 
 
 def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Slopes at knots of the parabola through each knot and its neighbours; at the ends, through the nearest three.
+    """Slopes at knots, from the parabola through each knot and its neighbours, or the nearest three knots at the ends.
 
     Args:
         times: Increasing. [S]
@@ -271,7 +272,7 @@ def slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
 def hermite(
     left: np.ndarray, right: np.ndarray, left_slope: np.ndarray, right_slope: np.ndarray, h: np.ndarray, u: np.ndarray
 ) -> np.ndarray:
-    """Cubic with given values and slopes at both ends of an interval of length h, at its fraction u. All broadcast."""
+    """Cubic Hermite interpolation over an interval of length h, at fraction u. All arguments broadcast."""
     u2 = u * u
     u3 = u2 * u
     return (
@@ -283,7 +284,7 @@ def hermite(
 
 
 class _Curve:
-    """Samples of one curve on the checking grid, and the tolerance that it has to hold."""
+    """Samples of one curve on the checking grid, with its tolerance."""
 
     def __init__(
         self, times: np.ndarray, values: np.ndarray, slopes: np.ndarray, tolerance: float, radius: float | None
@@ -294,7 +295,7 @@ class _Curve:
 
     @staticmethod
     def pair(samples: Samples, times: np.ndarray, tolerance: float, radius: float) -> tuple[_Curve, _Curve]:
-        """Location and rotation; each gets half of the tolerance, all of it where the other stands still."""
+        """Location and rotation curves. Each gets half the tolerance, or all of it if the other is constant."""
         quats, displacements, quat_slopes, displacement_slopes = (np.asarray(x, np.float64) for x in samples)
         signs = np.where((rotations.make_continuous(quats) * quats).sum(-1) < 0, -1.0, 1.0)[:, None]
         arguments = (
@@ -307,18 +308,18 @@ class _Curve:
         return location, rotation
 
     def error(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        """Largest distance of a point. [..., C] -> [...]"""
+        """Largest position error of a point. [..., C] -> [...]"""
         if self.radius is None:
             return np.linalg.norm(values - truth, axis=-1)
         angle = rotations.angle_between(rotations.normalize(values), truth)
         return 2 * self.radius * np.sin(0.5 * angle)
 
     def turn(self, duration: float) -> float:
-        """Largest angle that the body turns by within a duration, from its rates; rad."""
+        """Upper bound of the rotation angle within a duration, from the sampled rates; rad."""
         return 2.0 * duration * float(np.linalg.norm(self.slopes, axis=-1).max())
 
     def holds_steps(self, possible: np.ndarray) -> bool:
-        """Whether each single step between possible key times is good enough."""
+        """Return True if every single interval between candidate key times is within the tolerance."""
         inside = possible[:-1, None] + np.arange(1, _FINER)
         return self.constant or bool(self._segments_hold(possible[:-1], possible[1:], inside).all())
 
@@ -333,7 +334,10 @@ class _Curve:
         return good
 
     def greedy(self, possible: np.ndarray, forced: np.ndarray) -> Keys:
-        """Farthest reach from each key, by galloping and bisection; at most one possible step where none is good."""
+        """Greedy keys: each is as far as possible from the previous one, found by galloping and bisection.
+
+        If no interval is within the tolerance, the next key is one candidate step away.
+        """
         chosen = [0]
         if not self.constant:
             for start, stop in itertools.pairwise((forced // _FINER).tolist()):
@@ -343,7 +347,7 @@ class _Curve:
         return Keys(self.times[rows], self.values[rows].copy(), slopes.copy(), slopes.copy())
 
     def _walk(self, start: int, stop: int) -> list[int]:
-        """Positions of the keys after one position up to another, ``stop`` included."""
+        """Key positions after ``start`` up to and including ``stop``."""
         taken, position = [], start
         while position < stop and len(taken) < _ONE_BY_ONE:
             position += int(self._reaches(np.array([position]), np.array([stop]))[0])
@@ -359,7 +363,10 @@ class _Curve:
         return self._without_seams(np.array([start, *sorted(set(taken))]), bounds[1:-1])[1:].tolist()
 
     def _without_seams(self, positions: np.ndarray, seams: np.ndarray) -> np.ndarray:
-        """The positions without those seams that need no key: half of them at a time, which are no neighbours."""
+        """Remove stripe boundaries that need no key.
+
+        Odd and even ones are tested alternately, so that no two neighbours are removed at once.
+        """
         parity = 0
         while len(seams):
             k = np.searchsorted(positions, seams)
@@ -370,13 +377,13 @@ class _Curve:
         return positions
 
     def _hold(self, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-        """Whether one cubic between two positions is good enough. [n], [n] -> [n] bool"""
+        """Mask of the intervals that one cubic reproduces within the tolerance. [n], [n] -> [n] bool"""
         start, stop = starts * _FINER, stops * _FINER
         inside = start[:, None] + np.arange(1, max(2, int((stop - start).max(initial=0))))
         return self._segments_hold(start, stop, np.minimum(inside, stop[:, None] - 1))
 
     def _reaches(self, positions: np.ndarray, stops: np.ndarray) -> np.ndarray:
-        """Possible steps that one cubic from each position can take up to its stop, at least 1. [n], [n] -> [n]"""
+        """Number of candidate steps, >= 1, that one cubic can span from each position to its stop. [n], [n] -> [n]"""
 
         def good(rows: np.ndarray, lengths: np.ndarray) -> np.ndarray:
             return self._hold(positions[rows], positions[rows] + lengths)

@@ -1,16 +1,16 @@
-"""How a motion group moves past t_max: one small set of rates, evaluated in closed form where there is one.
+"""Motion models: rigid motion of a group past t_max as a small set of rates, in closed form if one exists.
 
 Notation: tau = t - t_max >= 0, p the group's pivot (its centre at t_max). A point of the bind state moves as
-x(t) = p + R(tau) (x(t_max) - p) + d(tau). The fitted curve (R_f, d_f) starts from the identity at tau = 0; the observed
-pose at t_max, which is the bind state, lies off that curve by noise. `offset_rotvec` r and `offset_displacement` e say
-where the curve is at t_max, seen from the bind state, and are blended in with s = 1 - exp(-tau / fade_time):
+x(t) = p + R(tau) (x(t_max) - p) + d(tau). The fitted curve (R_f, d_f) starts from the identity at tau = 0. The observed
+pose at t_max, which is the bind state, deviates from that curve by noise: `offset_rotvec` r and `offset_displacement` e
+are the pose of the curve at t_max relative to the bind state. They are blended in with s = 1 - exp(-tau / fade_time):
 
     R(tau) = R_f(tau) exp(s r),    d(tau) = d_f(tau) + s e.
 
-So R(0) = I and d(0) = 0 to the bit, and the motion converges to the fitted curve R_f exp(r), d_f + e.
+So R(0) = I and d(0) = 0 exactly, and the motion converges to the fitted curve R_f exp(r), d_f + e.
 
-A motion may swing with a frequency W: the clocks s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2 stand where those of a
-steady motion, tau and tau^2/2, stood. W = 0 is the steady motion to the bit.
+A motion may oscillate with angular frequency W: s1 = sin(W tau)/W and s2 = (1 - cos(W tau))/W^2 then replace the
+factors tau and tau^2/2 of a steady motion. W = 0 gives the steady motion exactly.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _VECTORS = (
     "offset_displacement",
 )
 _RATE_NAMES = (*(f"{name}.{axis}" for name in _VECTORS for axis in "xyz"), "frequency")
-_STEP_TOLERANCE = 1e-9  # of the radius; Magnus-4 error of `world_twist`
-_MOST_STEPS = 1 << 20  # of these
+_STEP_TOLERANCE = 1e-9  # allowed Magnus-4 error of `world_twist`, in radii
+_MOST_STEPS = 1 << 20  # Magnus steps to one time
 
 
 def _zeros() -> np.ndarray:
@@ -49,29 +49,29 @@ def _zeros() -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """Rigid motion past t_max. All rates are those at t_max, in the world frame; all vectors are float64. [3]
+    """Rigid motion past t_max. Rates are at t_max, in the world frame; vectors are float64 [3].
 
     Attributes:
-        kind: "static" (stays), "translation" (d_f = v s1 + a s2), "ballistic_spin" (centroid form:
-            d_f = v s1 + a s2 + u - R_f u, R_f = exp(w s1 + eps s2)), "constant_twist" (a screw:
-            R_f = exp(w tau), d_f = V(w tau) v tau), "world_twist" (v(x) = v + w x (x - p) with v and w linear in
-            time, x in the world; Magnus-4 steps) or "free_top" (d_f = v tau + a tau^2 / 2, R_f of a body that starts
-            with spin w and tumbles without torque, `free_top`).
+        kind: "static" (stays), "translation" (d_f = v s1 + a s2), "ballistic_spin" (centroid form: d_f = v s1 + a
+            s2 + u - R_f u, R_f = exp(w s1 + eps s2)), "constant_twist" (a screw: R_f = exp(w tau),
+            d_f = V(w tau) v tau), "world_twist" (v(x) = v + w x (x - p) with v and w linear in time, x in the world;
+            Magnus-4 steps) or "free_top" (d_f = v tau + a tau^2 / 2, R_f of a body that starts with spin w and tumbles
+            without torque, `free_top`).
         velocity: v, of the point `center_offset` off the pivot, world units per unit of time.
         acceleration: a, rate of v.
         angular_velocity: w, rad per unit of time.
         angular_acceleration: eps, rate of w.
-        center_offset: u, the body point that moves with v and a, from the pivot at t_max ("ballistic_spin" only).
-            A hinge has v = a = 0 and u on its axis.
-        offset_rotvec: r, rotation of the fitted curve at t_max seen from the bind state, rad.
+        center_offset: u, position relative to the pivot at t_max of the body point that moves with v and a
+            ("ballistic_spin" only). A hinge has v = a = 0 and u on its axis.
+        offset_rotvec: r, rotation of the fitted curve at t_max relative to the bind state, rad.
         offset_displacement: e, its displacement.
         fade_time: Time constant with which the offsets are blended in, > 0.
-        radius: Radius of the group, world units: what tolerances refer to.
+        radius: Radius of the group, world units; tolerances are relative to it.
         frequency: W >= 0, rad per unit of time, of "translation" (a spring) and "ballistic_spin" (a pendulum, with
-            v = a = 0 and u on its axis); 0 does not swing.
+            v = a = 0 and u on its axis); 0 for no oscillation.
         inertia: J of a "free_top" in the world at tau = 0, up to a factor; None for other kinds. [3, 3]
         covariance: Covariance of the fitted rates, or None. [P, P] in the order of `covariance_names`
-        covariance_names: Names of its rows, such as "velocity.x"; "frequency" where that was fitted.
+        covariance_names: Names of its rows, such as "velocity.x"; "frequency" if it was fitted.
     """
 
     kind: str = "static"
@@ -137,7 +137,7 @@ class MotionModel:
     __hash__ = None  # type: ignore[assignment]
 
     def to_dict(self) -> dict[str, Any]:
-        """The model as JSON types; `from_dict` restores it to the bit."""
+        """Return the model as JSON types; `from_dict` restores it exactly."""
         result: dict[str, Any] = {"kind": self.kind}
         for name in _VECTORS:
             result[name] = getattr(self, name).tolist()
@@ -152,7 +152,7 @@ class MotionModel:
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> MotionModel:
-        """Inverse of `to_dict`. Raises ValueError naming the key that is unknown or malformed."""
+        """Inverse of `to_dict`. Raises ValueError that names the unknown or malformed key."""
         if not isinstance(data, dict) or "kind" not in data:
             raise ValueError(f"expected an object with the key 'kind', got {data!r}")
         known = {f.name for f in fields(MotionModel)}
@@ -166,13 +166,13 @@ class MotionModel:
 
     @property
     def is_static(self) -> bool:
-        """Whether `evaluate` gives the identity at every time."""
+        """True if `evaluate` returns the identity at every time."""
         moving = [*(getattr(self, n) for n in _VECTORS if n != "center_offset")] if self.kind != "static" else []
         return not any(v.any() for v in (*moving, self.offset_rotvec, self.offset_displacement))
 
     @property
     def turns(self) -> bool:
-        """Whether `evaluate` ever gives a rotation."""
+        """True if `evaluate` returns a rotation at any time."""
         spins = self.kind not in ("static", "translation") and (
             self.angular_velocity.any() or (self.angular_acceleration.any() and self.kind != "free_top")
         )
@@ -191,14 +191,14 @@ def evaluate(model: MotionModel, tau: float | np.ndarray) -> tuple[np.ndarray, n
 
     Returns:
         Unit quaternions wxyz [..., 4] and displacements of the pivot, world [..., 3], float64. tau = 0 gives exactly
-        (1, 0, 0, 0) and 0; where a motion leaves the range of numbers the body stays at t_max, with a warning.
+        (1, 0, 0, 0) and 0. If a pose is not finite, the body stays at its pose at t_max, with a warning.
     """
     quats, displacements, _, _ = evaluate_with_rates(model, tau)
     return quats, displacements
 
 
 def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray, np.ndarray]:
-    """`evaluate` of G models at one time, in a few calls whatever their number; for many times keep a `Stack`.
+    """Evaluate G models at one time, vectorised over the models. For many times, keep a `Stack`.
 
     Returns:
         Unit quaternions wxyz [G, 4] and displacements [G, 3].
@@ -207,7 +207,7 @@ def evaluate_all(models: Sequence[MotionModel], tau: float) -> tuple[np.ndarray,
 
 
 class Stack:
-    """Several motions, ready to be evaluated together at any time; what does not depend on the time is done once."""
+    """Several motions, evaluated together at any time. Time-independent quantities are precomputed."""
 
     def __init__(self, models: Sequence[MotionModel]):
         self._count = len(models)
@@ -226,7 +226,7 @@ class Stack:
         self._displacements = np.array([model.offset_displacement for model in fading])
 
     def poses(self, tau: float) -> tuple[np.ndarray, np.ndarray]:
-        """Unit quaternions wxyz [G, 4] and displacements [G, 3] at a time since t_max, as `evaluate`."""
+        """Unit quaternions wxyz [G, 4] and displacements [G, 3] at a time since t_max, as from `evaluate`."""
         if tau < 0:
             raise ValueError(f"tau: expected a time since t_max >= 0, got {tau}")
         quats, displacements = rotations.identity(self._count), np.zeros((self._count, 3))
@@ -258,7 +258,7 @@ class Stack:
 
 
 def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray, ...]) -> Any:
-    """What motions of one kind are evaluated with, beside their rates."""
+    """Time-independent data for evaluating the motions of one kind, in addition to their rates."""
     frequencies = np.array([[model.frequency] for model in models])
     if kind == "world_twist":
         v, a, w, eps, _ = rates
@@ -272,7 +272,7 @@ def _prepared(kind: str, models: Sequence[MotionModel], rates: tuple[np.ndarray,
 
 
 def _held(*parts: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The same poses and rates, but those of a body at rest where one of them is not finite."""
+    """Replace poses and rates that are not finite by those of a body at rest."""
     sound = np.all([np.isfinite(part).all(-1) for part in parts], axis=0)
     if sound.all():
         return parts
@@ -291,13 +291,13 @@ def _warn_of_wild_motion() -> None:
 def evaluate_with_rates(
     model: MotionModel, tau: float | np.ndarray, most_steps: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pose as in `evaluate`, with its exact time derivative.
+    """Pose as from `evaluate`, with its exact time derivative.
 
     Args:
         model: The motion.
         tau: Time since t_max, >= 0, any shape. [...]
-        most_steps: Largest number of integration steps for all times together, or None for as many as they need. Times
-            that need more share their steps, and are rigid but inaccurate if even these are too few.
+        most_steps: Largest number of integration steps for all times together, or None for no limit. If more are
+            needed, times share steps; if even that is not enough, poses are rigid but inaccurate.
 
     Returns:
         Quaternions [..., 4], displacements [..., 3], angular velocities in the world frame, rad per unit [..., 3], and
@@ -323,7 +323,7 @@ def evaluate_with_rates(
 def curve(
     model: MotionModel, tau: float | np.ndarray, most_steps: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The fitted curve (R_f, d_f) without offsets, from the identity at tau = 0, with its exact derivative.
+    """The fitted curve (R_f, d_f) without offsets, the identity at tau = 0, with its exact derivative.
 
     Args:
         model: The motion.
@@ -340,13 +340,13 @@ def curve(
     if model.kind == "static":
         return rotations.identity(*tau.shape), zero, zero, zero
     once, twice = clocks(model.frequency, span)
-    slope = np.cos(model.frequency * span)  # of s1; that of s2 is s1
+    slope = np.cos(model.frequency * span)  # derivative of s1; that of s2 is s1
     if model.kind == "translation":
         return rotations.identity(*tau.shape), v * once + a * twice, zero, v * slope + a * once
     if model.kind == "ballistic_spin":
         u = model.center_offset
         quats, d = spin_poses(v, a, w, eps, u, model.frequency, span)
-        # R = exp(phi) turns with V(phi) phi'.
+        # R = exp(phi) has angular velocity V(phi) phi'.
         spins = se3.v_matrix_times(w * once + eps * twice, w * slope + eps * once)
         return quats, d, spins, v * slope + a * once - rotations.cross(spins, rotations.rotate(quats, u + zero))
     if model.kind == "constant_twist":
@@ -363,7 +363,7 @@ def curve(
 
 
 def clocks(frequency: float | np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What rates and their rates are multiplied with.
+    """Factors of the rates and of their derivatives in a motion that may oscillate.
 
     Args:
         frequency: W >= 0, rad per unit of time. [..., 1]
@@ -385,7 +385,7 @@ def spin_poses(
     frequency: float | np.ndarray,
     span: np.ndarray,
 ) -> se3.Pose:
-    """Poses of "ballistic_spin", all arguments broadcast: rates [..., 3], frequency and times span [..., 1]."""
+    """Poses of "ballistic_spin". All arguments broadcast: rates [..., 3], frequency and times span [..., 1]."""
     once, twice = clocks(frequency, span)
     quats = rotations.rotvecs_to_quats(w * once + eps * twice)
     arm = rotations.rotate(quats, center + 0 * quats[..., 1:])
@@ -393,14 +393,15 @@ def spin_poses(
 
 
 def twist_poses(v: np.ndarray, w: np.ndarray, span: np.ndarray) -> se3.Pose:
-    """Poses of the "constant_twist" curve, all arguments broadcast: v, w [..., 3], times span [..., 1]."""
+    """Poses of "constant_twist". All arguments broadcast: v, w [..., 3], times span [..., 1]."""
     turn = w * span
     return rotations.rotvecs_to_quats(turn), se3.v_matrix_times(turn, v + 0 * turn) * span
 
 
 def _world_twist(model: MotionModel, tau: np.ndarray, most_steps: int | None) -> se3.Pose:
-    """Magnus-4 poses; each time takes the power of two of steps that it needs, whatever its neighbours need. Those that
-    no number of steps would give are NaN.
+    """Magnus-4 poses, each time with its own number of steps rounded up to a power of two.
+
+    Poses are NaN at times that no number of steps reaches within the tolerance.
     """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     flat = tau.reshape(-1)
@@ -422,10 +423,10 @@ def _world_twist(model: MotionModel, tau: np.ndarray, most_steps: int | None) ->
 
 
 def _shared_steps(model: MotionModel, taus: np.ndarray, needed: np.ndarray, most: int) -> se3.Pose:
-    """Magnus-4 poses at times >= 0, each integrated from the one before: [S] -> [S, 4], [S, 3].
+    """Magnus-4 poses at times >= 0, each integrated from the previous one: [S] -> [S, 4], [S, 3].
 
-    All intervals between the times take the same number of steps: as short as the steps to the hardest time alone
-    would be, or as many as ``most`` allows.
+    All intervals between times take the same number of steps: enough for the step length that the hardest time needs,
+    or as many as ``most`` allows.
     """
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration
     times, rows = np.unique(taus, return_inverse=True)
@@ -443,7 +444,7 @@ def _shared_steps(model: MotionModel, taus: np.ndarray, needed: np.ndarray, most
 
 
 def steps_needed(model: MotionModel, tau: np.ndarray) -> np.ndarray:
-    """Steps of integration that poses of a motion take; 1 where there is a closed form. [S] -> [S]"""
+    """Number of integration steps for each pose; 1 for kinds with a closed form. [S] -> [S]"""
     if model.kind != "world_twist":
         return np.ones(len(tau), np.int64)
     v, a, w, eps = model.velocity, model.acceleration, model.angular_velocity, model.angular_acceleration

@@ -1,8 +1,8 @@
-"""Dynamics of single points past t_max: each moves by a twist of its own that changes linearly with time.
+"""Per-point dynamics past t_max: each point follows its own twist, which is linear in time.
 
-Notation: N points; the state of a point is ``v, w, a, e``: velocity of the point that sits at the origin of the
-coordinates, angular velocity, and the rates of both. The velocity at p is v + a tau + (w + e tau) x p. About its own
-centre a Gaussian's v and a are those of its centre (`se3.recentre`).
+Notation: N points; the state of a point is ``v, w, a, e``: velocity of the point at the origin of the coordinates,
+angular velocity, and the rates of both. The velocity at p is v + a tau + (w + e tau) x p. About its own centre, a
+Gaussian's v and a are those of its centre (`se3.recentre`).
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from . import rotations, twist_propagation
 log = logging.getLogger(__name__)
 
 Array = rotations.Array
-MAX_TURN = 0.1  # radians per midpoint step: beyond, distances grow visibly, by sqrt(1 + x^4 / 4) a step
-TRACE_STEP = 1 / 60  # TRACE's step at playback, in units of time
+MAX_TURN = 0.1  # rad per midpoint step; above, bodies grow visibly, by sqrt(1 + x^4 / 4) per step
+TRACE_STEP = 1 / 60  # TRACE's playback step, in units of time
 
 
 def time_unit(first: float, last: float) -> float:
-    """The unit of time that steps are counted in: 1 where observed times lie in [0, 1] and fill a quarter of it (as
-    in the paper's data), else the observed span.
+    """Unit of time for step lengths.
+
+    1 if the observed times fill at least a quarter of [0, 1] (as in the paper's data), else the observed span.
     """
     if first >= 0 and last <= 1 and last - first >= 0.25:
         return 1.0
@@ -40,19 +41,19 @@ def rk2(
     duration: float,
     step: float,
 ) -> tuple[Array, Array]:
-    """Midpoint steps of the points, and exponentials of their midpoint spin: the integrator of TRACE.
+    """Integrate points by the midpoint rule and rotations by exponentials of the midpoint spin: TRACE's integrator.
 
-    Points and rotations are integrated apart, so that a body is rigid only to second order in the step; `propagate`
-    is exact in that. The same code serves numpy and torch. Warns once where numpy arrays spin by more than `MAX_TURN`
-    in a step, as playback then shows bodies that grow; training, with tensors, is not asked.
+    Points and rotations are integrated separately, so a body is rigid only to second order in the step; `propagate`
+    keeps it exactly rigid. The same code serves numpy and torch. For numpy arrays it warns once about spins of more
+    than `MAX_TURN` per step, because bodies then grow visibly in playback.
 
     Args:
-        points: Where the points start. [..., 3]
+        points: Start positions. [..., 3]
         v: Velocity of the point at the origin. [..., 3]
         w: Angular velocity, rad per unit. [..., 3]
         a: Rate of v. [..., 3]
         e: Rate of w. [..., 3]
-        duration: Signed time to reach.
+        duration: Signed duration.
         step: Longest step; the last one is shorter.
 
     Returns:
@@ -78,17 +79,17 @@ def rk2(
 def propagate(dynamics: np.ndarray, duration: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and displacements of points under dynamics about their own centres, by fourth-order Magnus steps.
 
-    For more than one time keep a `twist_propagation.Propagator`.
+    For more than one time, keep a `twist_propagation.Propagator`.
 
     Args:
         dynamics: Velocity, angular velocity and the rates of both about the centre of each point, side by side. [N, 12]
-        duration: Signed time to reach.
+        duration: Signed duration.
         tolerance: Largest allowed error of a point, in the units of its velocity times time.
 
     Returns:
-        Unit quaternions wxyz [N, 4] and displacements [N, 3], float64; the identity to the bit for a duration of 0, for
-        points at rest, and, with a warning, for points whose dynamics are not finite or go beyond all numbers. What
-        is wrong with one point changes no bit of the others.
+        Unit quaternions wxyz [N, 4] and displacements [N, 3], float64. Exactly the identity for a duration of 0, for
+        points at rest and, with a warning, for points whose dynamics or poses are not finite. Such points do not affect
+        the others.
     """
     return twist_propagation.Propagator(dynamics, tolerance).rows_of(duration)
 
@@ -104,9 +105,9 @@ def _warn_of_coarse_steps(step: float) -> None:
 
 
 def step_sizes(duration: float, step: float) -> list[float]:
-    """Signed steps that fill a duration: whole ones and a last one that is no longer; none for no duration.
+    """Signed steps that add up to a duration: full steps and a shorter last one; empty for a duration of 0.
 
-    Their number is counted once, as a time that is added up misses or repeats a step after a while.
+    They are counted in advance because an accumulated time eventually misses or repeats a step.
     """
     count = max(1, math.ceil(abs(duration) / step - 1e-9)) if duration != 0 else 0
     if count == 0:

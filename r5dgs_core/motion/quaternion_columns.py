@@ -1,4 +1,4 @@
-"""Vectors and quaternions by column, [3, ...] and [4, ...]: numpy is slow at rows of three and four."""
+"""Vector and quaternion operations on columns, [3, ...] and [4, ...], faster in numpy than on rows of 3 or 4."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a x b. [3, ...] each, the second of full shape"""
+    """Cross product a x b. [3, ...] each; b has the full shape"""
     result = np.empty_like(b)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=result[i])
@@ -25,13 +25,13 @@ def multiply(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def rotate(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors turned by unit quaternions wxyz. [4, ...], [3, ...]"""
+    """Rotate vectors by unit quaternions wxyz. [4, ...], [3, ...]"""
     twice = 2 * cross(quats[1:], vectors)
     return vectors + quats[0] * twice + cross(quats[1:], twice)
 
 
 def direction_changes(quats: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """R^T l - l of one direction l for many rotations R. [4, n], [3] -> [3, n]"""
+    """R^T l - l for one direction l and many rotations R. [4, n], [3] -> [3, n]"""
     w, x, y, z = quats
     a, b, c = direction
     u, v, s = b * z - c * y, c * x - a * z, a * y - b * x  # l x axis

@@ -1,4 +1,4 @@
-"""The rigid motion that best carries one cloud of points into another.
+"""Robust rigid registration of two point clouds with known correspondences.
 
 Notation: x_i source, y_i target, w_i weights, c and c' their weighted centroids. The fit is y = c' + R (x - c).
 """
@@ -22,12 +22,13 @@ class RigidFit:
 
     Attributes:
         quat: Rotation R, unit wxyz. [4]
-        displacement: Of the weighted centroid, c' - c. [3]
+        displacement: Displacement of the weighted centroid, c' - c. [3]
         center: Weighted centroid of the source, c. [3]
-        residuals: Distance of each target point from its fitted place. [n]
-        weights: Final weights, those given times the robust ones. [n]
-        undetermined_axes: Directions in the source about which the points do not fix the rotation. [0..3, 3]
-        rotation_covariance: Of the rotation vector error, source frame, rad^2; pi^2 on undetermined axes. [3, 3]
+        residuals: Distance of each target point from its fitted position. [n]
+        weights: Final weights: the given ones times the robust ones. [n]
+        undetermined_axes: Directions in the source frame about which the points do not determine the rotation. [0..3,
+            3]
+        rotation_covariance: Covariance of the rotation vector, source frame, rad^2; pi^2 on undetermined axes. [3, 3]
     """
 
     quat: np.ndarray
@@ -53,22 +54,22 @@ def fit_rigid(
 ) -> RigidFit:
     """Fit a rotation and a translation robustly (Kabsch with Cauchy reweighting).
 
-    Where the points leave the rotation about an axis open (a line, one point, noise larger than the lever), that part
-    is taken from ``hint``, so that the answer is the rotation nearest to it among those that fit.
+    If the points do not determine the rotation about an axis (a line, a single point, noise larger than the lever arm),
+    that part comes from ``hint``: the result is the fitting rotation nearest to it.
 
     Args:
         source: Points before. [n, 3]
         target: The same points after. [n, 3]
-        weights: Of the points, >= 0 with a positive sum, or None for equal ones. [n]
-        rounds: Rounds of reweighting; none is needed where no residual is far above the median.
+        weights: Point weights, >= 0 with a positive sum, or None for equal ones. [n]
+        rounds: Largest number of reweighting rounds; reweighting stops once no residual is far above the median.
         hint: Expected rotation, unit wxyz; None for the identity.
 
     Returns:
         The fit; det R = +1 always.
 
     Source: Kabsch 1976, with the sign of the smallest singular vector set for det R = +1; Cauchy weights
-        1 / (1 + (r / s)^2) with s = 2 * 1.4826 * median(r); rotation covariance sigma^2 J^-1 with
-        J = sum w (|r|^2 I - r r^T).
+        1 / (1 + (r / s)^2) with s = 2 * 1.4826 * median(r); rotation covariance sigma^2 J^-1 with J = sum w (|r|^2
+        I - r r^T).
     """
     source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
     if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape or len(source) == 0:
@@ -92,7 +93,7 @@ def fit_rigid(
         current = current / current.sum()
         quat, center, moved, residuals = _kabsch(source, target, current)
 
-    if size <= 1e-14 * float(np.abs(source).max()):  # all in one place: what is left is rounding of their centroid
+    if size <= 1e-14 * float(np.abs(source).max()):  # coincident points; the rest is rounding of the centroid
         size = 0.0
     axes, covariance = _uncertainty(source - center, residuals, current, size)
     if len(axes):
@@ -107,13 +108,13 @@ def fit_rigid(
 
 
 def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, float] | None:
-    """The largest turn between neighbouring poses, where it is over 120 degrees, else None.
+    """Return the largest rotation between neighbouring poses if it exceeds 120 degrees, else None.
 
-    A turn of more than 180 degrees looks like the rest of a whole turn backwards, so that a body whose steps come near
-    that may spin the other way in truth: poses at more times tell.
+    A rotation of more than 180 degrees looks like a smaller one backwards. A body with steps near that limit may in
+    truth spin the other way; more frequent poses would resolve it.
 
     Args:
-        times: Of the poses, increasing. [S]
+        times: Times of the poses, increasing. [S]
         quats: Unit wxyz. [S, 4]
 
     Returns:
@@ -127,7 +128,7 @@ def aliased_step(times: np.ndarray, quats: np.ndarray) -> tuple[float, float, fl
 
 
 def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes one unit vector to another; about any normal where they oppose. [3] -> [4]"""
+    """Smallest rotation from one unit vector to another; about any normal if they are opposite. [3] -> [4]"""
     cosine = float(start @ end)
     if cosine < -1 + 1e-12:
         other = np.eye(3)[int(np.argmin(np.abs(start)))]
@@ -139,7 +140,7 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def _kabsch(
     source: np.ndarray, target: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation, the two centroids and the residuals for given weights of sum 1."""
+    """Rotation, both centroids and the residuals, for weights that sum to 1."""
     center, moved = weights @ source, weights @ target
     x, y = source - center, target - moved
     u, _, vt = np.linalg.svd((y * weights[:, None]).T @ x)
@@ -151,7 +152,7 @@ def _kabsch(
 def _uncertainty(
     offsets: np.ndarray, residuals: np.ndarray, weights: np.ndarray, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Axes that the points leave open, and the covariance of the rotation, both in the source frame."""
+    """Axes that the points leave undetermined, and the covariance of the rotation, both in the source frame."""
     relative = weights / weights.max()
     inertia = np.einsum("n,nij->ij", relative, inertias(offsets))
     dof = max(3 * float(relative.sum()) - 6, 1.0)

@@ -1,4 +1,4 @@
-"""TRACE's midpoint steps for random access: whole steps that were taken once are kept."""
+"""TRACE's midpoint integration with random access: full steps are cached."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import numpy as np
 from . import point_dynamics, rotations
 
 State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # points, rotations, v, w
-MOST_STEPS = 20000  # that are taken and kept; later times are those of the last one
+MOST_STEPS = 20000  # largest number of cached steps; motion stops after the last
 
 
 class SteppedPath:
-    """`point_dynamics.rk2` of the same points at many times, to the bit.
+    """`point_dynamics.rk2` of the same points at many times, with bit-identical results.
 
-    A point that the midpoint rule throws beyond all numbers stays where it last was, and so does everything after
-    `MOST_STEPS`.
+    A point whose position is no longer finite stays at its last finite position. All points stop after `MOST_STEPS`.
 
     Args:
-        points: Where the points start. [..., 3]
+        points: Start positions. [..., 3]
         v: Velocity of the point at the origin. [..., 3]
         w: Angular velocity, rad per unit. [..., 3]
         a: Rate of v. [..., 3]
@@ -42,7 +41,7 @@ class SteppedPath:
         return points, quats
 
     def _next(self, state: State, h: float) -> State:
-        """Points, rotations and twist a step later."""
+        """Points, rotations and twist one step later."""
         (points, quats, v, w), (a, e) = state, self._rates
         half_v, half_w = 0.5 * h * a, 0.5 * h * e
         with np.errstate(over="ignore", invalid="ignore"):

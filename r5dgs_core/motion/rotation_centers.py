@@ -1,9 +1,9 @@
-"""About which point and axis a motion turns or swings at t_max, and the same motion about another.
+"""Centre and axis of the rotation or oscillation of a motion model at t_max, and edits of both.
 
-Notation: points are seen from the group's pivot, along the world's axes. A "ballistic_spin" carries its center u. The
-velocities of a twist are v + w x x at x, and their rates a + eps x x: its center is the point nearest to the pivot that
-moves along the axis only, c = w x v / |w|^2, and the whole field of velocities goes where the center goes. A
-"translation" that swings with W rests at a / W^2. What flies straight, stays or tumbles freely has no such point.
+Notation: points are relative to the group's pivot, along the world axes. A "ballistic_spin" stores its centre u. The
+velocity of a twist at x is v + w x x, with rate a + eps x x; its centre is the point nearest to the pivot that moves
+only along the axis, c = w x v / |w|^2, and the whole velocity field moves with it. A "translation" that oscillates with
+W is centred at a / W^2. Steady translations, static groups and free tops have no centre.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _TWISTS = ("constant_twist", "world_twist")
 
 
 def center(model: MotionModel) -> np.ndarray | None:
-    """The point about which a motion turns or swings at t_max, or None where it has none. [3]"""
+    """Point about which a motion rotates or oscillates at t_max, or None if it has none. [3]"""
     if model.kind == "ballistic_spin":
         return model.center_offset
     if model.kind == "translation" and model.frequency > 0:
@@ -32,7 +32,7 @@ def center(model: MotionModel) -> np.ndarray | None:
 
 
 def axis(model: MotionModel) -> np.ndarray | None:
-    """Unit vector about which a motion turns at t_max, or starts to turn; None where it does not turn. [3]"""
+    """Unit vector of the rotation axis at t_max or of the starting rotation; None if the motion does not rotate. [3]"""
     if not model.turns or model.kind in ("static", "translation"):
         return None
     spin = model.angular_velocity if model.angular_velocity.any() else model.angular_acceleration
@@ -41,15 +41,15 @@ def axis(model: MotionModel) -> np.ndarray | None:
 
 
 def with_center(model: MotionModel, point: np.ndarray, old: np.ndarray | None = None) -> MotionModel:
-    """The same motion about another point.
+    """Move the centre of a motion to another point.
 
     Args:
         model: The motion.
-        point: Where it is moved to. [3]
-        old: Which point of the axis of a twist goes there, None for `center`. [3]
+        point: New centre. [3]
+        old: Point on the axis of a twist that moves to ``point``, or None for `center`. [3]
 
     Raises:
-        ValueError: The motion has no such point.
+        ValueError: The motion has no centre.
     """
     now = center(model)
     if now is None:
@@ -62,15 +62,15 @@ def with_center(model: MotionModel, point: np.ndarray, old: np.ndarray | None = 
 
 
 def with_axis(model: MotionModel, direction: np.ndarray, through: np.ndarray | None = None) -> MotionModel:
-    """The same motion about an axis of another direction through the same point; its speed of turning stays.
+    """Change the direction of a motion's axis, keeping one point of it and the angular speed.
 
     Args:
         model: The motion.
         direction: Not zero, of any length. [3]
-        through: Which point of the axis of a twist stays on it, None for `center`. [3]
+        through: Point on the axis of a twist that is kept, or None for `center`. [3]
 
     Raises:
-        ValueError: The motion does not turn, or the direction is zero.
+        ValueError: The motion does not rotate, or the direction is zero.
     """
     old = axis(model)
     length = float(np.linalg.norm(direction))
@@ -91,7 +91,7 @@ def with_axis(model: MotionModel, direction: np.ndarray, through: np.ndarray | N
 
 
 def _moved(model: MotionModel, by: np.ndarray) -> MotionModel:
-    """A twist whose rates at the pivot are those that it had off it. [3]"""
+    """Shift a twist so that its rates at the pivot are those it had at ``by``. [3]"""
     return replace(
         model,
         velocity=model.velocity + np.cross(model.angular_velocity, by),
@@ -100,7 +100,7 @@ def _moved(model: MotionModel, by: np.ndarray) -> MotionModel:
 
 
 def _between(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Shortest rotation from one unit vector to another, unit wxyz; a half turn about any normal of opposite ones."""
+    """Shortest rotation between two unit vectors, unit wxyz; a half turn about any normal if they are opposite."""
     quat = np.array([1 + old @ new, *np.cross(old, new)])
     if np.linalg.norm(quat) < 1e-7:
         normal = np.cross(old, np.eye(3)[int(np.argmin(np.abs(old)))])

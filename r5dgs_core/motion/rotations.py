@@ -1,8 +1,8 @@
-"""Quaternions, rotation matrices and rotation vectors, the same code for numpy and torch.
+"""Quaternions, rotation matrices and rotation vectors, for numpy and torch alike.
 
-Notation: quaternions are wxyz, Hamilton, active (q v q* turns v) and unit; rotation vectors are axis times angle in
+Notation: quaternions are wxyz, Hamilton, active (q v q* rotates v) and unit; rotation vectors are axis times angle in
 radians; matrices act on columns. Leading batch dimensions broadcast. Near zero angle every function is a series in the
-squared angle, so values keep their digits and gradients stay finite.
+squared angle, which keeps precision and finite gradients.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 Array = Any  # numpy.ndarray or torch.Tensor
 
-# Below this squared angle the nine Taylor terms are exact to rounding (the tenth is under 1e-17), above it the
-# closed forms lose at most two digits.
+# Below this squared angle the nine Taylor terms are exact to rounding (the tenth is under 1e-17); above it the closed
+# forms lose at most two digits.
 _SERIES_LIMIT = 1.0
 _COS_SERIES = (
     1.0,
@@ -34,7 +34,7 @@ _C_SERIES = tuple(c / (2 * k + 3) for k, c in enumerate(_B_SERIES))  # (x - sin 
 
 
 def array_namespace(*arrays: Array) -> Any:
-    """The library of the arrays: torch if one of them is a tensor, else numpy. torch is never imported here."""
+    """Return the library of the arrays: torch if any is a tensor, else numpy. Never imports torch."""
     torch = sys.modules.get("torch")
     if torch is not None and any(isinstance(array, torch.Tensor) for array in arrays):
         return torch
@@ -49,7 +49,7 @@ def _horner(coefficients: tuple[float, ...], x: Array) -> Array:
 
 
 def _split(angle2: Array) -> tuple[Any, Array, Array, Array]:
-    """Mask of small angles, squared angle where small (else 0) and where large (else 1), and the root of the latter.
+    """Mask of small angles; squared angle if small, else 0; squared angle if large, else 1; square root of the latter.
 
     `where` also differentiates the branch that it discards, so both branches get a safe argument first.
     """
@@ -63,7 +63,7 @@ def _split(angle2: Array) -> tuple[Any, Array, Array, Array]:
 def cosine(angle2: Array) -> Array:
     """cos(x) as a function of x^2. [...]"""
     xp = array_namespace(angle2)
-    if xp is np:  # the series is there for gradients; the value needs none
+    if xp is np:  # only gradients need the series
         return np.cos(np.sqrt(angle2))
     small, low, _, root = _split(angle2)
     return xp.where(small, _horner(_COS_SERIES, low), xp.cos(root))
@@ -96,7 +96,7 @@ def remainder_ratio(angle2: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """a x b with broadcasting. [..., 3] each."""
+    """Cross product a x b with broadcasting. [..., 3] each"""
     xp = array_namespace(a, b)
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
@@ -104,7 +104,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def normalize(quats: Array) -> Array:
-    """Unit quaternions with the same direction; the zero quaternion becomes the identity. [..., 4]"""
+    """Normalise quaternions; the zero quaternion becomes the identity. [..., 4]"""
     xp = array_namespace(quats)
     norm2 = (quats * quats).sum(-1)[..., None]
     zero = norm2 <= 0
@@ -121,7 +121,7 @@ def conjugate(quats: Array) -> Array:
 
 
 def multiply(p: Array, q: Array) -> Array:
-    """Hamilton product p q: first q, then p, both in the world frame. [..., 4]"""
+    """Hamilton product p q: rotation by q, then by p, both in the world frame. [..., 4]"""
     xp = array_namespace(p, q)
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
@@ -137,21 +137,21 @@ def multiply(p: Array, q: Array) -> Array:
 
 
 def rotate(quats: Array, vectors: Array) -> Array:
-    """Turn vectors by unit quaternions. [..., 4], [..., 3] -> [..., 3]"""
+    """Rotate vectors by unit quaternions. [..., 4], [..., 3] -> [..., 3]"""
     axis, w = quats[..., 1:], quats[..., :1]
     twice = 2 * cross(axis, vectors)
     return vectors + w * twice + cross(axis, twice)
 
 
 def rotvecs_to_quats(rotvecs: Array) -> Array:
-    """Exponential map, rotation vectors to unit quaternions; zero gives (1, 0, 0, 0) exactly. [..., 3] -> [..., 4]"""
+    """Exponential map, rotation vectors to unit quaternions; zero gives exactly (1, 0, 0, 0). [..., 3] -> [..., 4]"""
     xp = array_namespace(rotvecs)
     quarter = 0.25 * (rotvecs * rotvecs).sum(-1)[..., None]
     return xp.concatenate([cosine(quarter), 0.5 * sine_ratio(quarter) * rotvecs], -1)
 
 
 def quats_to_rotvecs(quats: Array) -> Array:
-    """Logarithm: unit quaternions to rotation vectors of angle at most pi. [..., 4] -> [..., 3]"""
+    """Logarithm map, unit quaternions to rotation vectors of angle at most pi. [..., 4] -> [..., 3]"""
     xp = array_namespace(quats)
     flipped = xp.where(quats[..., :1] < 0, -quats, quats)
     w, vec = flipped[..., :1], flipped[..., 1:]
@@ -179,8 +179,8 @@ def quats_to_rotmats(quats: Array) -> Array:
 def rotmats_to_quats(rotmats: Array) -> Array:
     """Rotation matrices to unit quaternions with w >= 0. [..., 3, 3] -> [..., 4]
 
-    Of the four ways to write the quaternion the one with the largest component is taken, which keeps all digits
-    at half turns, where the usual trace formula divides zero by zero.
+    Uses the formula for the largest of the four components. It keeps full precision at half turns, where the usual
+    trace formula divides zero by zero.
     """
     xp = array_namespace(rotmats)
     m = [[rotmats[..., i, j] for j in range(3)] for i in range(3)]
@@ -211,9 +211,9 @@ def rotmats_to_quats(rotmats: Array) -> Array:
 
 
 def make_continuous(quats: Array) -> Array:
-    """Choose the sign of each quaternion so that it is nearest to its predecessor along axis 0. [S, ..., 4]
+    """Choose the sign of each quaternion that is nearest to its predecessor along axis 0. [S, ..., 4]
 
-    The first keeps its sign. A track without this turns by up to 360 degrees between two keys of opposite sign.
+    The first keeps its sign. Without this, a track turns by up to 360 degrees between two keys of opposite sign.
     """
     xp = array_namespace(quats)
     if quats.shape[0] < 2:
@@ -225,12 +225,12 @@ def make_continuous(quats: Array) -> Array:
 
 
 def slerp(start: Array, end: Array, fraction: Array) -> Array:
-    """Turn from ``start`` to ``end`` the short way at constant rate. [..., 4], [..., 4], [...] -> [..., 4]
+    """Rotate from ``start`` to ``end`` the short way at a constant rate. [..., 4], [..., 4], [...] -> [..., 4]
 
     Args:
         start: Unit wxyz, reached at fraction 0. [..., 4]
         end: Unit wxyz, reached at fraction 1 (up to sign). [..., 4]
-        fraction: Any real; outside [0, 1] the turn goes on. [...] or a number
+        fraction: Any real; extrapolates outside [0, 1]. [...] or a number
     """
     turn = quats_to_rotvecs(multiply(end, conjugate(start)))
     if hasattr(fraction, "shape"):
@@ -239,7 +239,7 @@ def slerp(start: Array, end: Array, fraction: Array) -> Array:
 
 
 def angle_between(p: Array, q: Array) -> Array:
-    """Angle in radians of the turn from p to q, in [0, pi], exact near 0 and pi. [..., 4] -> [...]"""
+    """Rotation angle from p to q in radians, in [0, pi], accurate near 0 and pi. [..., 4] -> [...]"""
     xp = array_namespace(p, q)
     turn = multiply(conjugate(p), q)
     vec = turn[..., 1:]

@@ -4,8 +4,8 @@ Notation: a twist (w, v) moves the point x with velocity v + w x (x - o), where 
 groups o is their centre at t_max, see `recentre`. The pose (q, d) maps x - o to q (x - o) q* + d. With A, B, C of
 `rotations` and W = [w]_x, exp(w, v) has R = I + A W + B W^2 and d = (I + B W + C W^2) v.
 
-Single poses keep the dtype they are given; whatever takes steps or times computes in float64, as products of many
-float32 poses drift. Tensors carry gradients, finite at w = 0 too.
+Functions of single poses keep the input dtype. Functions that take steps or times compute in float64, because products
+of many float32 poses drift. Tensors carry gradients, which are finite at w = 0 too.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from . import rotations
 
 Array = rotations.Array
 Pose = tuple[Array, Array]
-MOST_STEPS = 1 << 31  # what `steps_needed` answers where no number of steps would do
+MOST_STEPS = 1 << 31  # result of `steps_needed` if no number of steps suffices
 
 
 def float64(*arrays: Array) -> tuple[Array, ...]:
-    """The arrays in float64, all of one library: tensors on the device of the first if one is a tensor."""
+    """Convert arrays to float64 of one library: tensors on the device of the first tensor if there is any."""
     xp = rotations.array_namespace(*arrays)
     if xp is np:
         return tuple(np.asarray(array, np.float64) for array in arrays)
@@ -31,9 +31,9 @@ def float64(*arrays: Array) -> tuple[Array, ...]:
 
 
 def v_matrix_times(w: Array, v: Array) -> Array:
-    """V(w) v = (I + B W + C W^2) v: the integral of exp(w s) v over s in [0, 1]. [..., 3]
+    """V(w) v = (I + B W + C W^2) v, the integral of exp(w s) v over s in [0, 1]. [..., 3]
 
-    It is also the left Jacobian of the rotation exponential: exp(phi(t)) has angular velocity V(phi) phi'.
+    V is also the left Jacobian of the rotation exponential: exp(phi(t)) has angular velocity V(phi) phi'.
     """
     angle2 = (w * w).sum(-1)[..., None]
     once = rotations.cross(w, v)
@@ -42,7 +42,7 @@ def v_matrix_times(w: Array, v: Array) -> Array:
 
 
 def exp(w: Array, v: Array) -> Pose:
-    """Pose after one unit of time under a constant twist; the zero twist gives the identity to the bit.
+    """Pose after one unit of time under a constant twist; the zero twist gives exactly the identity.
 
     Args:
         w: Angular velocity, rad per unit, any magnitude. [..., 3]
@@ -55,7 +55,7 @@ def exp(w: Array, v: Array) -> Pose:
 
 
 def compose(second: Pose, first: Pose) -> Pose:
-    """The pose that applies ``first``, then ``second``. ([..., 4], [..., 3])"""
+    """Pose that applies ``first``, then ``second``. ([..., 4], [..., 3])"""
     return (
         rotations.multiply(second[0], first[0]),
         rotations.rotate(second[0], first[1]) + second[1],
@@ -63,7 +63,7 @@ def compose(second: Pose, first: Pose) -> Pose:
 
 
 def invert(pose: Pose) -> Pose:
-    """The pose that undoes ``pose``. ([..., 4], [..., 3])"""
+    """Inverse pose. ([..., 4], [..., 3])"""
     back = rotations.conjugate(pose[0])
     return back, -rotations.rotate(back, pose[1])
 
@@ -75,23 +75,23 @@ def recentre(
     a: Array,  # [..., 3]
     center: Array,  # [..., 3]
 ) -> tuple[Array, Array]:
-    """Rewrite a twist with linear rates about another fixed origin: an exact change of variables.
+    """Express a twist with linear rates about another fixed origin: an exact change of variables.
 
     Args:
-        w: Angular velocity at the start, unchanged by the shift. [..., 3]
-        v: Velocity of the point that sits at the old origin. [..., 3]
+        w: Angular velocity at the start, unchanged. [..., 3]
+        v: Velocity of the point at the old origin. [..., 3]
         eps: Rate of w, unchanged. [..., 3]
         a: Rate of v. [..., 3]
-        center: The new origin in old coordinates. [..., 3]
+        center: New origin in old coordinates. [..., 3]
 
     Returns:
-        v and a about the new origin. Twists about a far origin cancel badly in rounding.
+        v and a about the new origin. Twists about a distant origin lose precision to cancellation.
     """
     return v + rotations.cross(w, center), a + rotations.cross(eps, center)
 
 
 def product(quats: Array, displacements: Array) -> Pose:
-    """Product P_n ... P_1 of the poses along axis 0 by halving, log n deep. ([n, ..., 4], [n, ..., 3])"""
+    """Product P_n ... P_1 of the poses along axis 0 by pairwise reduction, log n deep. ([n, ..., 4], [n, ..., 3])"""
     xp = rotations.array_namespace(quats, displacements)
     while len(quats) > 1:
         even = len(quats) // 2 * 2
@@ -129,9 +129,8 @@ def step_twists(
         v: Velocity of the point at the origin at time 0. [3]
         eps: Rate of w. [3]
         a: Rate of v. [3]
-        durations: Signed times T to reach. [...]
-        steps: Equal steps n >= 1 that each T is cut into.
-        order: 2 takes exp(h m) with the midpoint twist m, 4 takes exp(h m - h^3/12 [m, b]) with b = (eps, a).
+        durations: Signed durations T. [...] steps: Number n >= 1 of equal steps for each T.
+        order: 2 for exp(h m) with the midpoint twist m, 4 for exp(h m - h^3/12 [m, b]) with b = (eps, a).
 
     Returns:
         Angular and linear parts of the exponents. [n, ..., 3] each
@@ -154,10 +153,10 @@ def step_twists(
 def integrate(w: Array, v: Array, eps: Array, a: Array, durations: Array, steps: int, order: int = 4) -> Pose:
     """Poses after ``durations`` under a twist that is linear in time, by ``steps`` Magnus steps each.
 
-    Rigid to rounding and reversible at any step size; arguments as in `step_twists`.
+    Rigid to rounding and reversible at any step size. Arguments as in `step_twists`.
 
     Returns:
-        Unit quaternions [..., 4] and displacements [..., 3]; a duration of 0 gives the identity to the bit.
+        Unit quaternions [..., 4] and displacements [..., 3]; exactly the identity for a duration of 0.
     """
     quats, displacements = product(*exp(*step_twists(w, v, eps, a, durations, steps, order)))
     return rotations.normalize(quats), displacements
@@ -166,20 +165,20 @@ def integrate(w: Array, v: Array, eps: Array, a: Array, durations: Array, steps:
 def steps_needed(
     w: Array, v: Array, eps: Array, a: Array, durations: Array, radius: float, tolerance: float
 ) -> np.ndarray:
-    """Magnus-4 steps that keep the error of every point of a body under ``tolerance``.
+    """Number of Magnus-4 steps that keep the error of every point of a body under ``tolerance``.
 
     Args:
         w: Angular velocity at time 0, about the body's centre. [3]
         v: Velocity of the centre. [3]
         eps: Rate of w. [3]
         a: Rate of v. [3]
-        durations: Signed times to reach. [...]
+        durations: Signed durations. [...]
         radius: Radius of the body.
-        tolerance: Largest allowed distance, in the units of radius.
+        tolerance: Largest allowed position error, in the units of radius.
 
     Returns:
-        n >= 1 for each duration, numpy; 1 where twist and rate commute, which one step solves exactly, `MOST_STEPS`
-        where even that many would not do, or rates are not finite. [...] int64
+        n >= 1 for each duration, numpy. It is 1 if twist and rate commute, because one step is then exact, and
+        `MOST_STEPS` if even that many would not suffice or the rates are not finite. [...] int64
 
     Source: leading omitted term D = [C1, a2]/240 + [a1, [a1, C1]]/720 with C1 = [a1, a2], a1 = m, a2 = b at h = 1:
         n = ceil((c T^5 / tol)^(1/4)), c the mean over [0, T] of radius |D_w| + |D_v|; at least |w| T / 2 steps.
@@ -200,12 +199,12 @@ def steps_needed(
 
 
 def _numbers(values: Array) -> np.ndarray:
-    """The values as float64 numpy, without gradients."""
+    """Convert to float64 numpy, without gradients."""
     return float64(values)[0] if rotations.array_namespace(values) is np else values.detach().cpu().double().numpy()
 
 
 def _reach(twist: Pose, radius: float) -> np.ndarray:
-    """Mean over axis 0 of the speed that a twist gives to the farthest point. [n, ..., 3] each -> [...]"""
+    """Speed that a twist gives to the farthest point, averaged over axis 0. [n, ..., 3] each -> [...]"""
     return np.mean(radius * np.linalg.norm(twist[0], axis=-1) + np.linalg.norm(twist[1], axis=-1), axis=0)
 
 

@@ -1,10 +1,10 @@
-"""Many points that each move by a twist of their own: what does not depend on the time is computed once.
+"""Propagation of many points, each with its own twist, with time-independent quantities precomputed.
 
-Notation: x = (w, v) the twist of a point about its own centre at time 0, b = (e, a) its rate, T the time to reach. For
-a twist that is linear in time the bracket C = [x, b] is that of every moment, so that a Magnus step of length h with
-its middle at m is exp(h x + h m b - h^3/12 C): three products. Everything lies in columns, [6, n]
-(`quaternion_columns`). With s = sin(|u|/2) the ratios B = 2 s^2/|u|^2, C and D of `se3` lose digits towards u = 0 only
-as fast as what they are multiplied with vanishes, so no series is needed.
+Notation: x = (w, v) the twist of a point about its own centre at time 0, b = (e, a) its rate, T the duration. For a
+twist that is linear in time the bracket C = [x, b] is constant, so a Magnus step of length h with midpoint m is
+exp(h x + h m b - h^3/12 C): three products. Arrays are stored by column, [6, n] (`quaternion_columns`). With
+s = sin(|u|/2), the ratios B = 2 s^2/|u|^2, C and D of `se3` lose precision towards u = 0 only as fast as their factors
+vanish, so no series is needed.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from . import quaternion_columns, rotations, se3
 
 log = logging.getLogger(__name__)
 
-MAX_STEPS = 512  # of thousands of points, so that no frame takes for ever
-WILD = 1e12  # difficulty of a point that no number of steps follows
-CHUNK = 2048  # points at once: their columns stay in the cache
+MAX_STEPS = 512  # steps per frame of thousands of points, to bound the time
+WILD = 1e12  # difficulty above which no number of steps suffices
+CHUNK = 2048  # points per block, sized for the CPU cache
 _TINY = 1e-30
 
 
 class Propagator:
     """Rotations and displacements of points under dynamics about their own centres, at any time.
 
-    Points at rest are left out, twists without angular acceleration have a closed form, and the others take
-    fourth-order Magnus steps, as many as their neighbours in difficulty need. Points whose dynamics are not finite or
-    lead beyond all numbers rest, with a warning; the others stay within the tolerance as far as ``most_steps`` do.
+    Points at rest are skipped, twists without angular acceleration use a closed form, and the others take fourth-order
+    Magnus steps in blocks of similar difficulty. Points whose dynamics or poses are not finite stay at rest, with a
+    warning. The others stay within the tolerance if ``most_steps`` suffices.
 
     Args:
         dynamics: Velocity, angular velocity and the rates of both, about the centre of each point. [N, 12]
         tolerance: Largest allowed error of a point, in the units of its velocity times time, > 0. A number or [N]
-        radius: Distance at which an error of the rotation counts as one of the point. A number or [N]
-        most_steps: Bound of the steps to any time, >= 1: beyond, errors grow above the tolerance.
+        radius: Lever arm that converts rotation errors to position errors. A number or [N]
+        most_steps: Largest number of steps to any time, >= 1; if more are needed, errors exceed the tolerance.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class Propagator:
             warn_of_wild_dynamics(int((~sound).sum()), self.count)
 
     def columns(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
-        """Motion of the points that move, in the order of `rows`.
+        """Motion of the moving points, in the order of `rows`.
 
         Args:
-            duration: Signed time to reach.
+            duration: Signed duration.
 
         Returns:
             Unit quaternions wxyz [4, n] and displacements [3, n], float64, by column.
@@ -105,7 +105,7 @@ class Propagator:
         return quats, displacements
 
     def rows_of(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
-        """Unit quaternions wxyz [N, 4] and displacements [N, 3] of all points, float64; those at rest stay."""
+        """Unit quaternions wxyz [N, 4] and displacements [N, 3] of all points, float64."""
         quats, displacements = rotations.identity(self.count), np.zeros((self.count, 3))
         if duration != 0 and len(self.rows):
             q, d = self.columns(duration)
@@ -117,18 +117,20 @@ class Propagator:
         omitted, turning = self._omitted[i], self._turning[i]
         error = (omitted[0] + omitted[1] * span + omitted[2] * span**2) * span**5
         by_turn = (turning[0] + turning[1] * span) * span / 2
-        if not (error**0.25 < se3.MOST_STEPS and by_turn < se3.MOST_STEPS):  # no number of steps would do
+        if not (error**0.25 < se3.MOST_STEPS and by_turn < se3.MOST_STEPS):  # no number of steps suffices
             return min(MAX_STEPS, self._most_steps)
         return min(max(1, math.ceil(error**0.25), math.ceil(by_turn)), self._most_steps)
 
 
 @functools.cache
 def warn_of_wild_dynamics(bad: int, count: int) -> None:
-    log.warning("%d of %d points have dynamics beyond all numbers and stay where they are at t_max", bad, count)
+    log.warning("%d of %d points have dynamics that are not finite and stay at their positions at t_max", bad, count)
 
 
 def _omitted(x: np.ndarray, b: np.ndarray, bracket: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """What Magnus-4 leaves out, a polynomial of the time: bounds of the mean of `se3.steps_needed`. [3, n]"""
+    """Leading error terms of Magnus-4 as coefficients of a polynomial in time; bounds of `se3.steps_needed`'s mean.
+    [3, n]
+    """
     once, other = _bracket(x, bracket), _bracket(b, bracket)
     terms = (
         _bracket(x, once) / 720 - other / 240,
@@ -139,7 +141,7 @@ def _omitted(x: np.ndarray, b: np.ndarray, bracket: np.ndarray, reach: np.ndarra
 
 
 def _magnus(x: np.ndarray, b: np.ndarray, c: np.ndarray, duration: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Poses after equal steps: as many at once as fit the cache. [6, n] each -> [4, n], [3, n]"""
+    """Poses after equal steps, batched to fit the cache. [6, n] each -> [4, n], [3, n]"""
     count, h = x.shape[1], duration / steps
     fixed = (h * x - (h**3 / 12) * c)[:, None]
     quats, displacements = np.empty((4, 0)), np.empty((3, 0))
@@ -160,7 +162,7 @@ def _magnus(x: np.ndarray, b: np.ndarray, c: np.ndarray, duration: float, steps:
 
 
 def _product(quats: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The poses along axis 1 one after the other, by halving. [4, s, n], [3, s, n] -> [4, n], [3, n]"""
+    """Compose poses along axis 1 by pairwise reduction. [4, s, n], [3, s, n] -> [4, n], [3, n]"""
     while quats.shape[1] > 1:
         even = quats.shape[1] // 2 * 2
         first, second = slice(0, even, 2), slice(1, even, 2)
@@ -177,7 +179,7 @@ def _exp(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turn(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """exp(w), V(w) v, and what `_accelerated_spin` shares with them: |w| and sin(|w|/2)."""
+    """exp(w) and V(w) v, with |w| and sin(|w|/2) for `_accelerated_spin`."""
     angle = np.maximum(_norms(w), _TINY)
     half = 0.5 * angle
     s, cosine = np.sin(half), np.cos(half)
@@ -192,7 +194,7 @@ def _turn(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _accelerated_spin(x: np.ndarray, a: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Closed form of a twist whose w is constant: `se3.accelerated_spin`. [6, n], [3, n] -> [4, n], [3, n]"""
+    """Closed form for twists with constant w, as in `se3.accelerated_spin`. [6, n], [3, n] -> [4, n], [3, n]"""
     w, v = duration * x[:3], duration * x[3:]
     quats, displacements, angle, s = _turn(w, v)
     square = angle * angle
@@ -204,7 +206,7 @@ def _accelerated_spin(x: np.ndarray, a: np.ndarray, duration: float) -> tuple[np
 
 
 def _bracket(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """[(w1, v1), (w2, v2)] = (w1 x w2, w1 x v2 - w2 x v1) by column. [6, n] each"""
+    """Lie bracket [(w1, v1), (w2, v2)] = (w1 x w2, w1 x v2 - w2 x v1) by column. [6, n] each"""
     return np.concatenate(
         [
             quaternion_columns.cross(x[:3], y[:3]),
