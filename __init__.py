@@ -1,8 +1,8 @@
-"""R5DGS as a Blender extension. The repository root is the extension; nothing is imported before `register`."""
+"""Entry point of the R5DGS Blender extension, whose root is this repository. Packages are imported in `register`."""
 
 
 def register():
-    """Register the add-on's services, then its operators."""
+    """Register the add-on's services, then the operators."""
     from . import operators, r5dgs_addon
 
     r5dgs_addon.register()

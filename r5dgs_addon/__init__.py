@@ -1,4 +1,4 @@
-"""Services of the add-on: objects, keyframes, properties, preferences, panels and the worker's client."""
+"""Services of the add-on: objects, keyframes, properties, preferences, panels and the worker client."""
 
 from . import panels, preferences
 from .engine import engine, live_preview, render_notes, render_stats

@@ -1,8 +1,8 @@
-"""A scene as Blender objects: a collection, a root empty, and per object a collection with anchors and point clouds.
+"""Build a scene as Blender objects: a root empty, and per object a collection with anchor empties and point clouds.
 
-Notation: the root carries the world convention W; the anchor of motion group g stands at the group's pivot p and turns
-and moves by the group's pose (R, d). A point x of the bind state is shown at W T(p + d) R T(-p) x, where T(-p) is the
-cloud's parent inverse, so that the point cloud holds the file's own coordinates.
+Notation: the root carries the world convention W. The anchor of motion group g sits at the group's pivot p and is
+animated with the group's pose (R, d). A bind-state point x appears at W T(p + d) R T(-p) x, where T(-p) is the point
+cloud's parent inverse. The point cloud therefore stores the coordinates of the scene file unchanged.
 """
 
 import math
@@ -20,21 +20,21 @@ from . import compat
 from .motion import keyframes, physics
 from .scene import loaded_scenes, object_names, point_clouds, relink, timeline, viewport_display
 
-SMALLEST = 1e-4  # size of a scene; Blender's curves take steps below 1.2e-7 for none
+SMALLEST = 1e-4  # minimum extent of a scene (units); Blender's F-curves ignore changes below 1.2e-7
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a scene is built.
+    """Options of `build`.
 
     Attributes:
-        world_convention: Key of `cameras.WORLD_TO_BLENDER`, or "" for the file's own.
-        frame_zero: Frame at which the scene time is 0.
-        t_end: Scene time up to which motion is extrapolated; None for `timeline.default_end`.
-        key_tolerance: Error of the reduced keys, fraction of the scene's size.
-        fit_timeline: Whether the frame range and the marker are set.
-        sh_degree: Highest degree of the spherical harmonics that are stored on the points.
-        display: What stands for Gaussians in viewports without splats, of `viewport_display.ITEMS`.
+        world_convention: Key of `cameras.WORLD_TO_BLENDER`, or "" for the one stored in the file.
+        frame_zero: Frame of scene time 0.
+        t_end: Scene time up to which motion is extrapolated, or None for `timeline.default_end`.
+        key_tolerance: Maximum error of the reduced keys, as a fraction of the scene's extent.
+        fit_timeline: True to set the frame range and the t_max marker.
+        sh_degree: Highest spherical-harmonics degree stored on the points.
+        display: Key of `viewport_display.ITEMS` for viewports that do not draw splats.
     """
 
     world_convention: str = ""
@@ -57,7 +57,7 @@ class Range:
 
 
 def ranges(scene: Scene) -> list[Range]:
-    """The scene's Gaussians cut where object or motion group change."""
+    """Split the scene's Gaussians into ranges of constant object id and motion id."""
     pairs = np.stack([scene.object_ids, scene.motion_ids], axis=-1).astype(np.int64)
     if len(pairs) == 0:
         return []
@@ -69,10 +69,11 @@ def ranges(scene: Scene) -> list[Range]:
 
 
 def homes(scene: Scene, parts: list[Range]) -> list[Range]:
-    """The ranges whose objects keep the anchors: one for each motion group, one for each object's pinned Gaussians.
+    """Return the ranges whose object collections hold the anchors.
 
-    A body's anchor stays with the group's own object where that has Gaussians of it, though Gaussians of others may
-    move with it; any other with the object that has the most of it.
+    Each motion group has one anchor; the pinned group 0 has one per object. The anchor of a body goes to the group's
+    own
+    object if that object has Gaussians in the group, otherwise to the object with the most Gaussians in it.
     """
     best: dict[tuple[int, int], Range] = {}
     for part in parts:
@@ -86,20 +87,20 @@ def homes(scene: Scene, parts: list[Range]) -> list[Range]:
 
 
 def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options = Options()) -> bpy.types.Collection:
-    """Build a scene in the active Blender scene. After an error everything is as it was before.
+    """Build a scene in the active Blender scene. On error, the file is left unchanged.
 
     Args:
-        context: Its scene and view layer get the objects.
-        scene: The scene.
-        path: File that it came from; remembered for the preview.
-        options: How to build.
+        context: Context whose scene and view layer receive the objects.
+        scene: Scene to build.
+        path: Source file of the scene, stored for the preview.
+        options: Build options.
 
     Returns:
         The collection ``R5DGS <name>``.
 
     Raises:
-        SceneFileError: The scene has no Gaussians, or is too small for Blender's curves.
-        ConfigError: Extrapolation would end too far.
+        SceneFileError: The scene has no Gaussians, or is too small for Blender's F-curves.
+        ConfigError: The end of extrapolation is too many frames away.
     """
     if len(scene.means) == 0:
         raise errors.SceneFileError(
@@ -153,7 +154,7 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
 
 
 def object_name(scene: Scene, object_id: int) -> str:
-    """Name of an object of the table, or one made of its id where the table lacks it."""
+    """Name of an object from the scene's table, or a name made from its id if the table lacks it."""
     try:
         return scene.object(object_id).name
     except KeyError:
@@ -177,7 +178,7 @@ def _root(collection: bpy.types.Collection, scene: Scene, convention: str) -> bp
 
 
 def _pivot(scene: Scene, part: Range) -> np.ndarray:
-    """Where the anchor stands: the group's pivot; the middle of the object where the group is the pinned one. [3]"""
+    """Position of a range's anchor: the group's pivot, or the object's median point for the pinned group. [3]"""
     if part.motion_id != 0:
         return np.asarray(scene.groups[part.motion_id].pivot, np.float64)
     if part.object_id <= 0:
@@ -186,12 +187,12 @@ def _pivot(scene: Scene, part: Range) -> np.ndarray:
 
 
 def _anchor_key(part: Range) -> tuple[int, int]:
-    """What shares an anchor: a motion group; of the pinned one, each object by itself, so that it can be moved."""
+    """Key of the anchor that a range uses; pinned Gaussians get one anchor per object, so each can be moved."""
     return (part.object_id if part.motion_id == 0 else 0, part.motion_id)
 
 
 def _part_name(scene: Scene, part: Range, largest: dict[int, Range]) -> str:
-    """Name of a range: its object's for the largest one, which of the object's Gaussians these are for the others."""
+    """Name of a range: the object's name for its largest range, and a qualified name for the others."""
     name = object_name(scene, part.object_id)
     group: MotionGroup = scene.groups[part.motion_id]
     if group.role == "shadow":
@@ -212,7 +213,7 @@ def _anchor(
 ) -> bpy.types.Object:
     anchor = bpy.data.objects.new(object_names.fit(f"{_part_name(scene, part, largest)} anchor"), None)
     pivot = _pivot(scene, part)
-    shadow = scene.groups[part.motion_id].role == "shadow"  # what goes along is drawn smaller than what leads
+    shadow = scene.groups[part.motion_id].role == "shadow"  # shadow anchors are drawn smaller than those of bodies
     anchor.empty_display_type = "PLAIN_AXES" if shadow else "ARROWS"
     anchor.empty_display_size = (0.01 if shadow else 0.03) * extent
     anchor.rotation_mode = "QUATERNION"
@@ -259,7 +260,7 @@ def _describe(
     state = collection.r5dgs
     state.is_scene = True
     state.scene_name = scene.name
-    state.filepath = relink.relative_to(str(path.resolve()), bpy.data.filepath)  # allows the file, see `trust`
+    state.filepath = relink.relative_to(str(path.resolve()), bpy.data.filepath)  # also trusts the file
     state.seen_at = str(path.resolve())
     state.gaussians = len(scene.means)
     state.root = root

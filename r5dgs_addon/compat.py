@@ -1,26 +1,26 @@
-"""What differs between Blender versions, found by feature and not by number. Nothing else asks for a version."""
+"""Differences between Blender versions, found by feature detection. No other module checks the version."""
 
 import atexit
 from collections.abc import Sequence
 
 import bpy
 
-# In newer versions a path property has to say that it may begin with "//"; before, there is no such word.
+# Recent versions require path properties to declare support for the "//" prefix; older ones lack the option.
 _SAYS_RELATIVE = "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties
 PATH_OPTIONS = {"PATH_SUPPORTS_BLEND_RELATIVE"} if _SAYS_RELATIVE else set()
 KEYFRAME = bpy.types.Keyframe.bl_rna
 
 
 def new_point_clouds(counts: Sequence[int]) -> list[bpy.types.PointCloud]:
-    """Make point clouds of so many points each, at the origin; no object uses them yet.
+    """Create point clouds with the given numbers of points at the origin, not yet used by any object.
 
-    `PointCloud.resize` came with 5.1; before it, what geometry nodes make in a scene of their own is copied.
+    `PointCloud.resize` is available from 5.1. Older versions copy the result of geometry nodes in a temporary scene.
 
     Args:
-        counts: Number of points of each, at least 1.
+        counts: Number of points of each point cloud, at least 1.
 
     Returns:
-        The point clouds, in that order.
+        The point clouds, in the order of ``counts``.
     """
     if hasattr(bpy.types.PointCloud, "resize"):
         clouds = [bpy.data.pointclouds.new("R5DGS points") for _ in counts]
@@ -52,15 +52,15 @@ def new_point_clouds(counts: Sequence[int]) -> list[bpy.types.PointCloud]:
 
 
 def remove_scene(scene: bpy.types.Scene) -> None:
-    """Remove a scene that no window shows.
+    """Remove a scene that is not shown in any window.
 
-    ``scenes.remove`` asks the window what it shows, and up to 4.4 crashes where there is none, as in `blender -b -a`.
+    Up to 4.4, ``scenes.remove`` crashes if there is no window, as in `blender -b -a`.
     """
     bpy.data.batch_remove([scene])
 
 
 def make_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:
-    """Have the host draw a point cloud as Gaussian splats, where it can (5.3 on). Returns whether it can."""
+    """Set a point cloud to be drawn as Gaussian splats (Blender 5.3+). Returns False if unsupported."""
     kind = cloud.bl_rna.properties.get("type")
     if kind is None or "GAUSSIAN_SPLAT" not in kind.enum_items:
         return False
@@ -69,9 +69,9 @@ def make_gaussian_splat(cloud: bpy.types.PointCloud) -> bool:
 
 
 def new_fcurves(obj: bpy.types.Object, name: str):
-    """Give an object an empty action of its own and return that action's collection of F-curves.
+    """Assign a new, empty action to an object and return its F-curve collection.
 
-    4.2 and 4.3 keep F-curves on the action; from 4.4 on they lie in a channel bag of a slot.
+    4.2 and 4.3 store F-curves on the action; from 4.4 on, they are stored in a channel bag of a slot.
     """
     animation = obj.animation_data_create()
     action = bpy.data.actions.new(name)
@@ -87,7 +87,7 @@ def new_fcurves(obj: bpy.types.Object, name: str):
 
 
 def fcurves(obj: bpy.types.Object):
-    """The F-curves that move an object; empty where it has none."""
+    """Return the F-curves that animate an object, or an empty tuple."""
     animation = obj.animation_data
     if animation is None or animation.action is None:
         return ()
@@ -95,12 +95,12 @@ def fcurves(obj: bpy.types.Object):
 
 
 def slot_of(user: bpy.types.AnimData | bpy.types.NlaStrip):
-    """The slot of its action that an object or a strip of the NLA plays; None where actions have no slots."""
+    """Action slot used by an object or NLA strip, or None if actions have no slots."""
     return getattr(user, "action_slot", None)
 
 
 def channels(action: bpy.types.Action, slot):
-    """The F-curves of an action for one of its slots; empty where it has none."""
+    """Return the F-curves of an action for one of its slots, or an empty tuple."""
     if "slots" not in action.bl_rna.properties:
         return action.fcurves
     for layer in action.layers if slot is not None else ():
@@ -112,7 +112,7 @@ def channels(action: bpy.types.Action, slot):
 
 
 def own_fcurves(obj: bpy.types.Object, name: str):
-    """The F-curves that move an object, where new ones can be added; an action is made where it has none."""
+    """Return the editable F-curve collection of an object, creating an action if it has none."""
     animation = obj.animation_data
     if animation is None or animation.action is None:
         return new_fcurves(obj, name)
@@ -127,25 +127,25 @@ def own_fcurves(obj: bpy.types.Object, name: str):
 
 
 def play(obj: bpy.types.Object, action: bpy.types.Action, slot) -> None:
-    """Give an object an action, and in it the slot that a slot of the same action or of one it was copied from is."""
+    """Assign an action to an object, and the slot with the same handle as ``slot``."""
     animation = obj.animation_data_create()
     animation.action = action
     choose_slot(animation, slot)
 
 
 def choose_slot(user: bpy.types.AnimData | bpy.types.NlaStrip, slot) -> None:
-    """Let an object or a strip play the slot of its action that has the handle of a given one; None does nothing."""
+    """Set the action slot of an object or NLA strip to the one with the handle of ``slot``. Does nothing if None."""
     if slot is not None:
         user.action_slot = next(other for other in user.action.slots if other.handle == slot.handle)
 
 
 def keyframe_enum(property_name: str, item: str) -> int:
-    """Number of an enum item of `bpy.types.Keyframe`, for ``foreach_set``."""
+    """Numeric value of an enum item of `bpy.types.Keyframe`, for ``foreach_set``."""
     return KEYFRAME.properties[property_name].enum_items[item].value
 
 
 def empty_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
-    """The empty node tree of a material; ``use_nodes`` is deprecated, and always true, from 5.0 on."""
+    """Clear a material's node tree and return it. From 5.0 on, ``use_nodes`` is deprecated and always true."""
     if material.node_tree is None:
         material.use_nodes = True
     material.node_tree.nodes.clear()
@@ -153,13 +153,13 @@ def empty_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
 
 
 def call_at_exit(unregister) -> None:
-    """Unregister before Python ends in the bpy module, which crashes there while panels or menus are registered.
+    """Call ``unregister`` before Python exits in the bpy module, which crashes if panels or menus stay registered.
 
-    Blender itself disables its extensions in time.
+    Blender itself disables its extensions before exit.
     """
-    if not bpy.app.binary_path:  # true of the module only
+    if not bpy.app.binary_path:  # true only for the bpy module
         atexit.unregister(_forget_properties)
-        atexit.register(_forget_properties)  # before the other: the last one registered is called first
+        atexit.register(_forget_properties)  # registered before the other, because atexit calls the last one first
         atexit.register(unregister)
 
 
@@ -169,7 +169,7 @@ def do_not_call_at_exit(unregister) -> None:
 
 
 def _forget_properties() -> None:
-    """Take the properties off our classes: the bpy module crashes where one with a callback outlives it (4.2)."""
+    """Remove the property annotations of our classes: the bpy module (4.2) crashes at exit if one has a callback."""
     package = __package__.rpartition(".")[0]
     for base in (bpy.types.PropertyGroup, bpy.types.Operator, bpy.types.AddonPreferences):
         for cls in base.__subclasses__():
@@ -177,20 +177,20 @@ def _forget_properties() -> None:
                 cls.__annotations__ = {}
 
 
-# The pass of object indices has its long name from 5.0 on, when scenes lost their own node tree.
+# From 5.0 on (scenes without their own node tree), the object index pass has its long name.
 OBJECT_INDEX = "IndexOB" if "node_tree" in bpy.types.Scene.bl_rna.properties else "Object Index"
 
 
 def working_space() -> str:
-    """Name of the .blend's scene-linear color space; before 5.0 there is but one."""
+    """Name of the .blend file's scene-linear color space; fixed before 5.0."""
     spaces = getattr(bpy.data, "colorspace", None)
     return spaces.working_space if spaces is not None else "Linear Rec.709"
 
 
 def panels_of_all_engines() -> list[type]:
-    """Blender's own panels that are for every engine. It knows them by an engine that it no longer has.
+    """Blender's built-in panels that apply to every render engine, identified by the removed BLENDER_RENDER engine.
 
-    What means nothing for Gaussians is left out: simplifying, Freestyle, Grease Pencil.
+    Panels without meaning for Gaussians are excluded: Simplify, Freestyle and Grease Pencil.
     """
     panels = [p for p in bpy.types.Panel.__subclasses__() if "BLENDER_RENDER" in getattr(p, "COMPAT_ENGINES", ())]
     words = ("simplify", "freestyle", "gpencil", "grease_pencil")

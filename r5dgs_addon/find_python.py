@@ -1,4 +1,4 @@
-"""Finding a Python that can run the worker: likely places, and whether the one there has what rendering needs."""
+"""Search for a Python that can run the worker: candidate paths, and a check for the required packages."""
 
 import logging
 import os
@@ -15,8 +15,8 @@ from .process_group import ProcessGroup
 NEEDED = ("numpy", "torch", "numba")
 OLDEST = (3, 11)
 TIMEOUT_S = 20.0
-LOOK_S = 0.05  # between two looks at whether a search is to stop
-# Nothing is imported: finding a module's place takes milliseconds, importing torch takes seconds.
+LOOK_S = 0.05  # polling interval of the stop callback
+# `find_spec` takes milliseconds; importing torch would take seconds.
 CHECK = f"""
 import importlib.util, sys
 if sys.version_info < {OLDEST}:
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def environment() -> dict[str, str]:
-    """Environment for another Python: this process's, without what Blender set for its own."""
+    """Environment for another Python: this process's, without the variables that Blender sets for its own."""
     result = dict(os.environ)
     for name in ("PYTHONHOME", "__PYVENV_LAUNCHER__"):
         result.pop(name, None)
@@ -40,30 +40,32 @@ def environment() -> dict[str, str]:
 
 
 def candidates(beside: list[Path], home: Path | None = None) -> Iterator[str]:
-    """Pythons that are there, likeliest first, each once.
+    """Existing Python executables, most likely first, each once.
 
-    Blender's own; those of virtual environments that are active, or lie beside the extension or in the home folder
-    under the usual names; that of the command ``r5dgs``; what the system calls Python.
+    The order is: Blender's own; active virtual environments; environments with usual names beside the extension or in
+    the
+    home folder; the Python of the ``r5dgs`` command; the system's Python.
 
     Args:
-        beside: Folders that the extension calls its own.
-        home: The home folder; the user's where None.
+        beside: Folders that belong to the extension.
+        home: Home folder; the user's if None.
     """
     seen = set()
     for path in _places(beside, home or Path.home()):
-        # A virtual environment's Python is often a link to the system's: what it links to is another one.
+        # Links are not resolved: a virtual environment's Python often links to the system's, which is another
+        # environment.
         if path is not None and str(path) not in seen and path.is_file() and os.access(path, os.X_OK):
             seen.add(str(path))
             yield str(path)
 
 
 def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], bool] = lambda: False) -> str | None:
-    """The first of `candidates` that has what rendering needs, or None.
+    """Return the first of `candidates` that has the required packages, or None.
 
     Args:
         beside: As for `candidates`.
         home: As for `candidates`.
-        stopped: Whether to give up; asked again and again.
+        stopped: Callback that returns True to abort the search; polled repeatedly.
     """
     for python in candidates(beside, home):
         reason = lacking(python, stopped)
@@ -76,8 +78,8 @@ def find(beside: list[Path], home: Path | None = None, stopped: Callable[[], boo
 
 
 def lacking(python: str, stopped: Callable[[], bool] = lambda: False) -> str | None:
-    """Why a Python cannot run the worker, in a few words; None where it can."""
-    with tempfile.TemporaryFile() as said:  # the children of a wrapper script would hold a pipe open
+    """Return a short reason why a Python cannot run the worker, or None if it can."""
+    with tempfile.TemporaryFile() as said:  # a file, because child processes of a wrapper script would keep a pipe open
         try:
             group = ProcessGroup(
                 [python, "-c", CHECK],
@@ -121,7 +123,7 @@ def _places(beside: list[Path], home: Path) -> Iterator[Path | None]:
 
 
 def _inside(environment_folder: Path) -> Path:
-    """The Python of a virtual or conda environment."""
+    """Python executable of a virtual or conda environment."""
     if os.name != "nt":
         return environment_folder / "bin" / "python"
     scripts = environment_folder / "Scripts" / "python.exe"
@@ -129,7 +131,7 @@ def _inside(environment_folder: Path) -> Path:
 
 
 def _of_command(command: str | None) -> Path | None:
-    """The Python that an installed command runs with: beside it, or what its first line names."""
+    """Python of an installed command: the one beside it, or the interpreter of its shebang line."""
     if command is None:
         return None
     beside = Path(command).parent / ("python.exe" if os.name == "nt" else "python")

@@ -1,7 +1,7 @@
-"""The add-on's preferences: which Python runs the worker, and which encoder it has.
+"""Preferences of the add-on: worker Python, timeout, text encoder and trusted folders.
 
-Preferences are read and written in Blender's main thread alone; other threads get a `Choice` that was made there. The
-search for a Python touches none of Blender's data, so it runs where there is time for it.
+Preferences are read and written only in Blender's main thread. Other threads use a `Choice` created there. The search
+for a Python does not touch Blender's data, so it can run in any thread.
 """
 
 import functools
@@ -24,12 +24,12 @@ from .ui import worker_status
 ENVIRONMENT = "R5DGS_PYTHON"
 ENCODER_ENVIRONMENT = "R5DGS_TEXT_ENCODER"
 TRUSTED_ENVIRONMENT = "R5DGS_TRUSTED_FOLDERS"
-INSTALLED = "text"  # in place of a folder: the package of a small text encoder
+INSTALLED = "text"  # value of "Text Encoder" that selects the installed package with a small text encoder
 ROOT = Path(__file__).resolve().parent.parent
 
 log = logging.getLogger(__name__)
-_found: str | None = None  # what the search found in this session, "" for nothing; None before it
-_chosen: "Choice | None" = None  # what the preferences said last
+_found: str | None = None  # result of this session's search, "" if nothing was found, None before the search
+_chosen: "Choice | None" = None  # last snapshot of the preferences
 
 
 def _remember(_: bpy.types.AddonPreferences, context: bpy.types.Context) -> None:
@@ -43,15 +43,15 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
 
     worker_python: StringProperty(
         name="Worker Python",
-        description="Python with torch and numba that renders pictures. If empty: that of 'r5dgs config --user', or "
+        description="Python with torch and numba that runs the worker; if empty, the one of 'r5dgs config --user' or "
         "the first suitable one in the usual places",
         subtype="FILE_PATH",
         update=_remember,
     )
     worker_timeout: IntProperty(
         name="Timeout",
-        description="Seconds to wait for the worker's start and for each answer; the first picture compiles the "
-        "rasterizer, which takes a while",
+        description="Seconds to wait for the worker to start and to respond; the first render compiles the "
+        "rasterizer, which takes longer",
         default=120,
         min=1,
         max=3600,
@@ -60,18 +60,18 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
     )
     text_encoder: StringProperty(
         name="Text Encoder",
-        description="Folder of the encoder that made the scenes' lookup tables, for words that they do not store; "
+        description="Folder of the text encoder used for the scenes' lookup tables, for words they do not store; "
         "'text' for the installed package",
         subtype="DIR_PATH",
     )
     trusted_folders: StringProperty(
         name="Trusted Folders",
-        description=f"Folders, separated by '{os.pathsep}', from which any .blend may have scene files read; files "
-        "beside and below a .blend need none",
+        description=f"Folders from which any .blend may load scene files, separated by '{os.pathsep}'; files "
+        "next to a .blend or below it need no entry",
         update=_remember,
     )
     found_python: StringProperty(
-        name="Found Python", description="What the search for a Python found last", options={"HIDDEN"}
+        name="Found Python", description="Result of the last search for a Python", options={"HIDDEN"}
     )
 
     def draw(self, context):
@@ -96,22 +96,21 @@ class R5DGS_AP_preferences(bpy.types.AddonPreferences):
 
 
 def get() -> "R5DGS_AP_preferences | None":
-    """The preferences, or None where the add-on was registered without being enabled as an extension."""
+    """Return the preferences, or None if the add-on is registered without being enabled as an extension."""
     addon = bpy.context.preferences.addons.get(base_package)
     return addon.preferences if addon else None
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The preferences as other threads need them. Any thread may use it.
+    """Immutable snapshot of the preferences, safe to use from any thread.
 
     Attributes:
-        chosen: That of the environment, of the preferences or of ``r5dgs config --user``, in this order; "" for the
-            first one found that will do.
-        kept: What an earlier search found; "" for nothing.
-        beside: Folders that are the extension's own, where the search begins.
-        timeout_s: Seconds to wait for an answer of the worker.
-        trusted: Folders from which any .blend may have scene files read.
+        chosen: Python set by the environment, the preferences or ``r5dgs config --user``, in this order; "" to search.
+        kept: Result of an earlier search, or "".
+        beside: Folders of the extension, searched first.
+        timeout_s: Seconds to wait for a response from the worker.
+        trusted: Folders from which any .blend may load scene files.
     """
 
     chosen: str
@@ -121,7 +120,7 @@ class Choice:
     trusted: tuple[str, ...] = ()
 
     def known(self) -> str | None:
-        """The Python, where no search is needed; else None."""
+        """Return the Python if no search is needed, otherwise None."""
         if self.chosen:
             return self.chosen
         found = (self.kept or None) if _found is None else _found
@@ -130,12 +129,12 @@ class Choice:
         return found or sys.executable
 
     def python(self, stopped: Callable[[], bool] = lambda: False) -> str:
-        """The Python, searched for where need be, which may take a while; what is found is remembered.
+        """Return the Python, searching for it if needed. The search may take seconds; its result is cached.
 
-        Where nothing will do, Blender's own is named: the worker says what it lacks.
+        Falls back to Blender's own Python; the worker then reports the missing packages.
 
         Args:
-            stopped: Whether to give the search up; nothing is remembered then.
+            stopped: Callback that returns True to abort the search; its result is then not cached.
         """
         global _found
         known = self.known()
@@ -148,7 +147,7 @@ class Choice:
 
 
 def choice() -> Choice:
-    """What the preferences say at present; in another thread than Blender's main one, what they said last there."""
+    """Return a snapshot of the preferences. Outside the main thread, this is the last snapshot taken there."""
     global _chosen
     if not _may_touch_blender() and _chosen is not None:
         return _chosen
@@ -169,7 +168,7 @@ def choice() -> Choice:
 
 
 def _of_user_settings() -> str:
-    """``worker_python`` of ``r5dgs config --user``; "" if it is not set, or if the file is faulty, with a warning."""
+    """``worker_python`` of ``r5dgs config --user``, or "" if unset. A faulty file gives "" and a warning."""
     try:
         return user_settings.read().get("worker_python", "")
     except errors.ConfigError as error:
@@ -183,14 +182,14 @@ def _warn_once(message: str) -> None:
 
 
 def worker_python() -> str:
-    """Python to start the worker with, see `Choice.python`; it waits for the search."""
+    """Return the Python for the worker, see `Choice.python`. Blocks until the search has finished."""
     found = choice().python()
     keep_found()
     return found
 
 
 def text_encoder() -> str:
-    """The encoder for words that scenes do not store: the environment's, or the user's; "" for none."""
+    """Text encoder for words that scenes do not store, from the environment or the preferences; "" if unset."""
     preferences = get()
     chosen = os.environ.get(ENCODER_ENVIRONMENT, "").strip()
     if not chosen and preferences is not None:
@@ -199,14 +198,14 @@ def text_encoder() -> str:
 
 
 def keep_found() -> None:
-    """Write what the search has found into the preferences, for later sessions; only the main thread does."""
+    """Save the search result in the preferences for later sessions. Does nothing outside the main thread."""
     preferences = get() if _found is not None and _may_touch_blender() else None
     if preferences is not None and preferences.found_python != _found:
         preferences.found_python = _found
 
 
 def forget() -> None:
-    """Have the next `Choice` search again."""
+    """Discard the search result, so that the next `Choice` searches again."""
     global _found
     _found = None
     preferences = get()
@@ -215,7 +214,7 @@ def forget() -> None:
 
 
 def trust(folder: str) -> None:
-    """Add a folder to the trusted ones, for this session and, if Blender saves preferences, for later ones."""
+    """Add a trusted folder for this session, and for later ones if Blender saves its preferences."""
     preferences = get()
     if preferences is not None:
         preferences.trusted_folders = os.pathsep.join(filter(None, (preferences.trusted_folders, folder)))
@@ -229,18 +228,18 @@ def _trusted(preferences: "R5DGS_AP_preferences | None") -> tuple[str, ...]:
 
 
 def _absolute(path: str) -> str:
-    """A path that may begin with ``//``, the folder of the .blend, or with ``~``."""
-    blend = getattr(bpy.data, "filepath", "")  # none while Blender starts and registers its extensions
+    """Resolve a path that may begin with ``//`` (the .blend's folder) or ``~``."""
+    blend = getattr(bpy.data, "filepath", "")  # missing while Blender registers extensions at startup
     return str(Path(bpy.path.abspath(path, start=os.path.dirname(blend))).expanduser())
 
 
 def _may_touch_blender() -> bool:
-    """Whether this is Blender's main thread; a render in a window and what waits for the worker run in others."""
+    """True in Blender's main thread. Renders in a window and worker jobs run in other threads."""
     return threading.current_thread() is threading.main_thread()
 
 
 def _beside() -> list[Path]:
-    """Folders that are the extension's own: its code's, and what Blender gives it for files of the user."""
+    """Folders that belong to the extension: its user folder and its code."""
     try:
         own = [Path(bpy.utils.extension_path_user(base_package))]
     except ValueError:  # not enabled as an extension
@@ -249,7 +248,7 @@ def _beside() -> list[Path]:
 
 
 def register():
-    """Register the preferences' class, and read what they say for threads that may not."""
+    """Register the preferences class and take a first snapshot for other threads."""
     bpy.utils.register_class(R5DGS_AP_preferences)
     choice()
 

@@ -1,8 +1,8 @@
-"""A child process and everything that it starts, ended together.
+"""Child process that is terminated together with its descendants.
 
-A wrapper script (``conda run``, a module system, a shell script) runs the real program as a child of its own, which
-outlives the wrapper if only that is killed. On POSIX the wrapper leads a process group in a session of its own; on
-Windows it belongs to a job object, which the system also ends when Blender dies.
+A wrapper script (``conda run``, a module system, a shell script) runs the real program as its own child, which
+outlives the wrapper if only that is killed. On POSIX, the wrapper leads a process group in its own session. On
+Windows, it belongs to a job object, which the system also terminates when Blender exits.
 """
 
 import contextlib
@@ -14,13 +14,13 @@ import threading
 import time
 from typing import Any
 
-GRACE_S = 0.5  # from the request to end until the kill
+GRACE_S = 0.5  # time between SIGTERM and SIGKILL
 GONE_S = 1.0  # a killed process takes longer only inside an uninterruptible system call
 _LOOK_S = 0.01
 
 
 class ProcessGroup:
-    """A running process and its descendants. Any thread may use it.
+    """Running process and its descendants. Safe to use from any thread.
 
     Args:
         arguments: Program and arguments.
@@ -45,14 +45,14 @@ class ProcessGroup:
         """True while the first process runs."""
         if not hasattr(os, "waitid"):  # Windows, and macOS before Python 3.13
             return self.process.poll() is None
-        # `end` collects the exit status: until then the system gives the group's number to no other process.
+        # Only `end` collects the exit status: until then, the system does not reuse the process group id.
         with contextlib.suppress(ChildProcessError):
             options = os.WEXITED | os.WNOHANG | os.WNOWAIT
             return self.process.returncode is None and os.waitid(os.P_PID, self.process.pid, options) is None
         return False
 
     def end(self) -> None:
-        """End all processes within `GRACE_S` + `GONE_S` seconds, also those that ignore SIGTERM."""
+        """End all processes within `GRACE_S` + `GONE_S` seconds, including those that ignore SIGTERM."""
         with self._guard:
             if self._ended:
                 return
@@ -69,7 +69,7 @@ class ProcessGroup:
             self._ended = True
 
     def _signal(self, name: str) -> None:
-        with contextlib.suppress(ProcessLookupError, PermissionError):  # no process is left; macOS: only zombies are
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # no process left, or on macOS only zombies
             os.killpg(self.process.pid, getattr(signal, name))
 
 
@@ -89,10 +89,10 @@ class _Limits(ctypes.Structure):
 
 
 class _Job:
-    """A Windows job object: a process, and all that it starts from now on.
+    """Windows job object: a process and everything that it starts from now on.
 
     Args:
-        process: Just started.
+        process: Process that was just started.
     """
 
     _EXTENDED_LIMITS, _KILL_ON_CLOSE = 9, 0x2000
@@ -109,7 +109,7 @@ class _Job:
         self._holds = bool(self._kernel.AssignProcessToJobObject(self._handle, child))
 
     def end(self) -> None:
-        """End its processes; only the first one if the system refused to put it into the job."""
+        """Terminate all processes of the job, or only the first one if the system refused to assign it to the job."""
         if self._holds:
             self._kernel.TerminateJobObject(self._handle, 1)
         else:

@@ -1,4 +1,4 @@
-"""Cameras of a capture: the scene's own, generated rigs, and how a data set describes them."""
+"""Cameras of a capture: selection of the scene's cameras, generated rigs, and pose and intrinsics of each view."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .overrides import Overrides
 from .settings import CaptureSettings
 
 RIGS = ("AUTO", "NONE", "ARC", "RING", "HEMISPHERE")
-MIN_OWN_CAMERAS = 3  # fewer observed cameras than this say nothing about depth, so AUTO adds a rig
+MIN_OWN_CAMERAS = 3  # fewer observed cameras do not constrain depth, so AUTO adds a rig
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera under the name that the data set calls it by."""
+    """Camera with its name in the data set."""
 
     name: str
     camera: bpy.types.Object
@@ -29,23 +29,26 @@ class View:
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras of a capture; no camera is in both."""
+    """Observed and novel cameras of a capture; disjoint."""
 
     observed: tuple[View, ...]
     novel: tuple[View, ...]
 
 
 def choose(context: bpy.types.Context, settings: CaptureSettings, box: np.ndarray, overrides: Overrides) -> Views:
-    """Find the scene's cameras, and build the rig where one is wanted.
+    """Select the scene's cameras and build the rig if needed.
 
     Args:
-        context: Its scene holds the cameras.
-        settings: Names and rig.
-        box: Lowest and highest corner of what the rig should see. [2, 3]
-        overrides: Removes the rig in the end and takes changes to cameras.
+        context: Context whose scene holds the cameras.
+        settings: Camera names and rig.
+        box: Lowest and highest corner of the region that the rig should see. [2, 3]
+        overrides: Records changes to cameras and removes the rig at the end.
 
     Returns:
-        At least one observed view.
+        Views, at least one of them observed.
+
+    Raises:
+        ConfigError: No camera matches, a camera is not perspective, or the rig is invalid.
     """
     scene = context.scene
     cameras = sorted((ob for ob in scene.objects if ob.type == "CAMERA"), key=lambda ob: ob.name)
@@ -79,17 +82,17 @@ def choose(context: bpy.types.Context, settings: CaptureSettings, box: np.ndarra
 
 
 def describe(context: bpy.types.Context, camera: bpy.types.Object, width: int, height: int) -> dict[str, Any]:
-    """Pose and intrinsics of a camera at the scene's present frame.
+    """Pose and intrinsics of a camera at the scene's current frame.
 
     Args:
-        context: Gives the evaluated scene.
-        camera: A perspective camera.
+        context: Context with the evaluated scene.
+        camera: Perspective camera.
         width: Image width in pixels.
         height: Image height in pixels.
 
     Returns:
-        ``transform_matrix``, camera to world with OpenGL axes and no scale, ``camera_angle_x`` in radians, and
-        ``intrinsics`` with ``fl_x fl_y cx cy`` in pixels from the upper left corner.
+        ``transform_matrix`` (camera to world, OpenGL axes, no scale), ``camera_angle_x`` in radians, and ``intrinsics``
+        with ``fl_x fl_y cx cy`` in pixels from the upper left corner.
     """
     depsgraph = context.evaluated_depsgraph_get()
     evaluated = camera.evaluated_get(depsgraph)
@@ -122,13 +125,13 @@ def rig_poses(
     """Poses of a generated rig; novel views lie between observed ones.
 
     Args:
-        kind: "ARC" (open, centred at the azimuth), "RING" (closed) or "HEMISPHERE" (a spiral from the elevation up).
+        kind: "ARC" (open, centred at the azimuth), "RING" (closed) or "HEMISPHERE" (spiral from the elevation upwards).
         observed: Number of observed views.
         novel: Number of novel views.
-        target: Point that all look at. [3]
-        radius: Their distance from it.
+        target: Look-at point of all cameras. [3]
+        radius: Distance of the cameras from the target.
         elevation_deg: Elevation above the target.
-        elevation_spread_deg: Observed neighbours on an arc or ring differ by this in elevation.
+        elevation_spread_deg: Difference in elevation between observed neighbours on an arc or ring.
         azimuth_deg: Direction of the middle of an arc, or of a ring's first view, counter-clockwise from +X.
         arc_deg: Length of an arc.
 
@@ -158,7 +161,7 @@ def rig_poses(
 
 
 def _look_from(target: np.ndarray, radius: float, azimuth_deg: float, elevation_deg: float) -> np.ndarray:
-    """Camera-to-world matrix with OpenGL axes, upright, of a camera that looks at the target. [4, 4]"""
+    """Camera-to-world matrix (OpenGL axes) of an upright camera that looks at the target. [4, 4]"""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(min(max(elevation_deg, -89.9), 89.9))
     back = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
@@ -171,7 +174,7 @@ def _look_from(target: np.ndarray, radius: float, azimuth_deg: float, elevation_
 
 
 def _matches(camera: bpy.types.Object, wanted: str) -> bool:
-    """Whether a camera has a name, or is in a collection, of a comma-separated list of patterns."""
+    """True if the camera's name, or a collection of it, matches a comma-separated list of patterns."""
     names = [camera.name, *(collection.name for collection in camera.users_collection)]
     patterns = [pattern.strip() for pattern in wanted.split(",") if pattern.strip()]
     return any(fnmatch.fnmatchcase(name.casefold(), pattern.casefold()) for name in names for pattern in patterns)
@@ -210,7 +213,7 @@ def _build_rig(
     for prefix, poses in zip(("obs", "novel"), groups, strict=True):
         for index, pose in enumerate(poses):
             data = bpy.data.cameras.new(f"{prefix}{index}")
-            overrides.callback(bpy.data.cameras.remove, data)  # takes its object with it
+            overrides.callback(bpy.data.cameras.remove, data)  # removes the camera object, too
             data.sensor_fit = "HORIZONTAL"
             data.angle_x = fov
             data.clip_start, data.clip_end = radius * 1e-3, radius * 1e3

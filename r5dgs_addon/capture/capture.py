@@ -1,6 +1,6 @@
-"""Capture: from any .blend to a training data set in the D-NeRF layout, rendered by Cycles with exact object masks.
+"""Capture any .blend as a training data set in the D-NeRF layout, rendered by Cycles with exact object masks.
 
-One render gives the colours and the object ids of a view. Afterwards, also after an error, the scene is as it was.
+Each view is rendered once for colours and object ids. Afterwards, even after an error, the scene is restored.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from . import cameras, captured_objects, files, render
 from .overrides import Overrides
 from .settings import SPLITS, CaptureSettings
 
-MAX_OBJECTS = 32767  # the highest pass index that Blender has
+MAX_OBJECTS = 32767  # Blender's highest pass index
 
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """What a finished capture wrote.
+    """Result of a finished capture.
 
     Attributes:
         directory: Folder of the data set.
         images: Number of images of each split.
         objects: Name of each object id.
-        unseen: Names of objects that no image shows.
+        unseen: Names of objects that appear in no image.
     """
 
     directory: Path
@@ -47,9 +47,9 @@ class TimePlan:
     Attributes:
         start: Frame of t = 0.
         end: Frame of t = 1.
-        observed: Frames of train.
-        val: Frames of val.
-        test: Frames of test.
+        observed: Frames of the train split.
+        val: Frames of the val split.
+        test: Frames of the test split.
     """
 
     start: int
@@ -59,7 +59,7 @@ class TimePlan:
     test: tuple[float, ...]
 
     def time(self, frame: float) -> float:
-        """Scene time of a frame; 0 where the range is a single frame."""
+        """Scene time of a frame, or 0 if the range is a single frame."""
         return (frame - self.start) / (self.end - self.start) if self.end > self.start else 0.0
 
     @property
@@ -72,12 +72,12 @@ def plan_times(settings: CaptureSettings, scene_start: int, scene_end: int) -> T
     """Divide a frame range into the three splits.
 
     Args:
-        settings: Frame range, step, t_max and the thinning of val and test.
-        scene_start: First frame where the settings give none.
-        scene_end: Last frame where the settings give none.
+        settings: Frame range, step, t_max and the strides of val and test.
+        scene_start: First frame if the settings have none.
+        scene_end: Last frame if the settings have none.
 
     Returns:
-        The frames of each split.
+        Frames of each split.
     """
     start = scene_start if settings.frame_start is None else settings.frame_start
     end = scene_end if settings.frame_end is None else settings.frame_end
@@ -97,7 +97,7 @@ def plan_times(settings: CaptureSettings, scene_start: int, scene_end: int) -> T
 
 
 def check_settings(settings: CaptureSettings) -> None:
-    """Raise a `ConfigError` for the first setting that cannot be used."""
+    """Raise a `ConfigError` for the first invalid setting."""
     at_least_one = ("resolution_x", "resolution_y", "samples", "frame_step", "val_every", "test_every")
     for name in at_least_one:
         if getattr(settings, name) < 1:
@@ -121,7 +121,7 @@ def capture(
     settings: CaptureSettings,
     progress: Callable[[Step], None] | None = None,
 ) -> CaptureResult:
-    """Capture the context's scene to a data set folder; see `steps` for what may fail."""
+    """Capture the context's scene to a data set folder. See `steps` for the errors raised."""
     running = steps(context, settings)
     while True:
         try:
@@ -133,19 +133,19 @@ def capture(
 
 
 def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Step]:
-    """Capture image by image, so that a caller can show progress and stop in between.
+    """Capture image by image, so that the caller can show progress and stop in between.
 
     Closing the iterator early restores the scene and leaves no folder behind. Its return value is the `CaptureResult`.
 
     Args:
-        context: Its scene and view layer are captured.
-        settings: What to capture.
+        context: Context whose scene and view layer are captured.
+        settings: Capture settings.
 
     Yields:
-        The state after each image.
+        Progress after each image.
 
     Raises:
-        ConfigError: A setting is wrong, or the scene has no usable camera or object.
+        ConfigError: A setting is invalid, or the scene has no usable camera or object.
         DatasetError: The folder exists and is not empty.
         BackendError: OpenImageIO or Cycles is missing.
     """
@@ -197,7 +197,7 @@ def steps(context: bpy.types.Context, settings: CaptureSettings) -> Iterator[Ste
 
 
 def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tuple[str, float, cameras.View]]:
-    """Split, frame and view of every image, a frame's images together since changing the frame costs most."""
+    """Split, frame and view of every image, grouped by frame because changing the frame costs most."""
     picks = np.linspace(0, len(views.observed) - 1, min(test_views, len(views.observed))).round().astype(int)
     later_views = [views.observed[i] for i in picks] + list(views.novel)
     for frame in plan.frames:
@@ -212,7 +212,7 @@ def _jobs(plan: TimePlan, views: cameras.Views, test_views: int) -> Iterator[tup
 def _ground_truth(
     plan: TimePlan, survey: captured_objects.Survey, objects: tuple[captured_objects.CapturedObject, ...]
 ) -> dict:
-    """Rigid pose of every object at every captured time."""
+    """Rigid pose of every object at every captured time, as written to ``ground_truth.json``."""
     rows = [
         {"name": o.name, "id": o.id, "matrices": [m.tolist() for m in captured_objects.poses(survey, o)]}
         for o in objects

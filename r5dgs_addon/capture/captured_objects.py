@@ -1,4 +1,4 @@
-"""What counts as an object in a capture, its id, and its rigid pose at every captured time."""
+"""Objects of a capture: grouping of Blender objects, ids, and rigid poses at every captured time."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ DEFORMERS = {"ARMATURE", "CLOTH", "SOFT_BODY", "MESH_CACHE", "MESH_SEQUENCE_CACH
 
 @dataclass(frozen=True)
 class Survey:
-    """The scene's objects followed along time.
+    """Transforms and bounding boxes of the scene's objects over time.
 
     Attributes:
-        frames: Captured frames, increasing. T of them
-        matrices: World matrix of everything that renders and of its ancestors. [T, 4, 4] each
-        corners: Corners of the bounding box of everything that renders, world. [T, 8, 3] each
-        moving: Whatever of these changes its world matrix in the frame range.
-        deforming: What renders and may change its shape.
+        frames: The T captured frames, increasing.
+        matrices: World matrices of every rendered object and its ancestors. [T, 4, 4] each
+        corners: World-space bounding box corners of every rendered object. [T, 8, 3] each
+        moving: Keys of ``matrices`` whose world matrix changes within the frame range.
+        deforming: Rendered objects whose shape may change.
     """
 
     frames: tuple[float, ...]
@@ -38,18 +38,18 @@ class Survey:
 
     @property
     def animated(self) -> frozenset[bpy.types.Object]:
-        """What renders and moves or deforms."""
+        """Rendered objects that move or deform."""
         return (self.moving & self.corners.keys()) | self.deforming
 
 
 @dataclass(frozen=True)
 class CapturedObject:
-    """One object of the data set, made of one or more Blender objects.
+    """Object of the data set, made of one or more Blender objects.
 
     Attributes:
         id: Value in the masks, from 1.
         name: Name in ``objects.json``.
-        root: Blender object whose pose is the object's.
+        root: Blender object that defines the pose.
         members: Blender objects that carry the id.
     """
 
@@ -60,15 +60,15 @@ class CapturedObject:
 
 
 def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Overrides) -> Survey:
-    """Play the scene once, every whole frame in order so that simulations run, and note where things are.
+    """Play the scene once and record transforms and bounding boxes. All whole frames are visited, for simulations.
 
     Args:
-        context: Its scene and view layer.
-        frames: Captured frames, increasing. T of them
-        overrides: Takes the changes: what renders is also shown, or it would not be evaluated.
+        context: Context with the scene and view layer.
+        frames: The T captured frames, increasing.
+        overrides: Records the changes: rendered objects are also shown in the viewport, or they would not be evaluated.
 
     Returns:
-        The survey. The scene is left at another frame.
+        The survey. The scene's current frame changes.
     """
     scene = context.scene
     geometry: list[bpy.types.Object] = []
@@ -109,21 +109,27 @@ def survey(context: bpy.types.Context, frames: tuple[float, ...], overrides: Ove
 
 
 def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: str) -> tuple[CapturedObject, ...]:
-    """Decide what the objects are.
+    """Group Blender objects into the objects of the data set.
 
-    What hangs from one parent is one object, unless something under that parent is none (then the parent is a handle
-    of the whole scene), or the part moves while the parent stands (then they are not one rigid thing). With
-    "PASS_INDEX", equal indices are one object and are its id; else ids count from 1 in the order of names, so that
-    they stay the same from capture to capture.
+    Objects with a common parent form one object. Exceptions: the parent also has descendants that belong to no object
+    (it
+    is then a handle of the whole scene), or a child moves while the parent is still (they are then not rigidly
+    connected).
+    With "PASS_INDEX", equal indices form one object and give its id. Otherwise ids count from 1 in the order of names,
+    so
+    that they stay the same between captures.
 
     Args:
-        layer: Holds the selection.
-        survey: The scene's objects followed along time.
+        layer: View layer with the selection.
+        survey: Survey of the scene.
         choice: One of `CHOICES`.
-        collection: Name of the collection for "COLLECTION"; its child collections are an object each.
+        collection: Name of the collection for "COLLECTION"; each of its child collections is one object.
 
     Returns:
-        The objects, ordered by id; at least one.
+        Objects ordered by id, at least one.
+
+    Raises:
+        ConfigError: The collection is missing, or no object matches.
     """
     geometry = set(survey.corners)
     if choice == "AUTO":
@@ -162,14 +168,14 @@ def choose(layer: bpy.types.ViewLayer, survey: Survey, choice: str, collection: 
 
 
 def assign_ids(objects: tuple[CapturedObject, ...], overrides: Overrides) -> None:
-    """Give every Blender object the id of its object as pass index, and 0 to the rest, until the overrides end."""
+    """Set the pass index of every Blender object to its object's id, or 0, until the overrides end."""
     ids = {member: captured.id for captured in objects for member in captured.members}
     for ob in bpy.data.objects:
         overrides.set(ob, "pass_index", ids.get(ob, 0))
 
 
 def poses(survey: Survey, captured: CapturedObject) -> np.ndarray:
-    """Rigid pose of an object at each captured frame: its root's location and nearest rotation, no scale. [T, 4, 4]"""
+    """Rigid pose of an object at each captured frame: location and nearest rotation of its root. [T, 4, 4]"""
     matrices = survey.matrices[captured.root].copy()
     linear = matrices[:, :3, :3]
     sign = np.where(np.linalg.det(linear) < 0, -1.0, 1.0)[:, None, None]
@@ -180,7 +186,7 @@ def poses(survey: Survey, captured: CapturedObject) -> np.ndarray:
 
 
 def bounds(survey: Survey, objects: tuple[CapturedObject, ...]) -> np.ndarray:
-    """Box about all objects at all captured times: lowest and highest corner. [2, 3]"""
+    """Bounding box of all objects over all captured times: lowest and highest corner. [2, 3]"""
     corners = np.concatenate([survey.corners[m].reshape(-1, 3) for o in objects for m in o.members])
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
@@ -194,7 +200,7 @@ def _rendered_collections(layer_collection: bpy.types.LayerCollection) -> Iterat
 
 
 def _is_hidden(ob: bpy.types.Object) -> bool:
-    """Whether it never renders; where that is animated it may."""
+    """True if the object never renders. An object with animation data may become visible."""
     if not ob.hide_render:
         return False
     return ob.animation_data is None or ob.animation_data.action is None
@@ -206,7 +212,7 @@ def _deforms(ob: bpy.types.Object) -> bool:
 
 
 def _ancestors(ob: bpy.types.Object) -> list[bpy.types.Object]:
-    """Parents from the nearest to the farthest."""
+    """Parents from nearest to farthest."""
     found = []
     while ob.parent is not None:
         ob = ob.parent
@@ -219,7 +225,7 @@ def _is_selected(ob: bpy.types.Object, layer: bpy.types.ViewLayer) -> bool:
 
 
 def _roots(survey: Survey, chosen: set[bpy.types.Object]) -> dict[bpy.types.Object, bpy.types.Object]:
-    """For each chosen object the highest parent that it shares its fate with."""
+    """Map each chosen object to the highest ancestor that belongs to the same data set object."""
     others = set(survey.corners) - chosen
     outsiders = {ancestor for other in others for ancestor in (other, *_ancestors(other))}
     roots = {}

@@ -1,4 +1,4 @@
-"""Files of a captured data set: PNG images and masks, JSON, and a folder that appears only when it is complete."""
+"""Files of a captured data set: PNG images and masks, JSON, and atomic creation of the folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ...r5dgs_core import errors
 
 
 def require_openimageio() -> Any:
-    """The OpenImageIO module, or a `BackendError` that says how to get it."""
+    """Return the OpenImageIO module. Raises BackendError with installation instructions if it is missing."""
     try:
         import OpenImageIO
     except ImportError as error:
@@ -28,7 +28,7 @@ def require_openimageio() -> Any:
 
 
 def _images() -> Any:
-    """The core's image files, which need OpenImageIO; so they are imported when the first one is read or written."""
+    """Import the core's `images` module on first use, because it requires OpenImageIO."""
     require_openimageio()
     from ...r5dgs_core.data import images
 
@@ -37,13 +37,13 @@ def _images() -> Any:
 
 @contextmanager
 def new_folder(directory: Path) -> Iterator[Path]:
-    """A temporary folder beside ``directory`` that takes its name at the end; after an error nothing is left of it."""
+    """Create a temporary folder that is renamed to ``directory`` on success and removed after an error."""
     directory = directory.absolute()
     _check_free(directory)
     temporary = directory.with_name(f".{directory.name}.{secrets.token_hex(8)}.partial")
     try:
         temporary.parent.mkdir(parents=True, exist_ok=True)
-        temporary.mkdir()  # a folder of this process alone, as the name is new
+        temporary.mkdir()  # the name is unique, so the folder belongs to this process alone
     except OSError as error:
         raise errors.DatasetError(f"{directory}: cannot write the data set: {error}") from error
     try:
@@ -71,9 +71,9 @@ def write_view(folder: Path, stem: str, image: np.ndarray, ids: np.ndarray, *, w
     Args:
         folder: Folder of the data set.
         stem: Split and name without extension, such as "train/r_0000".
-        image: Display sRGB, alpha straight. [H, W, 3 or 4] uint8
+        image: Display sRGB, straight alpha. [H, W, 3 or 4] uint8
         ids: Object of each pixel, 0 for the background. [H, W]
-        wide: Write the mask in 16 bits.
+        wide: True for a 16-bit mask.
     """
     images = _images()
     images.write_png(folder / f"{stem}.png", image)
@@ -81,14 +81,14 @@ def write_view(folder: Path, stem: str, image: np.ndarray, ids: np.ndarray, *, w
 
 
 def read_png(path: Path) -> np.ndarray:
-    """Read a PNG's stored integers, alpha straight. [H, W, C] uint8 or uint16"""
+    """Read the stored integers of a PNG, straight alpha. [H, W, C] uint8 or uint16"""
     return _images().read_png(path)
 
 
 def read_exr_channel(path: Path, endings: tuple[str, ...]) -> np.ndarray:
-    """Read the one channel whose name ends so from any part of a multilayer EXR. [H, W] float32
+    """Read the channel whose name has one of the endings from any part of a multilayer EXR. [H, W] float32
 
-    Blender 4 writes all passes as one part, Blender 5 a part for each, and the names of passes differ too.
+    Blender 4 writes all passes as one part, Blender 5 one part per pass; pass names differ, too.
     """
     oiio = require_openimageio()
     source = oiio.ImageInput.open(str(path))
@@ -110,9 +110,9 @@ def read_exr_channel(path: Path, endings: tuple[str, ...]) -> np.ndarray:
 
 
 def write_transforms(folder: Path, split: str, header: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Write ``transforms_<split>.json``; a split without images has no file.
+    """Write ``transforms_<split>.json``, unless the split has no images.
 
-    ``camera_angle_x`` is the first frame's; a frame whose intrinsics that does not describe keeps its own.
+    The global ``camera_angle_x`` is that of the first frame. A frame with other intrinsics stores its own.
     """
     if not frames:
         return
@@ -132,7 +132,7 @@ def write_transforms(folder: Path, split: str, header: dict[str, Any], frames: l
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:
-    """Write JSON with one frame or object per line: small, and readable in a diff."""
+    """Write JSON with one frame or object per line, for compact and readable diffs."""
     members = []
     for key, item in value.items():
         text = json.dumps(item, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Changes to the user's data that are undone in the end, also after an error."""
+"""Temporary changes to the user's data, undone at the end, even after an error."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import bpy
 
 
 class Overrides(ExitStack):
-    """A context in which attributes are changed for a while; leaving it puts all of them back, the latest first."""
+    """Context manager that restores all changed attributes on exit, in reverse order."""
 
     def set(self, owner: Any, name: str, value: Any) -> None:
-        """Set ``owner.name`` until the end. Attributes that this Blender does not have are left out."""
+        """Set ``owner.name`` until the context exits. Does nothing if this Blender version lacks the attribute."""
         if not hasattr(owner, name):
             return
         self.callback(setattr, owner, name, getattr(owner, name))
         setattr(owner, name, value)
 
     def keep_image_format(self, settings: bpy.types.ImageFormatSettings) -> None:
-        """Keep a scene's output format; what may be chosen depends on what stands before, so the order is fixed."""
+        """Restore a scene's output format on exit, in a fixed order: earlier settings limit later ones."""
         names = (
             *("media_type", "file_format", "color_mode", "color_depth"),
             *("compression", "exr_codec", "color_management"),

@@ -1,4 +1,4 @@
-"""One render of Cycles gives the colours of a view, as Blender shows them, and the object id of every pixel."""
+"""Cycles render of a view: display colours, as Blender shows them, and object id of every pixel."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ SWITCHED_OFF = (
 
 
 def prepare(context: bpy.types.Context, settings: CaptureSettings, overrides: Overrides) -> Path:
-    """Set the scene up for `render_view` until the overrides end.
+    """Set up the scene for `render_view` until the overrides end.
 
     Args:
-        context: Its scene and view layer are rendered.
+        context: Context whose scene and view layer are rendered.
         settings: Resolution, samples, film and colour.
-        overrides: Takes every change.
+        overrides: Records every change.
 
     Returns:
-        A folder for temporary files that goes with the overrides.
+        Folder for temporary files, removed when the overrides end.
     """
     scene, layer = context.scene, context.view_layer
     render, change = scene.render, overrides.set
@@ -72,7 +72,7 @@ def prepare(context: bpy.types.Context, settings: CaptureSettings, overrides: Ov
     if settings.view_transform:
         try:
             change(scene.display_settings, "display_device", "sRGB")
-            change(scene.view_settings, "look", "None")  # before the transform, so that it is put back after it
+            change(scene.view_settings, "look", "None")  # before the view transform, so that it is restored after it
             change(scene.view_settings, "view_transform", settings.view_transform)
         except TypeError as error:
             raise errors.ConfigError(f"capture.view_transform: {error}") from error
@@ -84,18 +84,21 @@ def prepare(context: bpy.types.Context, settings: CaptureSettings, overrides: Ov
 def render_view(
     context: bpy.types.Context, camera: bpy.types.Object, transparent: bool, folder: Path
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render the scene's present frame from a camera.
+    """Render the scene's current frame from a camera.
 
-    The colours are what Blender itself writes into a PNG, so that its view transform applies to the last bit.
+    Colours are read from a PNG written by Blender, so that its view transform is reproduced exactly.
 
     Args:
-        context: Its scene was set up by `prepare`.
-        camera: The camera.
-        transparent: Keep alpha.
+        context: Context whose scene was set up by `prepare`.
+        camera: Camera to render from.
+        transparent: True to keep alpha.
         folder: Folder for temporary files.
 
     Returns:
         Display sRGB with straight alpha [H, W, 3 or 4] uint8, and object ids [H, W] int32.
+
+    Raises:
+        BackendError: Cycles failed.
     """
     scene = context.scene
     exr, png = folder / "passes.exr", folder / "color.png"
@@ -122,7 +125,7 @@ def render_view(
 
 
 def _set_format(settings: bpy.types.ImageFormatSettings, file_format: str, depth: str, mode: str) -> None:
-    if hasattr(settings, "media_type"):  # Blender 5: decides which file formats there are
+    if hasattr(settings, "media_type"):  # Blender 5: media type determines the available file formats
         settings.media_type = "MULTI_LAYER_IMAGE" if file_format == "OPEN_EXR_MULTILAYER" else "IMAGE"
     settings.file_format = file_format
     settings.color_mode = mode
@@ -131,7 +134,7 @@ def _set_format(settings: bpy.types.ImageFormatSettings, file_format: str, depth
 
 @contextmanager
 def _quiet_stdout() -> Iterator[None]:
-    """Keep the lines that Cycles prints for every step out of a background Blender's output."""
+    """Suppress the lines that Cycles prints for every step in background mode."""
     if not bpy.app.background:
         yield
         return

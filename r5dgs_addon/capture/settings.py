@@ -10,41 +10,41 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What to capture; every default suits a scene that was never meant for it.
+    """Settings of a capture. The defaults suit scenes that were not made for capturing.
 
     Attributes:
-        directory: Folder of the data set; absent or empty.
+        directory: Folder of the data set; missing or empty.
         resolution_x: Image width in pixels.
         resolution_y: Image height in pixels.
         samples: Cycles samples per pixel.
-        denoise: Denoise with OpenImageDenoise.
-        transparent: Write RGBA images with a transparent sky.
-        seed: Sampling seed of the first image; later ones count on from it.
+        denoise: True to denoise with OpenImageDenoise.
+        transparent: True to write RGBA images with a transparent sky.
+        seed: Sampling seed of the first image, incremented for each image.
         view_transform: Blender's view transform; "Standard" is plain sRGB, "" keeps the scene's.
         device: Cycles device, "CPU" or "GPU".
         frame_start: Frame of t = 0; None for the scene's.
         frame_end: Frame of t = 1; None for the scene's.
-        frame_step: Captured frames are this far apart.
-        t_max: Frames up to this time are observed (train and val), later ones are test.
-        val_every: Novel views are rendered at every n-th observed time.
-        val_between: Novel views are also rendered half-way between observed times.
-        test_every: Every n-th later time is rendered.
-        test_views: Number of observed views in test, beside all novel ones.
+        frame_step: Number of frames from one captured frame to the next.
+        t_max: Last observed time; earlier frames are train and val, later ones test.
+        val_every: Stride of the observed times that are rendered from novel views.
+        val_between: True to render novel views half-way between observed times, too.
+        test_every: Stride of the times after t_max that are rendered.
+        test_views: Number of observed views in test, in addition to all novel ones.
         observed: Names of the observed cameras: patterns such as "cam*, left", or a collection; "" for all.
         novel: The same for the novel cameras.
-        rig: Generated cameras: "NONE", "ARC", "RING", "HEMISPHERE", or "AUTO": an arc about the scene camera where
-            the scene has fewer than three observed cameras of its own.
+        rig: Generated cameras: "NONE", "ARC", "RING", "HEMISPHERE", or "AUTO", which adds an arc around the scene
+            camera if the scene has fewer than three observed cameras.
         rig_observed: Number of generated observed cameras.
         rig_novel: Number of generated novel cameras.
-        rig_target: Point, or name of the object, that the rig looks at; "" for the middle of the objects.
-        rig_radius: Distance of the rig from its target; 0 for one that sees all objects.
+        rig_target: Point, or name of the object, that the rig looks at; "" for the centre of the objects.
+        rig_radius: Distance of the rig from its target; 0 to fit all objects into view.
         rig_elevation_deg: Elevation of the rig above its target.
-        rig_elevation_spread_deg: Neighbours on an arc or ring differ by this much in elevation.
+        rig_elevation_spread_deg: Difference in elevation between neighbours on an arc or ring.
         rig_azimuth_deg: Direction of the middle of the arc, counter-clockwise from +X; -90 is Blender's front.
         rig_arc_deg: Length of the arc.
         rig_fov_deg: Horizontal field of view of the rig.
-        objects: What counts as an object: "PASS_INDEX", "COLLECTION", "SELECTED", "ANIMATED", or "AUTO": by pass index
-            where any is set, else what is animated or selected.
+        objects: Selection of objects: "PASS_INDEX", "COLLECTION", "SELECTED", "ANIMATED", or "AUTO": by pass index if
+            any is set, else animated objects, else selected ones.
         object_collection: Collection for "COLLECTION".
     """
 

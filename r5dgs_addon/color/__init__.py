@@ -1,1 +1,1 @@
-"""Colour management: view transforms, their inverses and the loss of the inversion."""
+"""Colour management: view transforms, their inverses and the error of the inversion."""

@@ -1,8 +1,8 @@
-"""Colours of the worker as Blender's scene-linear ones, such that the view transform gives back what was trained.
+"""Conversion of worker images to Blender's scene-linear colours, so that the view transform restores them.
 
-A picture of the core is display-referred sRGB. Blender's view transform *Standard* is sRGB's transfer function, so its
-inverse is what a render result has to hold. Under others (AgX, Filmic), or with a look, an exposure or curves, the
-inverse is a table of `view_transform`; where it is switched off or too coarse, `objections` says so.
+Images of the core are display-referred sRGB. Blender's view transform *Standard* is the sRGB transfer function, so a
+render result must hold its inverse. For other transforms (AgX, Filmic), looks, exposure or curves, the inverse is a
+table of `view_transform`. If that is disabled or too inaccurate, `objections` lists the reasons.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from . import view_transform
 
 STANDARD = "Standard"
 FAIR = view_inverse.VISIBLE / view_inverse.STEP
-WIDE = 0.9  # a view that reaches less of the table leaves saturated colours pale
-POOR = 25.0  # a view with such an inverse (*False Color*) has none worth the name
+WIDE = 0.9  # minimum share of displayable colours reached by the view; below it, saturated colours look pale
+POOR = 25.0  # maximum error in steps of 1/255; worse inverses (*False Color*) are not used
 
 
 def scene_linear(
@@ -26,18 +26,19 @@ def scene_linear(
     alpha: np.ndarray | None = None,  # [H, W]
     inverse: view_inverse.Inverse | None = None,
 ) -> np.ndarray:  # [H, W, 4]
-    """A picture as Blender's *Combined* pass, alpha premultiplied.
+    """Convert an image to Blender's *Combined* pass, with premultiplied alpha.
 
-    Colours over 1 stay over 1, without an inverse. The picture was blended as it is displayed; so the colour that is
-    made linear is that of the pixel without its alpha, which then saves as straight alpha with the picture's own bytes.
+    Without an inverse, colours above 1 stay above 1. Images are blended in display space. Therefore the straight colour
+    is
+    linearised and then premultiplied; saved with straight alpha, the image gets its original bytes back.
 
     Args:
-        color: Display-referred sRGB, >= 0; multiplied by alpha where there is one. [H, W, 3]
-        alpha: Coverage, or None for an opaque picture. [H, W]
-        inverse: Of the view transform; of *Standard* where None.
+        color: Display-referred sRGB, >= 0, premultiplied if ``alpha`` is given. [H, W, 3]
+        alpha: Coverage, or None for an opaque image. [H, W]
+        inverse: Inverse of the view transform, or None for *Standard*.
 
     Returns:
-        Scene-linear RGBA, float32, rows as they came. [H, W, 4]
+        Scene-linear RGBA, float32, in the same row order. [H, W, 4]
     """
     result = np.ones((*color.shape[:2], 4), np.float32)
     straight = np.maximum(np.asarray(color, np.float32), 0)
@@ -54,27 +55,27 @@ def scene_linear(
 
 
 def inverts(scene: bpy.types.Scene) -> bool:
-    """Whether a scene's view is to be inverted by a table."""
+    """True if the scene's view transform is inverted by a table."""
     return render_settings.of(scene).as_trained and view_transform.can(scene) and bool(differences(scene))
 
 
 def inverse(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
-    """The inverse of a scene's view, or None: it needs none, has none, or has none yet, and then gets it soon."""
+    """Inverse of the scene's view transform, or None if not needed, unusable, or not yet computed (then scheduled)."""
     found = view_transform.want(scene) if inverts(scene) else None
     return found if found is not None and found.error <= POOR else None
 
 
 def wait_for_inverse(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> view_inverse.Inverse | None:
-    """As `inverse`, and one that it has not yet is made or waited for, unless ``stopped`` says that nobody does."""
+    """Like `inverse`, but compute a missing table or wait for it until ``stopped`` returns True."""
     if inverts(scene):
         view_transform.wait(scene, stopped)
     return inverse(scene)
 
 
 def objections(scene: bpy.types.Scene) -> list[str]:
-    """Why colours do not come out as trained under a scene's colour management, in a few words each; else empty.
+    """Reasons why a scene's colour management does not reproduce the trained colours; empty if it does.
 
-    While the inverse of a view is still to be made, the view is objected to.
+    Until the inverse of a view transform has been computed, the view transform is listed.
     """
     found, made = differences(scene), inverse(scene)
     if made is not None:
@@ -83,7 +84,7 @@ def objections(scene: bpy.types.Scene) -> list[str]:
 
 
 def _saves_otherwise(scene: bpy.types.Scene) -> bool:
-    """Whether files are written with another view than the scene's (Output > Color Management > Override)."""
+    """True if files are saved with another view than the scene's (Output > Color Management > Override)."""
     output, view = scene.render.image_settings, scene.view_settings
     if output.color_management != "OVERRIDE":
         return False
@@ -92,7 +93,7 @@ def _saves_otherwise(scene: bpy.types.Scene) -> bool:
 
 
 def differences(scene: bpy.types.Scene) -> list[str]:
-    """What in a scene's colour management is not as *Standard* is by itself, in a few words each; else empty."""
+    """Settings of a scene's colour management that differ from plain *Standard*, as short phrases."""
     view, found = scene.view_settings, []
     if view.view_transform != STANDARD:
         found.append(f"view transform {view.view_transform}")
@@ -110,10 +111,10 @@ def differences(scene: bpy.types.Scene) -> list[str]:
 
 
 def show_as_trained(scene: bpy.types.Scene) -> None:
-    """Set a scene's colour management such that it has no `objections`."""
+    """Change a scene's colour management so that `objections` is empty."""
     view = scene.view_settings
     scene.render.image_settings.color_management = "FOLLOW_SCENE"
     view.view_transform, view.exposure, view.gamma, view.use_curve_mapping = STANDARD, 0.0, 1.0, False
-    view.look = "None"  # after the view transform, which decides what looks there are
+    view.look = "None"  # after the view transform, which determines the available looks
     if hasattr(view, "use_white_balance"):
         view.use_white_balance = False

@@ -1,8 +1,8 @@
-"""Loss of the loaded scenes' colours under a view transform that is inverted: how far they come out, and how many not.
+"""Colour loss of the loaded scenes under an inverted view transform.
 
-Pictures blend many Gaussians, and saturated ones that a view cannot reach vanish among others. So the colours that are
-measured are means over small cells of space, weighted with opacity and size; on the tabletop and kitchen scenes their
-PSNR is within a few dB of that of pictures.
+Images blend many Gaussians, which hides a few saturated ones that the view transform cannot reach. Therefore the loss
+is measured on mean colours of small spatial cells, weighted by opacity and size. On the tabletop and kitchen scenes,
+its PSNR is within a few dB of that of rendered images.
 """
 
 import functools
@@ -15,21 +15,21 @@ from ..scene import loaded_scenes, point_clouds
 from ..ui import status_bar
 from . import display_to_linear, view_transform
 
-ENOUGH_DB = 40.0  # below it, the loss is worth a warning
-_CELL = 0.02  # of the extent of what is loaded
-_FARTHEST = 1 << 20  # cells from the middle: numbers of three axes fit into 64 bits
+ENOUGH_DB = 40.0  # threshold of the warning (dB)
+_CELL = 0.02  # cell size, as a fraction of the extent of the loaded scenes
+_FARTHEST = 1 << 20  # maximum cell index, so that the indices of three axes fit into 64 bits
 _DELAY_S = 0.1
 
 _Scenes = tuple[tuple[int, int], ...]  # session_uid and number of Gaussians of each
 _Key = tuple[view_transform.Management, _Scenes]
-_known: dict[_Key, view_inverse.Loss | None] = {}  # None if it could not be measured
-_cells: dict[_Scenes, tuple[np.ndarray, np.ndarray]] = {}  # of the last scenes: no view changes their colours
+_known: dict[_Key, view_inverse.Loss | None] = {}  # None if the measurement failed
+_cells: dict[_Scenes, tuple[np.ndarray, np.ndarray]] = {}  # independent of the view transform
 
 
 def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
-    """The loss under a scene's view; None if that needs no inverse or has none.
+    """Measure the loss under a scene's view transform, or return None if it needs no inverse or has none.
 
-    It makes data for a moment, and is for Blender's main thread alone.
+    Creates temporary data-blocks, so it must run in Blender's main thread.
     """
     inverse = display_to_linear.wait_for_inverse(scene, lambda: False)
     collections = _collections(scene)
@@ -49,7 +49,7 @@ def measure(scene: bpy.types.Scene) -> view_inverse.Loss | None:
 
 
 def known(scene: bpy.types.Scene) -> view_inverse.Loss | None:
-    """The loss if it was measured already; else a timer measures it soon, as drawing must not make data."""
+    """Return the loss if cached; otherwise schedule its measurement, because drawing must not create data."""
     collections = _collections(scene)
     if not collections or display_to_linear.inverse(scene) is None:
         return None
@@ -60,7 +60,7 @@ def known(scene: bpy.types.Scene) -> view_inverse.Loss | None:
 
 
 def note(loss: view_inverse.Loss) -> str:
-    """A loss in a few words."""
+    """Format a loss for the user."""
     return f"about {loss.psnr:.0f} dB, {loss.unreached:.1%} of the colors out of its reach"
 
 
@@ -104,7 +104,7 @@ def _colors(collections: list[bpy.types.Collection]) -> tuple[np.ndarray, np.nda
 
 
 def _read(data: list[bpy.types.PointCloud], name: str, field: str, width: int) -> np.ndarray:
-    """An attribute of some clouds, one after the other. [N, width]"""
+    """Concatenated values of an attribute of several point clouds. [N, width]"""
     parts = [np.zeros((0, width), np.float32)]
     for cloud in data:
         attribute = cloud.attributes.get(name)
@@ -116,7 +116,7 @@ def _read(data: list[bpy.types.PointCloud], name: str, field: str, width: int) -
 
 
 def unregister() -> None:
-    """Forget what was measured."""
+    """Stop the timer and clear the caches."""
     if bpy.app.timers.is_registered(_measure_shown):
         bpy.app.timers.unregister(_measure_shown)
     _known.clear()

@@ -1,8 +1,8 @@
-"""View transforms of Blender scenes, inverted, so that colours come out as trained under AgX, Filmic and others, too.
+"""Inverse tables of Blender's view transforms, which preserve trained colours under AgX, Filmic and others.
 
-The table is made from samples that Blender itself displays, whatever configuration of OpenColorIO it has. Sampling
-makes data, and so is for Blender's own thread; it takes about a second, once for each colour management that is used.
-With a window a timer makes the table when it is wanted, and a render, in a thread of its own, waits for it.
+Tables are computed from samples that Blender itself displays, for any OpenColorIO configuration. Sampling creates
+data-blocks, so it runs in Blender's main thread. It takes about a second per colour management. With a window, a timer
+computes requested tables; a render, which runs in another thread, waits for them.
 """
 
 import functools
@@ -22,18 +22,18 @@ from ...r5dgs_core.color import view_inverse
 from .. import compat
 from ..ui import status_bar
 
-DISPLAY = "sRGB"  # what pictures were trained for
-LOOK_S = 0.25  # between two looks at what is wanted
-REST_S = 0.3  # what a viewport wants is made when it has wanted nothing else for so long: sliders move
-WAIT_S = 30.0  # a render waits no longer
-KEPT = 4  # tables, of half a megabyte and curves of one
+DISPLAY = "sRGB"  # display device of the training images
+LOOK_S = 0.25  # timer interval
+REST_S = 0.3  # delay after the last viewport request, because sliders change continuously
+WAIT_S = 30.0  # maximum wait of a render
+KEPT = 4  # number of cached tables (half a megabyte each, curves one megabyte)
 
 _log = logging.getLogger(__name__)
-_WIDTH = 512  # of images of samples
+_WIDTH = 512  # width of the sample images (px)
 _CURVES = ("tone", "extend", "use_clip")
 _LEVELS = ("black_level", "white_level")
 
-# Linear Rec.709 to the other scene-linear spaces that a .blend can have (ACEScg adapted to its white by Bradford).
+# Matrices from linear Rec.709 to the other working spaces of a .blend (ACEScg white adapted by Bradford).
 _WORKING_SPACES = {
     "Linear Rec.2020": (
         (0.6274039, 0.3292830, 0.0433131),
@@ -50,17 +50,17 @@ _WORKING_SPACES = {
 
 @dataclass(frozen=True)
 class Management:
-    """The settings that decide how colours are displayed; equal where they are displayed alike.
+    """Settings that determine the displayed colours. Equal instances display colours alike.
 
     Attributes:
         space: Scene-linear color space of the .blend.
-        device: The display.
-        transform: The view transform.
-        look: The look.
-        exposure: In stops.
-        gamma: The gamma.
-        curves: Settings of the curves and their points, or None where they are off.
-        balance: Settings of the white balance, or None where it is off.
+        device: Display device.
+        transform: View transform.
+        look: Look.
+        exposure: Exposure in stops.
+        gamma: Gamma.
+        curves: Curve settings and points, or None if curves are off.
+        balance: White balance settings, or None if it is off.
     """
 
     space: str
@@ -73,11 +73,11 @@ class Management:
     balance: tuple | None
 
     def apply(self, scene: bpy.types.Scene) -> None:
-        """Give a scene these settings; one that is new, with straight curves."""
+        """Apply the settings to a new scene, whose curves are still straight."""
         scene.display_settings.display_device = self.device
         view = scene.view_settings
         view.view_transform = self.transform
-        view.look = self.look  # after the view transform, which decides what looks there are
+        view.look = self.look  # after the view transform, which determines the available looks
         view.exposure, view.gamma = self.exposure, self.gamma
         if self.balance is not None:
             view.use_white_balance = True
@@ -97,7 +97,7 @@ class Management:
 
 
 def of(scene: bpy.types.Scene) -> Management:
-    """The settings of a scene."""
+    """Return the settings of a scene."""
     view, curves, balance = scene.view_settings, None, None
     if view.use_curve_mapping:
         mapping = view.curve_mapping
@@ -114,24 +114,24 @@ def of(scene: bpy.types.Scene) -> Management:
 
 
 def in_space(linear: np.ndarray, space: str) -> np.ndarray:
-    """Linear Rec.709, in which inverses are made and given, in a scene-linear space of a .blend. [..., 3]"""
+    """Convert linear Rec.709, the space of all inverse tables, to a scene-linear space of a .blend. [..., 3]"""
     matrix = _WORKING_SPACES.get(space)
     return linear if matrix is None else linear @ np.array(matrix, np.float32).T
 
 
-_inverses: dict[Management, view_inverse.Inverse | None] = {}  # None where Blender could not display samples
-_wanted: dict[Management, float] = {}  # what the timer shall make, and from when on
+_inverses: dict[Management, view_inverse.Inverse | None] = {}  # None if Blender could not display the samples
+_wanted: dict[Management, float] = {}  # requested tables and the time from which the timer computes them
 
 
 def can(scene: bpy.types.Scene) -> bool:
-    """Whether the display of a scene is one that tables are made for."""
+    """True if tables support the scene's display device."""
     return scene.display_settings.display_device == DISPLAY
 
 
 def want(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
-    """The inverse where it is made already; where it is not, the timer makes it when nothing else is wanted.
+    """Return the inverse if cached; otherwise request it from the timer, replacing any earlier request.
 
-    No data is written, so drawing may call it.
+    Writes no Blender data, so draw callbacks may call it.
     """
     management = of(scene)
     neutral = _neutral(management)
@@ -143,11 +143,11 @@ def want(scene: bpy.types.Scene) -> view_inverse.Inverse | None:
 
 
 def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> None:
-    """Have the inverse of a scene's view made, now where this is Blender's own thread, else in time or not.
+    """Compute the inverse of a scene's view in the main thread, or wait for the timer for up to `WAIT_S`.
 
     Args:
-        scene: Evaluated or not.
-        stopped: Whether to wait no longer; called often.
+        scene: Original or evaluated scene.
+        stopped: Callback that returns True to stop waiting; polled often.
     """
     neutral = _neutral(of(scene))
     if neutral not in _inverses and (bpy.app.background or threading.current_thread() is threading.main_thread()):
@@ -159,18 +159,18 @@ def wait(scene: bpy.types.Scene, stopped: Callable[[], bool]) -> None:
 
 
 def _neutral(management: Management) -> Management:
-    """The settings that a table is made for: an exposure is a factor of the scene's colours, but for curves."""
+    """Settings of the table to use: exposure only scales scene-linear colours, unless curves are active."""
     return management if management.curves else replace(management, exposure=0.0)
 
 
 @functools.lru_cache(maxsize=KEPT)
 def _exposed(inverse: view_inverse.Inverse, exposure: float) -> view_inverse.Inverse:
-    """The inverse of a view with another exposure; the same one each time."""
+    """Inverse of a view with another exposure, cached so that the same object is returned each time."""
     return replace(inverse, scale=inverse.scale * 2.0**-exposure)
 
 
 def _make(management: Management) -> None:
-    """Make an inverse; where that fails, as on a full disk, the console says why and it is not tried again."""
+    """Compute an inverse. A failure, for example on a full disk, is logged and not retried."""
     made = None
     try:
         sampler = _Sampler(management)
@@ -191,7 +191,7 @@ def loss(
     display: np.ndarray,  # [N, 3]
     weights: np.ndarray,  # [N]
 ) -> view_inverse.Loss | None:
-    """`view_inverse.loss` of a view, from colours that Blender displays; None if it cannot, as on a full disk."""
+    """`view_inverse.loss` of a view from colours that Blender displays, or None if sampling fails (full disk)."""
     try:
         sampler = _Sampler(management)
         try:
@@ -204,7 +204,7 @@ def loss(
 
 
 class _Sampler:
-    """Has Blender display colours: it saves images through a scene of their own."""
+    """Converts colours to display colours by saving images through a temporary scene."""
 
     def __init__(self, management: Management):
         self._space = management.space
@@ -217,7 +217,7 @@ class _Sampler:
         settings.color_mode, settings.color_depth = "RGB", "16"
 
     def displayed(self, colors: np.ndarray) -> np.ndarray:
-        """Display colours of linear Rec.709, in which views of single channels are such. [N, 3] both"""
+        """Display colours of linear Rec.709 colours, in which per-channel views act per channel. [N, 3] both"""
         path = str(Path(self._folder.name) / "samples.tif")
         height = -(-len(colors) // _WIDTH)
         pixels = np.ones((height * _WIDTH, 4), np.float32)
@@ -239,13 +239,13 @@ class _Sampler:
         return pixels[: len(colors), :3]
 
     def close(self) -> None:
-        """Remove what was made."""
+        """Remove the temporary scene and folder."""
         compat.remove_scene(self._scene)
         self._folder.cleanup()
 
 
 def look() -> float:
-    """Make what is wanted for long enough. Returns seconds to the next look."""
+    """Compute the requested tables that are due. Returns the timer interval in seconds."""
     for management, since in list(_wanted.items()):
         if time.monotonic() < since:
             continue
@@ -257,12 +257,12 @@ def look() -> float:
 
 
 def register():
-    """Begin to look at what is wanted."""
+    """Start the timer."""
     bpy.app.timers.register(look, first_interval=LOOK_S, persistent=True)
 
 
 def unregister():
-    """Undo `register`, and forget all tables."""
+    """Stop the timer and clear the caches."""
     if bpy.app.timers.is_registered(look):
         bpy.app.timers.unregister(look)
     _wanted.clear()

@@ -1,4 +1,4 @@
-"""Blender's cameras for tools that take pictures with their cameras: `transforms.json` and COLMAP's text model."""
+"""Export of Blender's cameras as `transforms.json` or COLMAP text model."""
 
 import re
 from pathlib import Path
@@ -33,16 +33,16 @@ def steps(
     """Write cameras into a folder; images are named ``images/frame_0001.png`` or ``images/CAMERA/0001.png``.
 
     Args:
-        context: Its scene has cameras, frames and resolution.
-        folder: Made where it does not exist.
-        which: Of `WHICH`.
-        format: Of `FORMATS`.
-        axes: Of `gaussians.AXES`; "FILE" gives cameras of the data set's world.
-        every: The scene's frame range instead of the current frame.
-        step: Frames from one view to the next.
+        context: Context with the scene's cameras, frames and resolution.
+        folder: Output folder, created if missing.
+        which: Key of `WHICH`.
+        format: Key of `FORMATS`.
+        axes: Key of `gaussians.AXES`; "FILE" gives cameras in the data set's world.
+        every: True for the scene's frame range, False for the current frame.
+        step: Number of frames from one view to the next.
 
     Raises:
-        ConfigError: A camera cannot be expressed, or there is none.
+        ConfigError: There is no camera, or one cannot be exported.
         SceneFileError: A file cannot be written.
     """
     scene, found, notes = context.scene, [], []
@@ -82,7 +82,7 @@ def image_name(frame: int) -> str:
 
 
 def _folders(scene: bpy.types.Scene) -> dict[bpy.types.Object, str]:
-    """A folder for each camera, called as every file system and COLMAP take it; those of like names are numbered."""
+    """Unique folder name for each camera, valid on every file system and in COLMAP; duplicates are numbered."""
     found: dict[bpy.types.Object, str] = {}
     taken: set[str] = set()
     for camera in _sorted(scene):
@@ -96,12 +96,12 @@ def _folders(scene: bpy.types.Scene) -> dict[bpy.types.Object, str]:
 
 
 def _sorted(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """The cameras of a Blender scene by name."""
+    """Cameras of a Blender scene, sorted by name."""
     return sorted((obj for obj in scene.objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
 
 
 def time_of(scene: bpy.types.Scene, collection: bpy.types.Collection | None, frame: int, every: bool) -> float | None:
-    """Scene time of a frame; without a loaded scene its share of the frame range, None where one frame is all."""
+    """Scene time of a frame. Without a loaded scene: its fraction of the frame range, or None for a single frame."""
     if collection is not None:
         return timeline.of_collection(collection).time(frame)
     span = scene.frame_end - scene.frame_start
@@ -109,19 +109,19 @@ def time_of(scene: bpy.types.Scene, collection: bpy.types.Collection | None, fra
 
 
 def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str, world: np.ndarray) -> cameras.Camera:
-    """A camera of Blender in other axes.
+    """Convert a Blender camera to other axes.
 
     Args:
-        depsgraph: Evaluated.
-        camera: A perspective camera.
-        axes: Of `gaussians.AXES`.
-        world: Map of the loaded scene's own world to Blender's. [4, 4]
+        depsgraph: Evaluated depsgraph.
+        camera: Perspective camera.
+        axes: Key of `gaussians.AXES`.
+        world: Transform from the loaded scene's own world to Blender's. [4, 4]
 
     Returns:
-        The camera, its whole picture.
+        Camera of the whole image, without render border.
 
     Raises:
-        ConfigError: The scene's own world is sheared or scaled unevenly, so that its cameras would be no cameras.
+        ConfigError: The scene's world is sheared or scaled unevenly, which a camera cannot express.
     """
     own = view_cameras.of_camera(depsgraph, lambda: np.zeros((0, 3)), camera, border=False).camera
     turn = gaussians.world_to(axes, world)
@@ -132,7 +132,7 @@ def in_axes(depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, axes: str,
 
 
 def _cameras(scene: bpy.types.Scene, which: str, notes: list[str]) -> list[bpy.types.Object]:
-    """The cameras to write at the present frame."""
+    """Cameras to export at the current frame."""
     if which == "ACTIVE":
         camera = scene.camera
         if camera is not None and camera.type == "CAMERA" and camera.data.type != "PERSP":

@@ -1,4 +1,4 @@
-"""The frames that an export or a capture goes through, and how the options of exports are drawn."""
+"""Frame range of an export or a capture, and drawing of export options."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ FRAMES = (
 
 
 def draw_properties(operator, *names: str) -> None:
-    """Draw properties of an export; the frame step where there is a range alone."""
+    """Draw the properties of an export; the frame step only for a frame range."""
     layout = operator.layout
     layout.use_property_split = True
     layout.use_property_decorate = False
@@ -23,7 +23,7 @@ def draw_properties(operator, *names: str) -> None:
 
 @contextmanager
 def frame_kept(scene: bpy.types.Scene) -> Iterator[None]:
-    """Bring a Blender scene back to the frame where it was, sub-frame included."""
+    """Restore a scene's current frame and sub-frame on exit."""
     frame, subframe = scene.frame_current, scene.frame_subframe
     try:
         yield
@@ -33,16 +33,16 @@ def frame_kept(scene: bpy.types.Scene) -> Iterator[None]:
 
 
 def frames_of(scene: bpy.types.Scene, every: bool, step: int = 1) -> list[int]:
-    """The frames of a Blender scene's range, or the current one alone."""
+    """Frames of a scene's range, or only the current one."""
     return list(range(scene.frame_start, scene.frame_end + 1, max(step, 1))) if every else [scene.frame_current]
 
 
 def go_to(scene: bpy.types.Scene, frame: int) -> None:
-    """Show a whole frame; the current one keeps its sub-frame, and edits that no key holds."""
+    """Go to a whole frame. If it is the current one, keep its sub-frame and edits without keyframes."""
     if frame != scene.frame_current:
         scene.frame_set(frame)
 
 
 def numbered(path, frame: int):
-    """The path of one frame of a sequence: scene.ply -> scene_0012.ply."""
+    """Insert the frame number into a path: scene.ply -> scene_0012.ply."""
     return path.with_name(f"{path.stem}_{frame:04d}{path.suffix}")

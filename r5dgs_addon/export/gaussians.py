@@ -1,4 +1,4 @@
-"""What Blender shows as Gaussians for others: the clouds of a frame, carried to where they are, in the axes wanted."""
+"""Export of the visible Gaussians of a frame, transformed to their place in the requested axes."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,11 +33,11 @@ WHICH = (
 
 @dataclass
 class Sources:
-    """Where the Gaussians of clouds come from; scene files are read once.
+    """Sources of the exported Gaussians. Each scene file is read once.
 
     Attributes:
-        notes: What has to be said about it, each once.
-        origins: Points that the positions of the scenes are measured from.
+        notes: Messages for the user, without duplicates.
+        origins: Origins that the positions of the scenes are relative to.
     """
 
     notes: list[str] = field(default_factory=list)
@@ -46,7 +46,7 @@ class Sources:
     _bending: dict[int, Residuals] = field(default_factory=dict)
 
     def scene(self, collection: bpy.types.Collection | None) -> Scene | None:
-        """The scene file of a loaded scene, or None where it is gone or damaged."""
+        """Scene file of a loaded scene, or None if it is missing or damaged."""
         if collection is None:
             return None
         if collection.session_uid not in self._scenes:
@@ -58,7 +58,7 @@ class Sources:
         return self._scenes[collection.session_uid]
 
     def bending(self, collection: bpy.types.Collection) -> Residuals:
-        """How single Gaussians of a loaded scene leave their group; its file has to be there."""
+        """Per-Gaussian residual motion of a loaded scene, whose file must exist."""
         known = self._bending.get(collection.session_uid)
         if known is None:
             scene = self.scene(collection)
@@ -67,13 +67,13 @@ class Sources:
         return known
 
     def note(self, text: str) -> None:
-        """Remember what has to be said in the end."""
+        """Add a message for the user."""
         if text not in self.notes:
             self.notes.append(text)
 
 
 def chosen(context: bpy.types.Context, which: str) -> set[bpy.types.Object] | None:
-    """Objects whose clouds are exported, of `WHICH`: the selected ones and what hangs from them; None for all."""
+    """Selected objects and their descendants, or None for all; ``which`` is a key of `WHICH`."""
     if which == "VISIBLE":
         return None
     selected = set(context.selected_objects)
@@ -81,14 +81,14 @@ def chosen(context: bpy.types.Context, which: str) -> set[bpy.types.Object] | No
 
 
 def world_to(axes: str, world: np.ndarray) -> np.ndarray:
-    """The map from Blender's world to the axes wanted, of `AXES`.
+    """Transform from Blender's world to the requested axes.
 
     Args:
-        axes: Of `AXES`.
-        world: Map of the scene's own world to Blender's. [4, 4]
+        axes: Key of `AXES`.
+        world: Transform from the scene's own world to Blender's. [4, 4]
 
     Returns:
-        The map. [4, 4]
+        The transform. [4, 4]
     """
     if axes == "FILE":
         return np.linalg.inv(world)
@@ -101,16 +101,16 @@ def world_to(axes: str, world: np.ndarray) -> np.ndarray:
 def splats_of(
     context: bpy.types.Context, wanted: set[bpy.types.Object] | None, axes: str, sources: Sources
 ) -> tuple[ply.Splats, list[str]]:
-    """The Gaussians that Blender shows at the current frame.
+    """Gaussians that Blender shows at the current frame.
 
     Args:
-        context: Its scene has the frame; what its view layer hides is left out.
-        wanted: What `chosen` gave.
-        axes: Of `AXES`.
-        sources: Where they come from, and what has to be said.
+        context: Context with the current frame; objects hidden in its view layer are skipped.
+        wanted: Result of `chosen`.
+        axes: Key of `AXES`.
+        sources: Source scenes; receives messages for the user.
 
     Returns:
-        The Gaussians, and the names of the clouds that are in them.
+        Gaussians, and the names of their point clouds.
     """
     depsgraph = context.evaluated_depsgraph_get()
     _, found = visible_clouds.instances(depsgraph)
@@ -136,7 +136,7 @@ def splats_of(
 def _placed(
     scene: Scene, one: visible_clouds.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources
 ) -> ply.Splats:
-    """The Gaussians of a visible cloud, by its scene file. matrix, turn [4, 4]"""
+    """Gaussians of a visible point cloud, read from its scene file. matrix, turn [4, 4]"""
     start, count, bending = one.start, one.count, None
     if one.edit is not None:
         whole = scene
@@ -151,10 +151,10 @@ def _placed(
 
 
 def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
-    """Gaussians out of the attributes that `point_clouds.fill` writes.
+    """Convert the attributes written by `point_clouds.fill` to Gaussians.
 
     Raises:
-        SceneFileError: The points are no Gaussians.
+        SceneFileError: An attribute is missing.
     """
     count = len(cloud.points)
 
@@ -187,20 +187,20 @@ def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
 def ply_steps(
     context: bpy.types.Context, path: Path, which: str, *, axes: str, plain: bool, every: bool, step: int = 1
 ) -> Steps:
-    """Write clouds as 3DGS PLY, one file for each frame.
+    """Write point clouds as 3DGS PLY, one file per frame.
 
     Args:
-        context: Its scene has the frames.
-        path: The file; those of a range get the frame's number behind the name.
-        which: Of `WHICH`.
-        axes: Of `AXES`.
-        plain: Leave identities and ids out.
-        every: The scene's frame range instead of the current frame.
-        step: Frames from one file to the next.
+        context: Context with the scene's frames.
+        path: Output file; in a range, the frame number is appended to its name.
+        which: Key of `WHICH`.
+        axes: Key of `AXES`.
+        plain: True to omit identities and object ids.
+        every: True for the scene's frame range, False for the current frame.
+        step: Number of frames from one file to the next.
 
     Raises:
-        ConfigError: The current frame shows nothing of it.
-        SceneFileError: A file cannot be written, or points are no Gaussians.
+        ConfigError: Nothing to export is visible at the current frame.
+        SceneFileError: A file cannot be written, or points lack Gaussian attributes.
     """
     wanted, sources, scene = chosen(context, which), Sources(), context.scene
     frames, most, clouds = frame_range.frames_of(scene, every, step), 0, set()
@@ -229,10 +229,10 @@ def ply_steps(
 
 
 def relative_note(origin: np.ndarray, more: str) -> str:
-    """A note that exported positions are relative to the origin of a scene. [3]"""
+    """Message that exported positions are relative to the origin of a scene. [3]"""
     return f"Positions are relative to {loaded_scenes.origin_text(origin)} of the data set's world; {more}"
 
 
 def _shared_origin(sources: Sources) -> np.ndarray | None:
-    """The origin of all exported scenes; None if they differ."""
+    """Common origin of all exported scenes, or None if they differ."""
     return np.array(next(iter(sources.origins))) if len(sources.origins) == 1 else None

@@ -1,4 +1,4 @@
-"""Which object each pixel shows, for a range of frames: masks as data sets have them, and index with depth as EXR."""
+"""Export of object masks as PNG and of object index and depth as EXR, for a range of frames."""
 
 import functools
 import json
@@ -17,8 +17,8 @@ from ..ui.stepwise_operator import Outcome, Step, Steps
 from ..worker import jobs
 from . import cameras, frame_range
 
-LOOK_S = 0.005  # between two looks at the worker
-LAYER = "R5DGS"  # of the EXR's channels, as in Blender's own multilayer files
+LOOK_S = 0.005  # polling interval of the worker
+LAYER = "R5DGS"  # layer name of the EXR channels, as in Blender's own multilayer files
 FORMATS = (
     ("PNG", "Masks", "PNG of 8 bits, or 16 where an id exceeds 255, in object_mask; 0 is the background"),
     ("EXR", "Index and Depth", "Multilayer OpenEXR in object_index: object index, depth and alpha, for the compositor"),
@@ -30,11 +30,11 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
     """Write ``object_mask/images/frame_0001.png``, ``object_index/frame_0001.exr`` and ``objects.json`` into a folder.
 
     Args:
-        context: Its scene has camera, resolution and frames; what its view layer hides is left out.
-        folder: Made where it does not exist.
-        format: Of `FORMATS`.
-        every: The scene's frame range instead of the current frame.
-        step: Frames from one file to the next.
+        context: Context with camera, resolution and frames; objects hidden in its view layer are skipped.
+        folder: Output folder, created if missing.
+        format: Key of `FORMATS`.
+        every: True for the scene's frame range, False for the current frame.
+        step: Number of frames from one file to the next.
 
     Raises:
         R5dgsError: There is no camera, the worker cannot render, or a file cannot be written.
@@ -69,14 +69,14 @@ def steps(context: bpy.types.Context, folder: Path, *, format: str, every: bool,
 
 
 def planes(seen: render_request.Shown, arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Object index, depth and alpha of a picture: the index is the render engine's, 0 where nothing is in front.
+    """Object index, depth and alpha of an image. Indices are those of the render engine, 0 for background.
 
     Args:
-        seen: What was rendered.
-        arrays: The worker's ``owners``, ``depth`` and ``alpha``. [H, W]
+        seen: Rendered scene.
+        arrays: ``owners``, ``depth`` and ``alpha`` from the worker. [H, W]
 
     Returns:
-        Indices int64, depths along the view and alphas float32. [H, W] each
+        Indices int64, z depths and alphas float32. [H, W] each
     """
     return render_passes.indices(arrays, seen), render_passes.depths(arrays), arrays["alpha"].astype(np.float32)
 
@@ -96,7 +96,7 @@ def _write(folder: Path, image: str, format: str, indices: np.ndarray, depth: np
 
 
 def _names(seen: render_request.Shown) -> dict[str, str]:
-    """Names by index of what is shown, as ``objects.json`` of a data set has them."""
+    """Names of the visible objects by index, in the format of a data set's ``objects.json``."""
     found = {}
     current = {collection: object_names.names(collection) for collection in seen.scenes}
     for instance in seen.instances:

@@ -1,4 +1,7 @@
-"""A loaded scene as it was edited in Blender, for a `.r5dgs` file: where clouds are at the observed times and after."""
+"""Export of a loaded scene with its edits as a `.r5dgs` file.
+
+The poses of the point clouds are sampled at the observed times and after t_max.
+"""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,18 +20,18 @@ from ..ui import plural
 from ..ui.stepwise_operator import Outcome, Step, Steps
 from . import frame_range
 
-TOLERANCE = 1e-5  # of the scene's size: what Blender may differ from playback by, keys aside
-KEY_SHARE = 1.5  # of the keys' own tolerance that counts as none, too
-MOST_LATER = 64  # times past t_max that are looked at
-MOST_EARLIER = 16  # frames before the first observed time that are looked at
-_STILL = 1e-6  # how far from the identity a parent may be that turns nothing
+TOLERANCE = 1e-5  # tolerated difference between Blender and playback without keys, as a fraction of the scene's extent
+KEY_SHARE = 1.5  # share of the keys' own tolerance that is ignored in addition
+MOST_LATER = 64  # maximum number of sampled times past t_max
+MOST_EARLIER = 16  # maximum number of sampled frames before the first observed time
+_STILL = 1e-6  # maximum deviation of a parent's linear part that counts as the identity
 
 
 @dataclass
 class _Member:
-    """A cloud while the frames go by. matrices [4, 4] each; pivot [3], parent [3, 3] and points at t_max.
+    """Point cloud with its poses over time. matrices [4, 4] each; pivot [3], parent [3, 3] and points at t_max.
 
-    ``keys`` has the different states of its points that were seen: several if modifiers animate them.
+    ``keys`` identifies the distinct states of its points over time; several if modifiers animate them.
     """
 
     cloud: bpy.types.Object
@@ -45,14 +48,14 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     """Write a loaded scene with its edits.
 
     Args:
-        context: Its scene has the frames.
-        collection: The loaded scene.
-        path: The new file; none that a loaded scene comes from.
-        exact: Store all numbers in full precision.
+        context: Context with the scene's frames.
+        collection: Loaded scene.
+        path: Output file; must not be the source of a loaded scene.
+        exact: True to store all numbers in full precision.
 
     Raises:
-        ConfigError: The path is that of a loaded scene, or a cloud has lost its points.
-        SceneFileError: The scene's own file is gone, or the new one cannot be written.
+        ConfigError: The path is the source of a loaded scene, or a point cloud has lost its points.
+        SceneFileError: The scene's own file is missing, or the new one cannot be written.
     """
     _refuse_sources(path)
     own = render_request.scene_path(collection)
@@ -97,7 +100,7 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:
-    """Sentences on edited points that the file does not hold."""
+    """Messages about edited points that the file cannot hold."""
     notes = [note for member in members for note in member.points.notes]
     animated = [member.cloud.name for member in members if len(member.keys) > 1]
     if animated:
@@ -120,7 +123,7 @@ def _refuse_sources(path: Path) -> None:
 
 
 def _later(times: timeline.Times) -> np.ndarray:
-    """Times past t_max at which Blender's curves are looked at: whole frames, and the last one."""
+    """Times past t_max at which Blender's F-curves are sampled: whole frames and the last one."""
     first, last = times.frame(times.t_max), times.frame(times.t_end)
     if last <= first + 1e-6:
         return np.zeros(0)
@@ -129,7 +132,7 @@ def _later(times: timeline.Times) -> np.ndarray:
 
 
 def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
-    """Frames of the timeline before the first observed time, of which a scene file knows nothing."""
+    """Frames before the first observed time, which a scene file cannot hold."""
     first, end = scene.frame_start, int(np.ceil(times.frame(times.t_start) - 1e-6))
     return sorted({int(frame) for frame in np.linspace(first, end - 1, MOST_EARLIER)}) if first < end else []
 
@@ -137,7 +140,7 @@ def _earlier(scene: bpy.types.Scene, times: timeline.Times) -> list[int]:
 def _go_to(
     context: bpy.types.Context, collection: bpy.types.Collection, frame: float
 ) -> tuple[bpy.types.Depsgraph, np.ndarray]:
-    """Blender at a frame, and the map of its world to the file's then. [4, 4]"""
+    """Go to a frame. Returns the depsgraph and the transform from Blender's world to the file's. [4, 4]"""
     whole = int(np.floor(frame))
     context.scene.frame_set(whole, subframe=min(float(frame - whole), 0.999999))
     depsgraph = context.evaluated_depsgraph_get()
@@ -145,7 +148,7 @@ def _go_to(
 
 
 def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allowed: float, extent: float) -> list[str]:
-    """Names of the clouds that are elsewhere before the first observed time than at it."""
+    """Names of the point clouds whose pose before the first observed time differs from that at it."""
     names = []
     for number, member in enumerate(members):
         changes = [np.abs(matrices[number] - member.matrices[0]) for matrices in before]
@@ -155,7 +158,7 @@ def _moving_before(members: list[_Member], before: list[list[np.ndarray]], allow
 
 
 def _members(collection: bpy.types.Collection) -> tuple[list[_Member], dict[int, tuple[str, int]]]:
-    """The clouds of a scene; copies of an object are objects of their own, whose names and originals come second."""
+    """Point clouds of a scene, and name and original of each copied object, which gets its own id."""
     found, names = [], {}
     clouds = [obj for obj in loaded_scenes.members(collection, "CLOUD") if obj.type == "POINTCLOUD"]
     clouds.sort(key=lambda obj: (obj.r5dgs.start, len(obj.name), obj.name))
@@ -185,7 +188,7 @@ def _anchor(cloud: bpy.types.Object) -> bpy.types.Object | None:
 def _look(
     context: bpy.types.Context, collection: bpy.types.Collection, members: list[_Member], frame: float, bind: bool
 ) -> None:
-    """Note where clouds are at a frame, in the world of the file; at t_max where their anchors stand, too."""
+    """Record the pose of each point cloud in the file's world; at t_max (``bind``), also points and anchor."""
     depsgraph, back = _go_to(context, collection, frame)
     for member in members:
         member.matrices.append(back @ _matrix(member.cloud, depsgraph))
@@ -207,19 +210,19 @@ def _matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray
 
 
 def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> list[edited_scene.Piece]:
-    """A cloud as what the core writes; nothing if nothing is left of it.
+    """Convert a point cloud to a `Piece` for the core, or an empty list if it is scaled to zero.
 
     Args:
-        member: The cloud.
-        source: The scene, extended by edited points.
-        place: Where its points are there, if they were edited.
+        member: Point cloud with its poses.
+        source: Scene, extended by edited points.
+        place: Range of its points in ``source`` if they were edited.
     """
     cloud, anchor, matrices = member.cloud, member.anchor, np.array(member.matrices)
     bind = matrices[len(source.track_times) - 1]
     start, count = cloud.r5dgs.start, cloud.r5dgs.count
     if place is not None:
         start, count, matrices = place.start, place.count, matrices @ place.matrix
-    if visible_clouds.flat([bind])[0]:  # scaled to nothing: nothing is left of it
+    if visible_clouds.flat([bind])[0]:  # scaled to zero
         return []
     remembers = anchor is not None and physics.has_motion(anchor)
     keys = physics.key_error(anchor)[0] if remembers else 0.0
@@ -245,7 +248,7 @@ def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> 
 def _table(
     collection: bpy.types.Collection, source: Scene, members: list[_Member], copies: dict[int, tuple[str, int]]
 ) -> dict[int, SceneObject]:
-    """Names, aliases, captions and colours of the objects as Blender has them now."""
+    """Current names, aliases, captions and colours of the objects."""
     colors = {item.id: item.color for item in source.objects}
     tints = {member.object_id: object_tint.tint(member.cloud) for member in reversed(members)}
     result = {}
@@ -266,7 +269,7 @@ def _table(
 
 
 def _rests(collection: bpy.types.Collection) -> bool:
-    """Whether the root only turns the scene's world to one of Blender's conventions."""
+    """True if the root's only transform is a world convention."""
     world = visible_clouds.world_of(collection)
     turns = cameras.WORLD_TO_BLENDER.values()
     return not world[:3, 3].any() and any(np.allclose(world[:3, :3], turn, atol=1e-5) for turn in turns)

@@ -1,1 +1,1 @@
-"""Parts shared by operators and panels: stepwise operators, status bar and plurals."""
+"""UI helpers shared by operators and panels: stepwise operators, status bar, plural forms and worker status."""

@@ -1,4 +1,4 @@
-"""Amounts in messages: "1 object", "40,000 Gaussians bend", "mug, ball and 3 more"."""
+"""Counts and name lists for messages: "1 object", "40,000 Gaussians bend", "mug, ball and 3 more"."""
 
 from collections.abc import Sequence
 
@@ -6,12 +6,12 @@ _NAMED = 5
 
 
 def of(count: int, noun: str, verb: str = "") -> str:
-    """A number of things in words for the user, and what they do.
+    """Format a count with its noun and, optionally, a verb.
 
     Args:
-        count: How many.
-        noun: What one is called; the plural ends in s.
-        verb: What several do; what one does ends in s.
+        count: Number of things.
+        noun: Singular noun; the plural adds s.
+        verb: Plural form of the verb; the singular adds s.
     """
     one = count == 1
     things = f"{count:,} {noun}{'' if one else 's'}"
@@ -19,6 +19,6 @@ def of(count: int, noun: str, verb: str = "") -> str:
 
 
 def names(found: Sequence[str]) -> str:
-    """The first of some names, and the number of the others."""
+    """List the first few names and the number of the others."""
     listed = ", ".join(found[:_NAMED])
     return listed if len(found) <= _NAMED else f"{listed} and {len(found) - _NAMED:,} more"

@@ -1,20 +1,20 @@
-"""What Blender's windows are told: words in the status bar, and that an area is to be drawn anew."""
+"""Status bar text, area redraws and wrapped labels."""
 
 import textwrap
 
 import bpy
 
-_LETTER, _MARGIN, _WIDTH = 7, 70, 400  # pixels of a letter, beside a text, and of a region if there is none
+_LETTER, _MARGIN, _WIDTH = 7, 70, 400  # pixels: letter width, margins beside the text, default region width
 
 
 def say(context: bpy.types.Context, text: str | None) -> None:
-    """Show words in the status bar; None takes them away."""
+    """Show a text in the status bar, or clear it if None."""
     if context.workspace is not None:
         context.workspace.status_text_set(text)
 
 
 def redraw(*kinds: str) -> None:
-    """Have areas of some types drawn anew, of all where none is named."""
+    """Redraw all areas of the given types, or all areas if none is given."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if not kinds or area.type in kinds:
@@ -22,7 +22,7 @@ def redraw(*kinds: str) -> None:
 
 
 def wrapped(layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE") -> None:
-    """Draw a text in lines that fit the region; Blender cuts the middle out of a longer label."""
+    """Draw a text in lines that fit the region, because Blender truncates long labels in the middle."""
     width = context.region.width if context.region is not None else _WIDTH
     scale = context.preferences.system.ui_scale or 1.0  # 0 without a window
     letters = max(int((width / scale - _MARGIN) / _LETTER), 20)

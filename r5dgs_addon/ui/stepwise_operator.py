@@ -1,4 +1,4 @@
-"""Operators that run step by step: beside the window with progress and Esc, at once for scripts and in `blender -b`."""
+"""Operators that run step by step: modal with progress and Esc in the UI, blocking in scripts and background mode."""
 
 import json
 import os
@@ -16,13 +16,13 @@ from . import status_bar
 
 @dataclass(frozen=True)
 class Step:
-    """Where long work stands.
+    """Progress of a long operation.
 
     Attributes:
-        done: Steps so far.
-        total: Steps in all.
-        what: What was just done, or is done next.
-        slow: What is done next may take long, in one go; the window shows these words first.
+        done: Number of completed steps.
+        total: Total number of steps.
+        what: Description of the step that was just completed or comes next.
+        slow: True if the next step may block for long; the window then shows ``what`` first.
     """
 
     done: int
@@ -33,49 +33,49 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What long work has to say in the end.
+    """Result of a long operation.
 
     Attributes:
-        text: What was done.
-        warnings: What is not as one may expect.
+        text: Summary for the user.
+        warnings: Warnings for the user.
     """
 
     text: str
     warnings: list[str] = field(default_factory=list)
 
 
-BLINK_S = 0.2  # between two looks at the window, which is drawn anew then
+BLINK_S = 0.2  # time between redraws of the window (s)
 Steps = Iterator[Step]  # a generator that returns an `Outcome`
 
-_beside: list[bpy.types.Operator] = []  # what goes on beside the window
+_beside: list[bpy.types.Operator] = []  # operators that currently run modal
 
 
 class Running:
-    """Mixed into an operator that has ``steps``, and ``filepath`` or ``directory`` among its properties.
+    """Mixin for operators with ``steps`` and a ``filepath`` or ``directory`` property.
 
-    The steps are closed where the user stops them, so that ``finally`` and ``with`` in them leave nothing half-done.
+    If the user stops the operator, the generator is closed, so that its ``finally`` and ``with`` blocks can clean up.
     """
 
-    work = "Export"  # what the status bar calls it
-    stopped = "files that were finished stay"  # what is said when it was stopped
+    work = "Export"  # name of the operation in the status bar
+    stopped = "files that were finished stay"  # appended to the report if the user stops the operation
 
     def steps(self, context: bpy.types.Context) -> Steps:
-        """The work, a step at a time."""
+        """Return a generator that performs the operation one step at a time."""
         raise NotImplementedError
 
     def suggest(self, context: bpy.types.Context) -> bool:
-        """Fill in a path where none is given. Returns whether to go on without asking for one."""
+        """Set a default path. Returns True to run without opening the file browser."""
         return False
 
     def target_file(self, suffix: str) -> Path:
-        """The file that ``filepath`` names, its suffix added where it is absent. ConfigError where it names none."""
+        """Return the file of ``filepath`` with the suffix added if missing. Raises ConfigError if it names no file."""
         path = bpy.path.abspath(self.filepath)
         if not os.path.basename(path):
             raise errors.ConfigError(f"{self.work.lower()}: expected a {suffix} file, got '{path}'; give it a name")
         return Path(path if path.lower().endswith(suffix) else path + suffix)
 
     def target_folder(self) -> Path:
-        """The folder that ``directory`` names. ConfigError where it names none."""
+        """Return the folder of ``directory``. Raises ConfigError if it is empty."""
         if not self.directory:
             raise errors.ConfigError(f"{self.work.lower()}: expected a folder, got nothing; choose one")
         return Path(bpy.path.abspath(self.directory))
@@ -121,26 +121,26 @@ class Running:
                 if self._last is not None and self._last.slow:
                     break
             failed = False
-        finally:  # the timer and the progress bar go, and the error is shown
+        finally:  # on error, too, the timer and progress bar must go
             if failed or finished is not None:
                 self._end(context)
         return finished or {"RUNNING_MODAL"}
 
     def cancel(self, context):
-        """Blender ends the operator: the file browser is closed, or a window or the file while it runs."""
+        """Called by Blender if the file browser is closed, or if a window or the file closes during the operation."""
         if getattr(self, "_timer", None) is not None:
             try:
                 self._steps.close()
-            finally:  # where what the steps undo fails, too
+            finally:  # even if the cleanup of the steps fails
                 self._end(context)
 
     def _step(self, context):
-        """Do one step; the operator's result when that was the last, else None."""
+        """Run one step. Returns the operator's result after the last step, otherwise None."""
         try:
             step = next(self._steps)
         except StopIteration as end:
             self.report({"INFO"}, end.value.text)
-            for warning in end.value.warnings:  # the last report is what the status bar shows
+            for warning in end.value.warnings:  # reported last, because the status bar shows the last report
                 self.report({"WARNING"}, warning)
             return {"FINISHED"}
         except errors.R5dgsError as error:
@@ -171,24 +171,24 @@ class Running:
 
 
 def begin(operator: bpy.types.Operator) -> None:
-    """Note that an operator goes on beside the window, for `stop_all`."""
+    """Register a running modal operator for `stop_all`."""
     _beside.append(operator)
 
 
 def end(operator: bpy.types.Operator) -> None:
-    """Forget an operator that has ended."""
+    """Remove an operator that has ended."""
     _beside[:] = [other for other in _beside if other is not operator]
 
 
 def stop_all(context: bpy.types.Context) -> None:
-    """Stop what goes on beside the window, as Esc does. Blender itself does not where an operator's class goes."""
+    """Cancel all running modal operators, because Blender does not do so when their classes are unregistered."""
     for operator in list(_beside):
         operator.cancel(context)
 
 
 @contextmanager
 def cursor(context: bpy.types.Context) -> Iterator[Callable[[float], None]]:
-    """Show at the mouse how far work is that the window has to wait for; gives what to call with the share done."""
+    """Show blocking progress at the mouse cursor. Yields a callback that takes the completed fraction."""
     manager = context.window_manager
     if bpy.app.background or context.window is None:
         yield lambda share: None

@@ -1,4 +1,4 @@
-"""Progress and result of *Test Worker*, drawn under its buttons in the preferences and the sidebar."""
+"""Progress and result of *Test Worker*, drawn below its button in the preferences and the sidebar."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from . import status_bar
 
 
 class TestJob(Protocol):
-    """The part of a `jobs.Job` that is drawn here; the worker itself stands on the preferences, which draw this."""
+    """Interface of `jobs.Job` used here. The module cannot import `jobs`, which depends on the preferences."""
 
     @property
     def doing(self) -> str:
-        """What it waits for, in a few words."""
+        """Short description of the current step."""
         ...
 
     @property
@@ -47,7 +47,7 @@ def end(text: str, icon: str) -> None:
 
 
 def redraw() -> None:
-    """Draw the areas that show it anew."""
+    """Redraw the areas that show the status."""
     status_bar.redraw("PREFERENCES", "VIEW_3D")
 
 

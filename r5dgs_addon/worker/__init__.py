@@ -1,1 +1,1 @@
-"""The add-on's side of the worker process: start it, send jobs and read its answers."""
+"""Client of the worker process: start it, submit jobs and read responses."""

@@ -1,9 +1,9 @@
-"""The add-on's side of the worker: a Python with torch, started when it is first needed, kept until the add-on ends.
+"""Job queue of the worker: a Python with torch, started on first use and kept until the add-on is unregistered.
 
-There is one worker, and it does one thing after the other: whoever asks has it for all steps of what is asked, so that
-nobody's scenes are exchanged between loading and rendering. `run` waits for the answer; `submit` returns a job that a
-timer looks at, and what waits under the same key is dropped for what comes later. After a worker's death the next
-request starts another. No thread touches Blender's data.
+There is one worker, and it runs one job at a time: a job holds the worker for all its steps, so that no other job
+replaces its scene between loading and rendering. `run` blocks until the response arrives. `submit` returns a job for a
+timer to poll; a new job replaces a waiting one with the same key. After the worker dies, the next job starts another.
+No job thread accesses Blender's data.
 """
 
 import atexit
@@ -23,18 +23,18 @@ SEARCHING = "looking for a Python with torch"
 
 
 class Job:
-    """Requests that wait for their answers in a thread of their own, so that Blender's window stays free.
+    """Sequence of worker requests that runs in its own thread, so that Blender's UI stays responsive.
 
     Args:
-        choice: Which Python the worker has that is started where none runs; it is searched for in the thread, too.
-        steps: What the sidebar says while it waits, the command, and its arguments; one after the other.
-        key: What a later job takes the place of this one by; "" for nothing.
+        choice: Preferences that select the Python if no worker runs; the search for a Python runs in the thread, too.
+        steps: Tuples of status text, command and arguments, executed in order.
+        key: A later job with the same key replaces this one while it waits; "" for none.
     """
 
     def __init__(self, choice: preferences.Choice, steps: Steps, key: str = ""):
         self.key = key
-        self.python = ""  # the worker's, once it is known
-        self.dropped = False  # whether it ended before it began
+        self.python = ""  # Python of the worker, once known
+        self.dropped = False  # True if the job was dropped before it started
         self._step = "waiting for the worker"
         self._started = time.monotonic()
         self._answer: Answer | None = None
@@ -47,48 +47,48 @@ class Job:
 
     @property
     def doing(self) -> str:
-        """What it waits for, in a few words."""
+        """Short description of the current step."""
         return (notice() if self._begun else "") or self._step
 
     @property
     def done(self) -> bool:
-        """Whether `answer` returns at once."""
+        """True if `answer` returns without waiting."""
         return self.dropped or self._ended
 
     @property
     def seconds(self) -> float:
-        """Seconds since it was asked for."""
+        """Seconds since the job was submitted."""
         return time.monotonic() - self._started
 
     def join(self) -> None:
-        """Wait until it has ended, whatever came of it."""
+        """Wait until the job has ended, successfully or not."""
         if not self.dropped:
             self._thread.join()
 
     def drop(self) -> bool:
-        """Have it not begin. Returns whether that was in time."""
+        """Drop the job if it has not started. Returns True if it is dropped."""
         with self._guard:
             self.dropped = self.dropped or not self._begun
             return self.dropped
 
     def cancel(self) -> None:
-        """Have it not begin, or end it by stopping the worker, which has no other way to leave a picture unfinished."""
+        """Drop the job, or stop the worker if it has started: a render cannot be interrupted in another way."""
         if not self.drop():
             self._end()
 
     def answer(self) -> Answer:
-        """Wait for the last step's result and arrays. Raises what a step raised, BackendError where it was dropped."""
+        """Wait for the result and arrays of the last step. Re-raises its error; BackendError if the job was dropped."""
         self.join()
         preferences.keep_found()
         if self.dropped:
-            raise errors.BackendError("worker: what was asked for was taken back before its turn")
+            raise errors.BackendError("worker: the job was dropped before it started")
         if self._error is not None:
             raise self._error
         assert self._answer is not None
         return self._answer
 
     def _end(self) -> None:
-        """Stop the worker until the job has ended; it may be starting one just now, or looking for its Python."""
+        """Stop the worker until the job has ended. The job may just be starting one, or searching for its Python."""
         self._ending.set()
         while not self.done:
             _kill()
@@ -106,33 +106,33 @@ class Job:
                 self.python = choice.python(self._ending.is_set)
                 if self._ending.is_set():
                     raise errors.BackendError(
-                        "worker: stopped while its Python was looked for; the next request looks again"
+                        "worker: stopped during the search for a Python; the next request searches again"
                     )
                 self._step = "starting the worker"
                 running = _running(self.python)
                 running.greet(choice.timeout_s)
                 for self._step, command, arguments in steps:
                     self._answer = running.request(command, choice.timeout_s, **arguments)
-            except BaseException as error:  # raised again where the answer is asked for
+            except BaseException as error:  # re-raised by `answer`
                 self._error = error
-            finally:  # before the next one's turn: the thread itself may take a moment more
+            finally:  # set before the lock is released, because the thread itself may take a moment longer
                 self._ended = True
 
 
-_turn = threading.Lock()  # held by who asks the worker
-_state = threading.Lock()  # held while the names below change
+_turn = threading.Lock()  # held by the job that uses the worker
+_state = threading.Lock()  # held while the globals below change
 _worker: Worker | None = None
 _jobs: list[Job] = []
 
 
 def submit(key: str, steps: Steps) -> Job:
-    """Begin a `Job`; what waits under the same key and has not begun is dropped: the latest request wins.
+    """Start a `Job` and drop waiting jobs with the same key: the latest request wins.
 
-    It returns at once: even the search for a Python is the job's. Call it from Blender's main thread, and look at the
+    Returns immediately, as the search for a Python is part of the job. Call it from Blender's main thread, and poll the
     job's ``done`` from a timer.
 
     Args:
-        key: Who asks, "viewport" for example.
+        key: Name of the requester, for example "viewport".
         steps: As for `Job`.
 
     Returns:
@@ -147,15 +147,15 @@ def submit(key: str, steps: Steps) -> Job:
 
 
 def start(steps: Steps) -> Job:
-    """`submit` of something whose place nothing takes."""
+    """`submit` a job that no later job replaces."""
     return submit("", steps)
 
 
 def run(steps: Steps) -> Answer:
-    """Ask for steps one after the other and wait, for the turn, too; the last one's result and arrays.
+    """Run steps in order and wait for them. Returns the result and arrays of the last step.
 
     Raises:
-        R5dgsError: What the worker reports, or why it cannot be asked.
+        R5dgsError: Error reported by the worker, or BackendError if it is unavailable.
     """
     return start(steps).answer()
 
@@ -166,10 +166,10 @@ def request(command: str, **arguments: Any) -> Answer:
 
 
 def current(python: str | None = None) -> Worker:
-    """The running worker, greeted; it is started where none runs or another Python is wanted.
+    """Return the running worker after its handshake; starts one if none runs or if another Python is requested.
 
     Raises:
-        BackendError: It cannot be started.
+        BackendError: The worker cannot be started.
     """
     choice = preferences.choice()
     python = python or preferences.worker_python()
@@ -180,18 +180,18 @@ def current(python: str | None = None) -> Worker:
 
 
 def notice() -> str:
-    """What pictures of the running worker wait for at present beside their own making; else empty."""
+    """Return the reason why renders of the running worker are delayed (compilation), or ""."""
     running = _worker
     return running.notice if running is not None and running.alive else ""
 
 
 def busy(key: str | None = None) -> bool:
-    """Whether a job has not ended yet: one of a key, or any."""
+    """True if any job with this key, or any job at all if None, has not ended."""
     return any(not job.done and (key is None or job.key == key) for job in list(_jobs))
 
 
 def stop() -> None:
-    """Stop the worker, if one runs; jobs that wait for it end with an error."""
+    """Stop the worker if one runs. Waiting jobs end with an error."""
     jobs = list(_jobs)
     for job in jobs:
         job.drop()
@@ -205,7 +205,7 @@ def _waiting(key: str) -> list[Job]:
 
 
 def _running(python: str) -> Worker:
-    """The worker of a Python, for who has the turn."""
+    """Return the worker for a Python, replacing a dead or different one. The caller holds ``_turn``."""
     global _worker
     if _worker is not None and (not _worker.alive or _worker.python != python):
         _kill()
@@ -223,7 +223,7 @@ def _kill() -> None:
 
 
 def register():
-    """See to it that no worker outlives Blender."""
+    """Ensure that no worker outlives Blender."""
     atexit.register(stop)
 
 

@@ -1,11 +1,12 @@
-"""The process that runs the worker, and what is said to it and by it.
+"""Worker process and its protocol.
 
-The protocol is that of `r5dgs_core.worker.server`: a JSON line each way, and after an answer's line the raw bytes that
-it announces. Lines of no request say that the worker compiles its rasterizer, and when that is over. A worker that
-dies, hangs or talks nonsense is dropped with a clear error.
+The protocol is that of `r5dgs_core.worker.server`: one JSON line each way; a response line announces raw bytes, which
+follow it. Lines without a request id report the start and end of kernel compilation. A worker that dies, times out or
+sends invalid data is stopped with a clear error.
 
-The Python may be a wrapper script whose child does the work and keeps the pipes open. So the whole process group is
-ended, and a pipe is closed only by the thread that uses it: closing it elsewhere would wait for that thread's lock.
+The Python may be a wrapper script whose child does the work and keeps the pipes open. Therefore the whole process
+group is ended, and each pipe is closed only by the thread that uses it: closing it elsewhere would block on that
+thread's lock.
 """
 
 import base64
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = preferences.ENVIRONMENT
 STDERR_LINES = 12
-LAST_WORDS_S = 0.5  # after a worker's death, for what its pipes still hold
+LAST_WORDS_S = 0.5  # time to read the rest of the pipes after a worker's death
 REMEDY = f"set 'Worker Python' in the add-on's preferences, or {ENVIRONMENT}, to a Python with torch and numba"
 COMPILING = "preparing the rasterizer (first use, about 10 s)"
 
@@ -42,26 +43,26 @@ log = logging.getLogger(__name__)
 
 
 class Worker:
-    """One running worker process; `greet` it before the first request.
+    """Running worker process. Call `greet` before the first request.
 
     Args:
-        python: Path of the Python to run it with.
+        python: Path of the Python executable.
 
     Raises:
-        BackendError: It cannot be started.
+        BackendError: The process cannot be started.
     """
 
     def __init__(self, python: str):
         self.python = python
         self.hello: dict[str, Any] = {}
-        self.notice = ""  # what pictures wait for, where it is not their own making
-        self._held: set[str] = set()  # keys of the point edits that the worker holds
+        self.notice = ""  # reason why renders are delayed, or ""
+        self._held: set[str] = set()  # keys of the point edits that the worker has cached
         self._number = 0
         self._answers: queue.Queue = queue.Queue()
         self._stderr: collections.deque[str] = collections.deque(maxlen=STDERR_LINES)
         environment = find_python.environment()
         known = environment.get("PYTHONPATH", "")
-        # The add-on's own copy of the core comes first, so that both sides are of one version.
+        # The add-on's own copy of the core comes first, so that both sides have the same version.
         environment["PYTHONPATH"] = str(ROOT) + (os.pathsep + known if known else "")
         environment["PYTHONUNBUFFERED"] = "1"
         try:
@@ -87,13 +88,13 @@ class Worker:
             reader.start()
 
     def greet(self, timeout_s: float) -> None:
-        """Wait until it answers, once.
+        """Perform the handshake, once.
 
         Args:
-            timeout_s: Seconds to wait; the worker is stopped when they have passed.
+            timeout_s: Seconds to wait before the worker is stopped.
 
         Raises:
-            BackendError: It does not answer, or its Python lacks what rendering needs.
+            BackendError: The worker does not respond, or its Python lacks required packages.
         """
         if self.hello:
             return
@@ -115,24 +116,24 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._process.pid
 
     def request(self, command: str, timeout_s: float, **arguments: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Ask for something and wait for the answer.
+        """Send a request and wait for the response.
 
         Args:
             command: Name of the request.
-            timeout_s: Seconds to wait; the worker is stopped when they have passed.
-            **arguments: The request's arguments, JSON values; for ``points``, ``points`` is a tuple of
-                `evaluated_points.Edit`, of which those that the worker already holds are not sent again.
+            timeout_s: Seconds to wait before the worker is stopped.
+            **arguments: JSON-compatible arguments. For the command ``points``, ``points`` is a tuple of
+                `evaluated_points.Edit`; edits that the worker has cached are not sent again.
 
         Returns:
-            The result, and its arrays by name.
+            Result and arrays by name.
 
         Raises:
-            R5dgsError: What the worker reports, by its own class.
-            BackendError: The worker died or did not answer in time.
+            R5dgsError: Error reported by the worker, with its original class.
+            BackendError: The worker died or did not respond in time.
         """
         if command == "points":
             arguments = self._hand_over(arguments["points"])
@@ -166,13 +167,14 @@ class Worker:
         return header.get("result", {}), arrays
 
     def close(self) -> None:
-        """End the process and all that it started; whoever waits for an answer gets the error of a worker that died.
+        """End the process group. A caller that waits for a response gets a BackendError.
 
-        It returns within two seconds, even if a process has left the group and keeps the pipes open: that one sees the
+        Returns within two seconds, even if a process has left the group and keeps the pipes open; that process receives
+        the
         end of its input.
         """
         self._group.end()
-        if self._writing.acquire(blocking=False):  # else the thread that writes gets an error, and closes in turn
+        if self._writing.acquire(blocking=False):  # else the writing thread fails and closes the pipe
             try:
                 with contextlib.suppress(OSError), _broken_pipes_are_errors():
                     assert self._process.stdin is not None
@@ -182,7 +184,7 @@ class Worker:
         self._answers.put(None)
 
     def _hand_over(self, edits: Iterable["evaluated_points.Edit"]) -> dict[str, Any]:
-        """The arguments of a ``points`` request."""
+        """Return the arguments of a ``points`` request."""
         new = {
             edit.key: {name: base64.b64encode(values.data).decode() for name, values in edit.arrays().items()}
             for edit in edits
@@ -195,7 +197,7 @@ class Worker:
         for reader in self._readers:
             reader.join(timeout=LAST_WORDS_S)
         code = self._process.returncode or 0
-        # A shell script returns 128 and the signal that ended its child. The last words are of something else then.
+        # A shell returns 128 + signal if a signal ended its child; stderr then does not explain the exit.
         killed = not {-code, code - 128}.isdisjoint((signal.SIGTERM, getattr(signal, "SIGKILL", None)))
         said = "" if killed else " | ".join(line for line in list(self._stderr)[-4:] if line.strip())
         why = "stopped from outside; perhaps memory ran out" if killed else f"exit code {code}"
@@ -238,7 +240,7 @@ class Worker:
             log.warning("R5DGS worker: %s", notice)
         if event["event"] == "failed":
             log.warning("R5DGS worker: the rasterizer could not be prepared: %s", event.get("text", "no reason given"))
-        self.notice = notice  # last: who sees it finds it told already
+        self.notice = notice  # set last: a reader that sees the notice can rely on the log entry
 
     def _read_stderr(self) -> None:
         stream = self._process.stderr
@@ -250,11 +252,11 @@ class Worker:
 
 @contextlib.contextmanager
 def _broken_pipes_are_errors() -> Iterator[None]:
-    """Let a write to a process that has ended raise BrokenPipeError in this thread.
+    """Turn SIGPIPE into BrokenPipeError in this thread.
 
-    Blender, unlike Python, leaves SIGPIPE to the system, which ends Blender.
+    Unlike Python, Blender keeps the default action of SIGPIPE, which ends the process.
     """
-    if not hasattr(signal, "SIGPIPE"):  # Windows has no such signal
+    if not hasattr(signal, "SIGPIPE"):  # Windows has no SIGPIPE
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGPIPE})
@@ -268,7 +270,7 @@ def _broken_pipes_are_errors() -> Iterator[None]:
 
 
 def _error_of(header: dict[str, Any]) -> errors.R5dgsError:
-    """The error that an answer reports: a class of `errors` where the worker names one."""
+    """Convert an error response to the class of `errors` that it names, or BackendError."""
     report = header.get("error", {})
     kind = getattr(errors, str(report.get("kind")), None)
     message = str(report.get("message", "no reason given"))

@@ -1,4 +1,4 @@
-"""Operators that wait for the worker: beside the window where there is one, in place for scripts and `blender -b`."""
+"""Operators that wait for the worker: modal in the UI, blocking in scripts and background mode."""
 
 import bpy
 
@@ -8,16 +8,17 @@ from . import jobs
 
 
 class Waiting:
-    """Mixed into an operator that begins a job and does something with its answer.
+    """Mixin for operators that submit a job and process its response.
 
-    The operator has ``_begin(context)``, which returns the job, ``_finish(context, answer)``, which returns what
-    operators return, and ``waits_for``, what the status bar calls it.
+    Subclasses define ``_begin(context)``, which returns the job; ``_finish(context, answer)``, which returns the
+    operator's
+    result; and ``waits_for``, the name shown in the status bar.
     """
 
     waits_for = "R5DGS"
 
     def invoke(self, context, event):
-        """Leave the window free; scripts and `blender -b` wait in `execute`."""
+        """Start the job and run modal; without a window, run `execute`."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
@@ -31,7 +32,7 @@ class Waiting:
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        """Look at the job when the timer says so; Esc gives it up."""
+        """Poll the job on each timer event; Esc cancels it."""
         if event.type == "ESC":
             self.cancel(context)
             self.report({"INFO"}, f"{self.waits_for} stopped; the next one starts the worker again")
@@ -45,12 +46,12 @@ class Waiting:
         return self._answered(context)
 
     def cancel(self, context):
-        """Give the job up."""
+        """Cancel the job."""
         self._job.cancel()
         self._leave(context)
 
     def execute(self, context):
-        """Wait in place."""
+        """Run the job and block until it ends."""
         try:
             self._job = self._begin(context)
         except errors.R5dgsError as error:
@@ -73,7 +74,7 @@ class Waiting:
 
 
 def free(operator: type, key: str) -> bool:
-    """Whether no job of a key runs, for an operator's ``poll``, which says otherwise why it is greyed out."""
+    """True if no job with this key runs; otherwise sets the poll message. For an operator's ``poll``."""
     if jobs.busy(key):
         operator.poll_message_set("It is at work already; Esc stops it")
         return False
