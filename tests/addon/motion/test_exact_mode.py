@@ -33,7 +33,7 @@ def scene(scene_path):
 def listeners():
     handlers = importlib.import_module("bpy").app.handlers
     every = handlers.frame_change_pre + handlers.frame_change_post
-    return [f.__name__ for f in every if f.__module__.endswith("motion_exact")]
+    return [f.__name__ for f in every if f.__module__.endswith("motion.exact_mode")]
 
 
 def stored(cloud, name, field, width):

@@ -389,7 +389,7 @@ def test_the_cpu_draws_without_looking_for_a_gpu(tmp_path):
     (tmp_path / "gsplat.py").write_text("raise AssertionError('gsplat was imported')")
     script = (
         "import sys, torch, r5dgs_core.raster as raster\n"
-        "from tests.splats import camera, splats\n"
+        "from tests.support.splats import camera, splats\n"
         "for backend in ('auto', 'reference'):\n"
         "    raster.rasterize_splats(*[t.float() for t in splats(5, 3)], camera(), backend=backend)\n"
         "assert 'gsplat' not in sys.modules\n"

@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = """
 import torch
-from tests.agreement import assert_within_bars
-from tests.splats import camera, splats
+from tests.support.agreement import assert_within_bars
+from tests.support.splats import camera, splats
 for n_channels in (3, 19):
     background = torch.rand(40, 48, n_channels, generator=torch.Generator().manual_seed(1)).double()
     assert_within_bars(splats(400, n_channels, seed=n_channels), camera(), background)

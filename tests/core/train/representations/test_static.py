@@ -21,7 +21,7 @@ from r5dgs_core.train.representations import static
 from tests.support import tiny_datasets
 
 MOVING_PARTS = (
-    *("deformation", "trd", "encoding", "tracks", "track_state", "tracks_representation"),
+    *("deformation", "trd", "encoding", "tracks", "track_state"),
     *("residual", "residual_trial", "residual_field"),
 )
 RUN = """
@@ -31,9 +31,9 @@ from r5dgs_core.bake import bake
 from r5dgs_core.train import run
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
-from tests import datasets as tiny
+from tests.support import tiny_datasets
 data, folder = Path(sys.argv[1]), Path(sys.argv[2])
-run.train(data, folder / "run", tiny.settings("train.iterations=150", *sys.argv[3:]))
+run.train(data, folder / "run", tiny_datasets.settings("train.iterations=150", *sys.argv[3:]))
 bake.run_bake(folder / "run", folder / "still.r5dgs")
 scene = scene_file.read(folder / "still.r5dgs")
 scene_player.frame(scene, 2.0)
