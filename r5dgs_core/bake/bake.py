@@ -1,8 +1,8 @@
-"""A checkpoint becomes a scene: the bind state at t_max, the tracks in the world, and a motion model per group.
+"""Bake a checkpoint into a scene: bind state at t_max, tracks in world coordinates, and a motion model per group.
 
 Notation: in training a body moves x -> c + R_s (x - c) + d_s. With the bind state at the last knot T and any pivot p,
-the same motion is x_bind -> p + Q_s (x_bind - p) + D_s with Q_s = R_s R_T^-1 and
-D_s = c + d_s + Q_s (p - c - d_T) - p. Colours are taken over to the bind state by `shading`.
+the same motion is x_bind -> p + Q_s (x_bind - p) + D_s with Q_s = R_s R_T^-1 and D_s = c + d_s + Q_s (p - c - d_T) - p.
+Colours are transferred to the bind state by `train.representations.shading`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ log = logging.getLogger(__name__)
 
 
 def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
-    """Turn the last checkpoint of a run into a scene.
+    """Bake the last checkpoint of a run into a scene.
 
     Args:
-        run: A run folder; its training need not be finished.
-        dataset: The data set, read from where the run found it if not given.
+        run: A run folder; its training may be unfinished.
+        dataset: The data set; read from the place recorded in the run if None.
 
     Returns:
-        The scene, in the world of the data set.
+        The scene, in the world coordinates of the data set.
 
     Raises:
         CheckpointError, DatasetError: A file is missing or damaged.
@@ -59,7 +59,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     )
     state = checkpoint.load(run.folder)
     tensors, wanted = state.tensors, run.config.needs
-    # Objects that nobody named: their ids mean nothing to the data set.
+    # Discovered objects have no names; their ids are not those of the data set.
     found = packed_masks.NAME in tensors or packed_masks.LABELS in tensors
     if found:
         dataset = dataclasses.replace(dataset, object_names={}, object_aliases={})
@@ -75,7 +75,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     single: dict[str, Any] = {}
     if motion.points is not None and wanted.tracks != "off":
         extent = float(np.ptp(np.quantile(cloud.means, [0.01, 0.99], axis=0), axis=0).max())
-        # Relative to what the groups really did: what the user switches off must not come back as residuals.
+        # Relative to the trained poses, so that motion that the user switched off does not return as residuals.
         single = point_motion.members(motion.points, norm, cloud.motion_ids, bound.trained, bound.pivots, order, extent)
     bent = (0.0, 0.0, False, "nothing moves")
     if state.representation != representation.STILL:
@@ -169,9 +169,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
 
 
 def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.ImageEvidence | None:
-    """Return the evidence of the training images on a scene's motion; None if nothing moves.
+    """Return the evidence of the training images on a scene's motion; None if nothing moves or an image is missing.
 
-    A missing image is logged as a warning and gives None, too.
+    A missing image is logged as a warning.
     """
     if not np.any(scene.track_poses[..., 1:] != 0):
         return None
@@ -190,9 +190,10 @@ def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.
 def _on_training_views(
     tensors: dict[str, Tensor], trained: Scene, scene: Scene, dataset: Dataset, config: Config
 ) -> dict[str, Any]:
-    """PSNR of the checkpoint and of the scene on the training views, for the provenance; empty if one is missing.
+    """Return the PSNR of the checkpoint and of the scene on the training views, for the provenance.
 
-    A checkpoint of an unfinished or older run does not hold its own; the scene with the trained motion stands for it.
+    A checkpoint of an unfinished or older run does not store its PSNR; the scene with the trained motion is measured
+    instead. The result is empty if an image is missing.
     """
     behind = train_views.behind(dataset, config)
     try:
@@ -201,14 +202,14 @@ def _on_training_views(
             before = float(tensors[checkpoint_content.TRAIN_PSNR])
         else:
             before = probe.training_psnr(dataset, behind, image_evidence.painter(trained))
-    except DatasetError:  # `_evidence` says so
+    except DatasetError:  # `_evidence` has logged it
         return {}
     return {"training_views": {"checkpoint_psnr": before, "baked_psnr": baked}}
 
 
 @dataclass
 class _Cloud:
-    """The run's Gaussians in the world, in the order of training; brought to the bind state by `_bind`.
+    """Gaussians of a run in world coordinates, in the order of training. `_bind` brings them to the bind state.
 
     Attributes:
         means: [N, 3] float64
@@ -237,13 +238,13 @@ class _Cloud:
 
 @dataclass(frozen=True)
 class _Bound:
-    """The groups as `_bind` leaves them.
+    """Motion groups after `_bind`.
 
     Attributes:
         rows: The scene's groups, with static models.
-        trained: Their poses relative to the bind state as they were trained. [G, S, 7]
-        pivots: Points that these turn about. [G, 3]
-        played: The same poses without what the user switched off. [G, S, 7]
+        trained: Trained poses relative to the bind state. [G, S, 7]
+        pivots: Pivots of these poses. [G, 3]
+        played: The same poses without the parts that the user switched off. [G, S, 7]
     """
 
     rows: list[MotionGroup]
@@ -255,7 +256,7 @@ class _Bound:
 def _observed(
     run: checkpoint.Run, state: checkpoint.Checkpoint, norm: Normalization
 ) -> tuple[_Cloud, observed_motion.ObservedMotion]:
-    """Gaussians and observed motion of a checkpoint, without what the user leaves out."""
+    """Return the Gaussians and the observed motion of a checkpoint, without what the user switched off."""
     tensors, wanted = state.tensors, run.config.needs
     g = {n.removeprefix("gaussians."): t.numpy() for n, t in tensors.items() if n.startswith("gaussians.")}
     if not all(np.isfinite(a).all() for a in g.values()):
@@ -263,7 +264,7 @@ def _observed(
     present = tensors["object_ids"].numpy()
     if "labels" in tensors:
         labels = tensors["labels"].numpy()
-    else:  # an unfinished run has none yet
+    else:  # an unfinished run has no labels yet
         labels = registry.group_classes(state.representation, tensors)[g["motion_ids"]]
     motion = registry.observed_motion(
         state.representation, tensors, present, state.observed.numpy(), labels, run.config
@@ -303,7 +304,7 @@ def _bind(
     wanted: NeedsSection,
     names: dict[int, str],
 ) -> _Bound:
-    """Bring the Gaussians to the bind state, in place."""
+    """Bring the Gaussians to the bind state, in place, and return their motion groups."""
     rows, trained, pivots, played = [], [], [], []
     opacities = 1 / (1 + np.exp(-cloud.opacity_logits.astype(np.float64)))
     for index, group in enumerate(motion.groups):
@@ -320,7 +321,7 @@ def _bind(
         )
         pivot = _pivot(cloud.means[members], opacities[members], center + d)
         poses = _relative(group.quats, path, center, pivot)
-        if group.observed.any() and not motion.smooth:  # nothing is known of an object before it is seen
+        if group.observed.any() and not motion.smooth:  # before an object is seen its pose is unknown
             first = int(np.argmax(group.observed))
             poses[:first] = poses[first]
         trained.append(poses.copy())
@@ -337,7 +338,7 @@ def _bind(
 
 
 def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np.ndarray) -> np.ndarray:
-    """Poses about the pivot relative to the bind state, exactly the identity at the last knot. [S, 7]
+    """Return poses about the pivot relative to the bind state, exactly the identity at the last knot. [S, 7]
 
     Args:
         quats: Rotations about ``center``, wxyz. [S, 4]
@@ -353,14 +354,14 @@ def _relative(quats: np.ndarray, path: np.ndarray, center: np.ndarray, pivot: np
 
 
 def _radius(means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> float:
-    """Distance from the pivot that holds nine of ten members that can be seen."""
+    """Return the 90 % quantile of the visible members' distances from the pivot; 1 without members."""
     if len(means) == 0:
         return 1.0
     return float(np.quantile(np.linalg.norm(means - pivot, axis=1)[visibility.seen(opacities)], 0.9))
 
 
 def _anchor(rows: np.ndarray, means: np.ndarray, opacities: np.ndarray, pivot: np.ndarray) -> int:
-    """Row of the member nearest to the pivot among those that can be seen, -1 without members."""
+    """Return the row of the visible member nearest to the pivot, -1 without members."""
     if len(rows) == 0:
         return -1
     distance = np.where(visibility.seen(opacities), np.linalg.norm(means - pivot, axis=1), np.inf)
@@ -375,7 +376,7 @@ def _motion_group(
     model: MotionModel,
     anchor: int,
 ) -> MotionGroup:
-    """A row of the scene's table of groups, as of one whose members all move rigidly with it."""
+    """Return the scene's `MotionGroup` of a track whose members all move rigidly with it."""
     seen = times[group.observed]
     return MotionGroup(
         index,
@@ -391,13 +392,13 @@ def _motion_group(
 
 
 def _unit(vector: np.ndarray) -> tuple[np.ndarray, float]:
-    """Direction and length of a vector; along z where it has no length."""
+    """Return the direction and the length of a vector; the direction is z if the length is zero."""
     length = float(np.linalg.norm(vector))
     return (vector / length, length) if length > 1e-12 else (np.array([0.0, 0, 1]), 0.0)
 
 
 def _pivot(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np.ndarray:
-    """Middle of a group: per axis the opacity-weighted mean of members within the 5 % and 95 % quantiles."""
+    """Return the centre of a group: opacity-weighted mean per axis, without the outer 5 % at both ends."""
     if len(means) < 3:
         return np.asarray(means.mean(0) if len(means) else fallback, np.float64)
     low, high = np.quantile(means, [0.05, 0.95], axis=0)
@@ -408,11 +409,11 @@ def _pivot(means: np.ndarray, opacities: np.ndarray, fallback: np.ndarray) -> np
 
 
 def _background(coefficients: np.ndarray, wanted: str) -> np.ndarray:
-    """The sky's coefficients, only to the degree that shows: bands below half an 8-bit level are left out.
+    """Return the sky's coefficients without the highest degrees that an 8-bit image does not show (below half a level).
 
     Args:
-        coefficients: As trained. [Kb, 3]
-        wanted: The user's word on the gradient: "on" keeps them all, "off" the first alone, "auto" looks.
+        coefficients: Trained coefficients. [Kb, 3]
+        wanted: User's override for the gradient: "on" keeps all degrees, "off" only the constant, "auto" measures.
     """
     if wanted != "auto":
         return coefficients if wanted == "on" else coefficients[:1]
@@ -424,7 +425,7 @@ def _background(coefficients: np.ndarray, wanted: str) -> np.ndarray:
 
 
 def _objects(object_ids: np.ndarray, present: np.ndarray, dataset: Dataset) -> tuple[SceneObject, ...]:
-    """The table: unassigned Gaussians if any, the background, then every object; rows are sorted by id."""
+    """Return the object table, sorted by id: unassigned Gaussians (if any), background, objects."""
     table = []
     ids = [-1] * bool((object_ids == -1).any()) + sorted({0, *(int(i) for i in present)})
     taken: set[str] = set()
@@ -444,16 +445,18 @@ def _objects(object_ids: np.ndarray, present: np.ndarray, dataset: Dataset) -> t
 
 
 def run_bake(folder: Path, out: Path, dataset_root: Path | None = None, overrides: Sequence[str] = ()) -> Scene:
-    """Bake a run folder and write the scene file; returns the scene.
+    """Bake a run folder, write the scene file and return the scene.
 
     Args:
         folder: The run folder.
-        out: The scene file.
-        dataset_root: The data set, where it has moved.
+        out: Path of the scene file.
+        dataset_root: The data set; None if it has not moved since training.
         overrides: ``needs.NAME=on|off`` overrides of the run's configuration.
 
     Raises:
-        CheckpointError, ConfigError, DatasetError, SceneFileError: As their messages say.
+        CheckpointError: The checkpoint is missing or damaged, or the data set is not the one of the training.
+        ConfigError, UsageError: An override is invalid.
+        DatasetError, SceneFileError: The data set cannot be read, or the scene file cannot be written.
     """
     run = checkpoint.open_run(folder)
     configs.require_needs(overrides)

@@ -1,4 +1,4 @@
-"""Bodies of a scene that fall share one gravity, where the data says which way is up."""
+"""Shared gravity of the falling bodies of a scene, if the world convention defines the up axis."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ import numpy as np
 from ..motion.models import MotionModel
 from ..motion_fit import model_selection, shared_gravity
 
-UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}  # others do not say
+UP = {
+    "blender": np.array([0.0, 0.0, 1.0]),
+    "opengl": np.array([0.0, 1.0, 0.0]),
+}  # up axis; undefined in other conventions
 
 
 def share_gravity(
     fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]], convention: str
 ) -> dict[int, MotionModel]:
-    """Models of the fits; bodies that fall alike have one acceleration between them.
+    """Return the fitted models, with one common acceleration for bodies that fall alike.
 
     Args:
-        fits: By the index of a group: its track and what was fitted to it.
-        convention: World axes of the scene.
+        fits: Track and fit of each moving group, by group index.
+        convention: World convention of the scene; gravity is shared only if its up axis is known.
     """
     models = {index: fit.model for index, (_, fit) in fits.items()}
     if convention not in UP or not fits:

@@ -1,11 +1,12 @@
-"""Evidence of the training images on the motion of a scene's groups: picture errors, significance of a change.
+"""Evidence of the training images on the motion of a scene's groups: image errors, significance of a change.
 
-Notation: a group's poses change along d from what they are (0) to a simpler motion (1). To first order the picture of
+Notation: a group's poses change along d from the trained ones (0) to a simpler motion (1). To first order the image of
 view v at l is I_v + l D_v. With the residual r_v = I_v - truth, each cluster c of views (a camera, or some of its
-times) has the information q_c = sum D^2 and the score g_c = -sum r D, so that the images like l = sum g / sum q best.
-Errors of the pictures are alike at neighbouring pixels and times, and what changes the look of a surface, such as a
-passing shadow, is alike in all cameras. So the noise is not counted in pixels: it is the variance of sum (g - l q) over
-clusters of views and over patches of the body's surface (the sandwich estimate, clustered both ways).
+times) has the information q_c = sum D^2 and the score g_c = -sum r D, so that l = sum g / sum q fits the images best.
+Errors are correlated between neighbouring pixels and times, and effects that change the look of a surface, such as a
+passing shadow, are common to all cameras. Therefore the noise is not derived from the number of pixels: it is the
+variance of sum (g - l q) over clusters of views and over patches of the body's surface (the sandwich estimate,
+clustered both ways).
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from ..render import scene_renderer
 from ..scene.scene import Scene
 from ..train.train_views import spread
 
-PIXELS = 700_000  # of all sampled views together
-FEWEST, MOST = 20, 40  # sampled views, whatever their size
-CLUSTERS = 8  # cameras are split in time until there are so many
+PIXELS = 700_000  # total of the sampled views
+FEWEST, MOST = 20, 40  # limits of the number of sampled views
+CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
 PATCHES = 8  # of a body: its octants
-STEP = 0.02  # rad or radii by which poses are changed to see what the images do
+STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,11 @@ class Support:
     """Support of the images for a change from one motion of a group to a simpler one.
 
     Attributes:
-        sigmas: Distance of the simpler motion from what the images like best, in standard deviations; negative if they
-            like it better than the motion that was trained.
-        clusters: Independent parts that the deviation was taken from.
-        level: Root mean square of the change of the pixels that show the group, colours in [0, 1].
-        shape: Share of the change of the pictures that shape and texture make; colours that turn with the group make
-            the rest.
+        sigmas: Distance of the simpler motion from the best fit to the images, in standard deviations; negative if it
+            fits better than the trained motion.
+        clusters: Number of independent parts in the estimate of the deviation.
+        level: Root mean square change of the pixels that show the group, colours in [0, 1].
+        shape: Share of shape and texture in the change of the images; the rest is colours that turn with the group.
     """
 
     sigmas: float
@@ -51,10 +51,10 @@ class Support:
 
 
 class ImageEvidence:
-    """Some training views and what a scene shows in them.
+    """Comparison of a scene with a sample of its training views.
 
     Args:
-        scene: The scene with the motion that was trained; groups stay within the observed time.
+        scene: The scene with the trained motion; groups stay within the observed time.
         views: Views, as from `sample`.
         behind: Colour behind transparent pixels; None if the images are opaque. [3]
 
@@ -71,17 +71,17 @@ class ImageEvidence:
         self.psnr = self._psnr(self._scene)
 
     def loss(self, poses: np.ndarray) -> float:
-        """Mean PSNR that the sampled views lose with other poses of the groups, dB. [G, S, 7]"""
+        """Return the loss of mean PSNR on the sampled views with other poses [G, S, 7] of the groups, dB."""
         return self.psnr - self._psnr(self._with(poses))
 
     def support(
         self, group: int, before: np.ndarray, after: np.ndarray, size: float, rows: Sequence[int] | None = None
     ) -> Support:
-        """Significance of the change of shape and place from some poses to others, both in the colours of the others.
+        """Return the significance of a change of shape and place; both motions have the colours of ``after``.
 
         Args:
             group: The group.
-            before: Poses of all groups that were trained. [G, S, 7]
+            before: Trained poses of all groups. [G, S, 7]
             after: Poses of all groups with the simpler motion. [G, S, 7]
             size: Largest change, rad or radii.
             rows: Indices of the views to use; None for all.
@@ -113,13 +113,13 @@ class ImageEvidence:
         return dataclasses.replace(self._scene, track_poses=poses)
 
     def _octants(self, group: int) -> np.ndarray:
-        """Patch of each Gaussian: its octant about the group's pivot, `PATCHES` if it is no member. [N] int32"""
+        """Return the patch of each Gaussian: its octant about the pivot; `PATCHES` in other groups. [N] int32"""
         scene = self._scene
         octants = ((scene.means > scene.groups[group].pivot) @ np.array([1, 2, 4])).astype(np.int32)
         return np.where(scene.motion_ids == group, octants, np.int32(PATCHES))
 
     def glance(self, changes: np.ndarray) -> list[int]:
-        """One view of each cluster, that with the largest change at the knot nearest to its time. [S]"""
+        """Return one view per cluster: the one with the largest change [S] at the knot nearest to its time."""
         knots = np.abs(self._scene.track_times[:, None] - [view.t for view in self._views]).argmin(0)
         clusters = range(int(self._clusters.max()) + 1)
         mine = (np.flatnonzero(self._clusters == cluster) for cluster in clusters)
@@ -128,13 +128,13 @@ class ImageEvidence:
     def _draw(
         self, player: scene_player.Player, row: int, factor: np.ndarray | None = None, octants: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Picture of a view, sRGB in [0, 1] [H, W, 3], and the patch that each pixel shows [H, W].
+        """Return the image of a view, sRGB in [0, 1] [H, W, 3], and the patch that each pixel shows [H, W].
 
         Args:
-            player: Of the poses.
-            row: The view.
-            factor: Shading to draw with instead of that of the poses. [N]
-            octants: Patch of each Gaussian; without it the patches mean nothing. [N]
+            player: Player of the poses.
+            row: Index of the view.
+            factor: Shading factors that replace those of the poses. [N]
+            octants: Patch of each Gaussian; without it, the returned patches are meaningless. [N]
         """
         view = self._views[row]
         frame = player.frame(view.t)
@@ -156,7 +156,7 @@ class ImageEvidence:
 def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: float) -> Support:
     """Return the support from the scores and the information of each cluster and patch. [C, PATCHES + 1] each
 
-    The variance is that over clusters and over patches, less that over both, which is in each of them.
+    The variance is the sum of those over clusters and over patches, less their intersection, which both contain.
     """
     total = float(information.sum())
     if total <= 0:
@@ -186,7 +186,7 @@ def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:
 
 
 def sample(views: Sequence[datasets.View]) -> list[datasets.View]:
-    """Some views, evenly over the times of each camera, as many as `PIXELS` allows."""
+    """Return views spread evenly over the times of each camera, as many as `PIXELS` allows."""
     size = float(np.median([view.camera.width * view.camera.height for view in views]))
     limit = int(np.clip(PIXELS / size, FEWEST, MOST))
     cameras = _by_camera(views)
@@ -203,7 +203,7 @@ def _by_camera(views: Sequence[datasets.View]) -> dict[str, list[datasets.View]]
 
 
 def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
-    """Cluster of each view: its camera, or a stretch of its camera's times where cameras are few. [V]"""
+    """Return the cluster of each view: its camera, or an interval of its camera's times if cameras are few. [V]"""
     cameras = _by_camera(views)
     parts = -(-CLUSTERS // len(cameras))
     found: dict[int, int] = {}
@@ -222,7 +222,7 @@ def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
 
 
 def _between(before: np.ndarray, after: np.ndarray, share: float) -> np.ndarray:
-    """Poses a share of the way from some to others, beyond either too. [G, S, 7]"""
+    """Interpolate (or extrapolate) between poses; ``share`` is 0 at ``before`` and 1 at ``after``. [G, S, 7]"""
     turn = rotations.multiply(after[..., :4], rotations.conjugate(before[..., :4]))
     turn = rotations.rotvecs_to_quats(share * rotations.quats_to_rotvecs(turn))
     quats = rotations.normalize(rotations.multiply(turn, before[..., :4]))

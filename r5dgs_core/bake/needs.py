@@ -1,7 +1,7 @@
-"""What a scene does not need and therefore does not carry: the table of decisions, with the number behind each.
+"""The needs table: features that a scene needs, each with its measured value, threshold and decision.
 
-``needs.NAME`` of the configuration is the user's word on a row: it wins over the number, in training
-(`training_needs.resolve`) and in baking (`decide`, `simplify_motion`).
+``needs.NAME`` in the configuration is the user's override of a row; it takes precedence over the measurement in
+training (`training_needs.resolve`) and in baking (`decide`, `simplify_motion`).
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from ..scene.scene import MotionGroup
 from ..train.observed_motion import Moves
 
 STILL_QUAT = rotations.identity()
-STILL = 0.0025  # displacement, as a share of the group's diameter, that counts as rest if the images are missing
-TURN = 0.002  # rotation in radians that counts as none if the images are missing
-SHADING_LEVEL = 0.5 / 255  # change of colour that an 8-bit image does not show
-SKY_BAND = 0.5 / 255  # size of a sky coefficient that an 8-bit image does not show
+STILL = 0.0025  # displacement in diameters of the group below which it is at rest, if the images are missing
+TURN = 0.002  # rotation in radians that is negligible, if the images are missing
+SHADING_LEVEL = 0.5 / 255  # change of colour that is invisible in an 8-bit image
+SKY_BAND = 0.5 / 255  # sky coefficient that is invisible in an 8-bit image
 
 
 def _travel(poses: np.ndarray, radius: float) -> float:
-    """Largest displacement of a track, in diameters."""
+    """Return the largest displacement of a track, in diameters."""
     return float(np.linalg.norm(poses[:, 4:], axis=1).max()) / (2 * radius)
 
 
 def _turn(poses: np.ndarray) -> float:
-    """Largest rotation of a track, rad."""
+    """Return the largest rotation of a track, rad."""
     return float(rotations.angle_between(poses[:, :4], STILL_QUAT).max())
 
 
 def is_on(table: Sequence[dict[str, Any]], name: str) -> bool:
-    """Decision of a row of the table."""
+    """True if the row ``name`` of the table is "on"."""
     return next(row["decision"] == "on" for row in table if row["name"] == name)
 
 
@@ -51,24 +51,24 @@ def decide(
     residuals: tuple[float, float, bool, str] = (0.0, 0.0, False, "none was tried"),
     moves: Moves | None = None,
 ) -> tuple[dict[str, Any], ...]:
-    """The needs table of a baked scene.
+    """Return the needs table of a baked scene.
 
     Args:
         groups: Motion groups.
-        track_poses: Their tracks relative to the bind state, simplified already. G of [S, 7]
+        track_poses: Their tracks relative to the bind state, already simplified. G of [S, 7]
         motion_ids: Group of each Gaussian. [N]
         shading: Shading vectors in the bind state. [N, 3]
         light: Light direction. [3]
         background_sh: Sky coefficients that were kept. [Kb, 3]
         bases: Spherical harmonics bases of the colours.
-        classified: Whether identities and their classifier were trained.
-        wanted: The user's word on each row; by default everything is measured.
-        residuals: Value and threshold of the residuals of single Gaussians, whether there are any, what the value is.
-        moves: Gaussians that went to groups that explain them better, or None where none was asked.
+        classified: True if identities and their classifier were trained.
+        wanted: User's override of each row; None measures all.
+        residuals: Value and threshold of the row "residuals", True if the scene has residuals, and the reason.
+        moves: Gaussians that were moved to another group; None if regrouping did not run.
 
     Returns:
-        Rows with name, value, threshold, decision ("on" or "off") and reason, which says where the user decided. What
-        the run has not learned stays off.
+        Rows with name, value, threshold, decision ("on" or "off") and reason, which names the user's overrides. A
+        feature that the run has not learned stays "off".
     """
     wanted = wanted or NeedsSection()
     bodies = [g for g in groups if g.role == "body"]
@@ -81,7 +81,7 @@ def decide(
     moved, turned = f"{moving} of {len(bodies)} objects move or turn", "largest turn in the observed time, rad"
     lit = bool(np.any(shading) and np.any(light))
     followers = "Gaussians that follow a caster on its support"
-    # Name, value, threshold, whether it is needed by that, whether the run has it at all, what the value is.
+    # Name, value, threshold, True if needed, True if the run has learned it, meaning of the value.
     rows = [
         ("tracks", largest_travel, 0.0, moving > 0, len(bodies) > 0, moved),
         ("rotation", largest_turn, 0.0, largest_turn > 0, len(bodies) > 0, turned),
@@ -100,7 +100,7 @@ def decide(
 
 
 def _said(moves: Moves | None) -> str:
-    """What became of the Gaussians that move, in words."""
+    """Summary of the regrouping, for the reason of its row."""
     if moves is None:
         return "each Gaussian goes with the group that it was made for"
     said = (
@@ -111,7 +111,7 @@ def _said(moves: Moves | None) -> str:
 
 
 def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:
-    """`row`, with the user's word."""
+    """Return a row of the table with the user's override applied."""
     if wanted != "auto":
         on = wanted == "on" and there
         missing = wanted == "on" and not there
@@ -120,7 +120,7 @@ def _row(name: str, value: float, threshold: float, on: bool, there: bool, reaso
 
 
 def row(name: str, value: float, threshold: float, on: bool, reason: str) -> dict[str, Any]:
-    """A row of the table."""
+    """Return a row of the table."""
     return {
         "name": name,
         "value": float(value),

@@ -1,7 +1,7 @@
-"""Motion of single Gaussians as a scene stores it: relative to the bind state and to what their groups do.
+"""Motion of single Gaussians as stored in a scene: residuals relative to the rigid motion of their groups.
 
-Notation: R Gaussians with states x_s at the knots s, last knot T. Their group takes the bind state x_T to
-Q_s (x_T - p) + p + D_s; a residual is the change of the bind state that its group then brings to x_s.
+Notation: R Gaussians with states x_s at the knots s, last knot T. Their group moves the bind state x_T to Q_s (x_T - p)
++ p + D_s. A residual is the change of the bind state that the group's motion takes to x_s.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ..scene.scene import MotionGroup
 from ..train.normalization import Normalization
 from ..train.observed_motion import PointMotion
 
-AT_ONCE = 8192  # Gaussians that are related to their groups at once; bounds memory
-VISIBLE = 1e-4  # residuals below this share of the scene's size, and below this angle or log scale, are left out
+AT_ONCE = 8192  # Gaussians per block; bounds memory
+VISIBLE = 1e-4  # smallest residual that is stored: offset / scene size, angle in rad, or change of log scale
 
 
 def members(
@@ -30,20 +30,20 @@ def members(
     order: np.ndarray,
     extent: float,
 ) -> dict[str, Any]:
-    """The fields of `Scene` that hold motion of single Gaussians.
+    """Return the fields of `Scene` that store the motion of single Gaussians.
 
     Args:
         points: States at the knots, training coordinates.
-        norm: From training coordinates to the world.
+        norm: Training coordinates to world coordinates.
         motion_ids: Group of each Gaussian, in the order of training. [N]
         track_poses: Poses of the groups at the knots, relative to the bind state. [G, S, 7]
-        pivots: Points that they turn about, world. [G, 3]
-        order: Row of training of each row of the scene. [N]
+        pivots: Pivots of the groups, world. [G, 3]
+        order: Training row of each row of the scene. [N]
         extent: Size of the scene, world units.
 
     Returns:
         ``residual_rows``, ``residual_offsets``, ``residual_quats``, ``residual_log_scales``, ``dynamics`` and
-        ``canonical_means``; None where a scene needs none.
+        ``canonical_means``; fields that the scene does not need are missing.
     """
     result: dict[str, Any] = {}
     if points.dynamics is not None and np.any(points.dynamics):
@@ -69,14 +69,14 @@ def members(
 def _relative(
     points: PointMotion, chosen: np.ndarray, norm: Normalization, poses: np.ndarray, pivots: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals of some Gaussians: offsets [R, S, 3], rotations with continuous signs [R, S, 4], growths [R, S, 3].
+    """Return residuals: offsets [R, S, 3], rotations with continuous signs [R, S, 4], changes of log scales [R, S, 3].
 
     Args:
         points: States at the knots, training coordinates.
-        chosen: Which of its rows. [R]
-        norm: From training coordinates to the world.
-        poses: Of their groups, relative to the bind state. [R, S, 7]
-        pivots: Of their groups, world. [R, 3]
+        chosen: Rows of ``points``. [R]
+        norm: Training coordinates to world coordinates.
+        poses: Poses of the rows' groups, relative to the bind state. [R, S, 7]
+        pivots: Pivots of the rows' groups, world. [R, 3]
     """
     pivot, world = pivots[:, None], norm.points_to_world(points.means[chosen])
     back = rotations.conjugate(poses[..., :4])
@@ -85,19 +85,19 @@ def _relative(
     turns = rotations.normalize(rotations.multiply(rotations.multiply(back, quats), rotations.conjugate(quats[:, -1:])))
     growths = points.log_scales[chosen] - points.log_scales[chosen][:, -1:]
     offsets[:, -1], growths[:, -1], turns[:, -1] = 0.0, 0.0, [1.0, 0, 0, 0]
-    backwards = np.moveaxis(turns[:, ::-1], 1, 0)  # signs go on from the last knot, the identity
+    backwards = np.moveaxis(turns[:, ::-1], 1, 0)  # signs are continuous from the last knot, the identity
     return offsets, np.moveaxis(rotations.make_continuous(backwards), 0, 1)[:, ::-1], growths
 
 
 def departures(
     groups: Sequence[MotionGroup], motion_ids: np.ndarray, rows: np.ndarray, offsets: np.ndarray
 ) -> list[MotionGroup]:
-    """The groups with the distance that their members keep from rigid motion in the observed time.
+    """Return the groups with the deviations of their members from rigid motion in the observed time (rms and maximum).
 
     Args:
         groups: Motion groups.
         motion_ids: Group of each Gaussian of the scene. [N]
-        rows: Those with residuals. [R]
+        rows: Gaussians with residuals. [R]
         offsets: Their residual offsets. [R, S, 3]
     """
     squares, result = (offsets.astype(np.float64) ** 2).sum(-1), []

@@ -1,17 +1,17 @@
-"""The motion of a scene's bodies without what neither the training images nor the poses need.
+"""Simplification of the motion of a scene's bodies: turns, paths and bends that are noise are dropped.
 
-A body's motion has two parts, its turn and its path. The turn may be dropped, and the path may be replaced by one place
-or by a straight line. Each of these is done if and only if
+The motion of a body has two parts, its turn and its path. The turn may be dropped, and the path may be replaced by a
+fixed place or by a straight line. Each of these is done if and only if
 
-- the poses do not change by more than their noise: the training images do not tell the simpler motion from the trained
-  one (`image_evidence`), by an F test at `LEVEL`; or the body's pixels change by less than 8 bits show; or a turn
-  serves colours rather than shape (`SHAPE`); and
-- the training views lose no more than `LOSS` dB by all simplifications of the scene together.
+- the poses do not change by more than their noise: the training images do not distinguish the simpler motion from the
+  trained one (`image_evidence`), by an F test at `LEVEL`; or the body's pixels change by less than 8 bits show; or a
+  turn serves colours rather than shape (`SHAPE`); and
+- all simplifications of the scene together lower the PSNR of the training views by at most `LOSS`.
 
 A part that only the colours of the images need, such as a turn by which shading imitates a shadow, is kept in the
-observed time, but nothing follows from it for the time after: the motion past t_max is fitted without it.
+observed time, but the motion past t_max is fitted without it.
 
-Notation: G groups, S poses. Poses are relative to the bind state that the scene was given with until `_finish`.
+Notation: G groups, S poses. Poses are relative to the bind state that the scene was given with until `_rebound`.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from .image_evidence import ImageEvidence
 log = logging.getLogger(__name__)
 
 LEVEL = 0.01  # probability with which noise alone passes for motion
-LOSS = 0.03  # dB of the training views that all simplifications together may take
-SHAPE = 0.5  # share of a turn's effect on the pictures below which it serves colours, as of a shadow that passes
-CLEARLY = 3.0  # times the noise that may be: seen at a glance, in one view of each cluster
-LARGEST = 0.05  # spread of turns in rad, of paths in diameters, that is motion without a look at the images
+LOSS = 0.03  # largest loss of PSNR on the training views by all simplifications together, dB
+SHAPE = 0.5  # share of shape in a turn's effect on the images, below which the turn serves colours (passing shadows)
+CLEARLY = 3.0  # change / allowed change above which one view per cluster decides
+LARGEST = 0.05  # spread (rad or diameters) above which motion is kept without comparing images
 
 
 @dataclass(frozen=True)
 class _Part:
-    """A simplification of one body's motion.
+    """Simplification of one body's motion.
 
     Attributes:
-        group: The body.
+        group: Group of the body.
         name: Row of the needs table that it decides: "rotation" (the body does not turn), "motion" (it stays in its
             place) or "curved_path" (its path is straight).
-        poses: The body's poses with it. [S, 7]
-        spread: Root mean square per component of what is dropped: rad, or world units.
+        poses: Simplified poses of the body. [S, 7]
+        spread: Root mean square per component of the dropped motion, rad or world units.
         value: The same, rad or diameters.
         change: The same in units of its noise.
         allowed: Largest change that counts as noise.
-        why: What the noise was judged by, in words.
+        why: Basis of the noise estimate, in words.
         kept: True if the user keeps the part.
         seen: True if the noise was measured in the images.
     """
@@ -81,11 +81,11 @@ class _Part:
 
 @dataclass(frozen=True)
 class Simplified:
-    """A scene with the motion that it needs.
+    """Scene with simplified motion.
 
     Attributes:
-        scene: The scene, with another bind state for bodies whose last pose was off the simpler motion.
-        rows: What was measured and decided for each body, as rows of the needs table.
+        scene: The scene, in a new bind state for bodies whose last pose was not on the simplified motion.
+        rows: Measurements and decisions for each body, as rows of the needs table.
     """
 
     scene: Scene
@@ -98,10 +98,10 @@ def simplify(
     """Drop turns, paths and bends that are noise, and fit the motion past t_max.
 
     Args:
-        scene: The scene with the poses that were trained and static models of the groups' radii.
+        scene: The scene with trained poses and static models that hold the groups' radii.
         observed: Knots at which each group was placed. [G, S] bool
-        evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and
-            `needs.TURN` is dropped.
+        evidence: The training images; None if they are missing. Then only motion below `needs.STILL` and `needs.TURN`
+            is dropped.
         wanted: The user's overrides; parts that are "on" are kept.
 
     Returns:
@@ -127,7 +127,7 @@ def simplify(
         rows += [{"object": names[g.object_id], **row} for row in found]
     models = falling_bodies.share_gravity(fits, scene.world_convention)
     groups = list(bound.groups)
-    for part in parts:  # what follows no noise starts at the bind state
+    for part in parts:  # a model fitted without noise starts at the bind state
         if part.noise and part.group in models:
             offset = "offset_rotvec" if part.name == "rotation" else "offset_displacement"
             models[part.group] = dataclasses.replace(models[part.group], **{offset: np.zeros(3)})
@@ -139,7 +139,7 @@ def simplify(
 def _parts(
     scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
 ) -> list[_Part]:
-    """Simplifications of one body: of its turn, and of its path to a place, or else to a line."""
+    """Return the candidate simplifications of a body: of its turn, and of its path to a place or else a line."""
     poses, weights = scene.track_poses[group], observed.astype(np.float64)
     weights = weights if weights.any() else np.ones(len(poses))
     mean = rotations.normalize(weights @ rotations.make_continuous(poses[:, :4]))
@@ -170,7 +170,7 @@ def _judged(
     evidence: ImageEvidence | None,
     kept: bool,
 ) -> _Part:
-    """A part, with what it drops [S, 3] in rad or world units measured by its noise."""
+    """Return a candidate whose dropped motion [S, 3] (rad or world units) is measured in units of its noise."""
     unit = 1.0 if name == "rotation" else 2 * scene.groups[group].model.radius
     spread = float(np.sqrt(np.average((dropped**2).mean(1), weights=weights)))
     if evidence is None:
@@ -199,7 +199,7 @@ def _judged(
 
 
 def _independent(series: np.ndarray) -> float:
-    """Number of independent values in a series that is correlated in time, from its first lag. [S, 3]"""
+    """Return the number of independent values in an autocorrelated series, from its first lag. [S, 3]"""
     energy = float((series**2).sum())
     lag = float((series[1:] * series[:-1]).sum()) / energy if energy > 0 else 0.0
     lag = min(max(lag, 0.0), 1.0)
@@ -209,7 +209,7 @@ def _independent(series: np.ndarray) -> float:
 def _unseen(
     scene: Scene, parts: Sequence[_Part], evidence: ImageEvidence | None
 ) -> tuple[list[_Part], dict[int, float]]:
-    """Return the parts that the images do not need, cheapest first, and the cost of each part by its `id`, dB."""
+    """Return the parts that the images do not need, cheapest first, and the PSNR loss of each part by its `id`, dB."""
     if evidence is None or not parts:
         return list(parts), {}
     losses = {id(part): evidence.loss(_with_parts(scene, [part])) for part in parts}
@@ -225,7 +225,7 @@ def _unseen(
 
 
 def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
-    """Poses of all groups with some simplifications. [G, S, 7]"""
+    """Return the poses of all groups with some simplifications applied. [G, S, 7]"""
     poses = scene.track_poses.copy()
     for part in parts:
         columns = slice(0, 4) if part.name == "rotation" else slice(4, 7)
@@ -234,7 +234,7 @@ def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
 
 
 def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
-    """Poses of all groups, those of followers brought to what their leaders do now, in place. [G, S, 7]"""
+    """Update the poses of followers to the new poses of their leaders, in place, and return the poses. [G, S, 7]"""
     change = poses[..., 4:] - scene.track_poses[..., 4:]
     for g in scene.groups:
         if g.follows is not None and g.follow_matrix is not None:
@@ -243,7 +243,7 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
-    """Return the scene with other poses [G, S, 7], bound in the last pose of each group."""
+    """Return the scene with other poses [G, S, 7], in the bind state of each group's last pose."""
     if np.array_equal(poses, scene.track_poses):
         return scene
     arrays = {name: getattr(scene, name) for name in _BOUND}
@@ -274,7 +274,7 @@ _BOUND = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets",
 def _bind(
     scene: Scene, arrays: dict[str, np.ndarray], rows: np.ndarray, pivot: np.ndarray, q: np.ndarray, d: np.ndarray
 ) -> None:
-    """Move Gaussians to another bind state, in place: turned by q [4] about the pivot [3], and shifted by d [3]."""
+    """Move Gaussians to another bind state, in place: a rotation q [4] about the pivot [3] and a shift d [3]."""
     means = arrays["means"][rows].astype(np.float64)
     arrays["means"][rows] = pivot + rotations.rotate(q, means - pivot) + d
     if not np.any(q[1:] != 0):
@@ -295,7 +295,7 @@ def _bind(
 
 
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
-    """Poses that the future motion is fitted to: without noise, even if the images need it. [S, 7] relative to t_max"""
+    """Return the poses for the fit past t_max: without noise, even if the images need it, relative to t_max. [S, 7]"""
     result = poses.copy()
     for part in parts:
         if part.noise and part.name == "rotation":
@@ -308,7 +308,10 @@ def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
 def _fit(
     scene: Scene, group: int, observed: np.ndarray, poses: np.ndarray, parts: Sequence[_Part]
 ) -> tuple[shared_gravity.Track, model_selection.Fit]:
-    """Fit a body's future motion; return the fitted track, too. The noise is at least that measured in the images."""
+    """Fit a body's motion past t_max and return its track and the fit.
+
+    The noise is at least that measured in the images.
+    """
     members = scene.motion_ids == group
     opacities = 1 / (1 + np.exp(-scene.opacity_logits[members].astype(np.float64)))
     body = free_top.inertia(scene.means[members][visibility.seen(opacities)].astype(np.float64))
@@ -341,7 +344,7 @@ _SPREADS = {
 
 
 def _row(part: _Part, dropped: bool, loss: float | None, said: str, travel: float) -> dict[str, Any]:
-    """Row of the needs table of a part: the threshold is the spread that would be noise."""
+    """Row of the needs table for a part; its threshold is the largest spread that counts as noise."""
     threshold = part.value * part.allowed / part.change if part.change > 0 else LARGEST
     why = part.why
     if loss is not None:

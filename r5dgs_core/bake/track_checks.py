@@ -1,4 +1,4 @@
-"""What is wrong with the track of one group is told by its name, and stays with that group."""
+"""Checks of single tracks: problems are reported with the object's name and do not affect other groups."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ log = logging.getLogger(__name__)
 
 
 def sound(group: GroupTrack, name: str) -> GroupTrack:
-    """The group, at rest in its place if its track holds values that are not finite; then with a warning.
+    """Return the group, or the group at rest, with a warning, if its track is not finite.
 
     Args:
         group: A motion group.
-        name: Of its object, for the warning.
+        name: Name of its object, for the warning.
     """
     track = np.concatenate([group.quats, group.displacements], axis=1)
     bad = np.asarray(~np.isfinite(track).all(1))
@@ -36,12 +36,12 @@ def sound(group: GroupTrack, name: str) -> GroupTrack:
 
 
 def warn_of_aliasing(name: str, times: np.ndarray, track: np.ndarray) -> None:
-    """Warn if an object turns by more than 120 degrees between two observed times: it may turn the other way.
+    """Warn if an object turns by more than 120 degrees between two observed times, as its direction is then ambiguous.
 
     Args:
-        name: Of the object.
+        name: Name of the object.
         times: Observed times. [S]
-        track: Its poses, rotation wxyz first. [S, 7]
+        track: Poses of the object, rotation wxyz first. [S, 7]
     """
     found = rigid_fit.aliased_step(times, track[:, :4])
     if found is not None:
