@@ -1,6 +1,6 @@
-"""Differentiable rasterizer of Gaussians, one signature: `cpu` (numba), `cuda` and `reference` (plain torch)."""
+"""Differentiable Gaussian rasterizer with three backends: `cpu` (numba), `cuda` (gsplat) and `reference` (torch)."""
 
-from . import environment as environment  # first, as it checks what numba reads when it is imported
+from . import environment as environment  # first: validates variables that numba reads
 from .rasterizer import rasterize, rasterize_splats
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
 

@@ -1,4 +1,4 @@
-"""Choice of the backend that rasterizes given tensors on this machine."""
+"""Selection of the rasterizer backend for given tensors on this machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ log = logging.getLogger(__name__)
 
 
 def choose_backend(backend: str, means: torch.Tensor) -> str:
-    """Name of the backend that draws tensors like ``means`` when ``backend`` is asked for. Raises BackendError."""
+    """Return the backend to use for tensors like ``means``, resolving "auto".
+
+    Raises:
+        ValueError: The name is unknown.
+        BackendError: The backend cannot rasterize these tensors here.
+    """
     if backend not in BACKENDS:
         raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
     if backend == "auto":
@@ -46,7 +51,7 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
 
 
 def numba_is_there() -> bool:
-    """Whether kernels can be compiled here; numba itself is not imported for the answer."""
+    """Return True if numba is installed. Does not import it."""
     return importlib.util.find_spec("numba") is not None
 
 

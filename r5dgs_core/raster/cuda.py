@@ -1,11 +1,11 @@
-"""Rasterizer on NVIDIA GPUs: plain torch projects in float64, kernels of gsplat (Apache-2.0) blend in float32.
+"""Rasterizer for NVIDIA GPUs: float64 projection in torch, float32 blending by gsplat kernels (Apache-2.0).
 
-Of gsplat three functions are called: `isect_tiles` and `isect_offset_encode` list the Gaussians of each tile,
-`rasterize_to_pixels` blends them. Its projection is not: it knows no skew and no other clamp than its own, and it culls
-and sorts in float32, while that of the reference makes both backends draw the same Gaussians in the same order.
+Only three functions of gsplat are used: `isect_tiles` and `isect_offset_encode` list the Gaussians of each tile,
+`rasterize_to_pixels` blends them. The projection is that of the reference, so that both backends draw the same
+Gaussians in the same order: gsplat's projection lacks skew and a configurable clamp, and culls and sorts in float32.
 
-gsplat is imported when something is drawn, not when this module is. Its thresholds are compiled into it; `Kernels`
-carries them, and `check_settings` refuses settings that ask for others.
+gsplat is imported on the first call. Its thresholds are compile-time constants; `Kernels` records them, and
+`check_settings` rejects settings that differ.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from .settings import RasterSettings, RasterStats, SplatImage
 
 log = logging.getLogger(__name__)
 
-TILE = 16  # px; the size that gsplat tunes its kernels for
-# Compiled into gsplat 1.5 and 1.6 alike. More than 32 at a time need more shared memory than some GPUs have.
+TILE = 16  # px; gsplat tunes its kernels for this size
+# Compiled into gsplat 1.5 and 1.6. More than 32 channels need more shared memory than some GPUs have.
 CHANNEL_COUNTS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32)
-OLDEST_GSPLAT = (1, 5)  # the first that takes a radius per axis
-ALPHA_MAX_SLACK = 0.01  # difference of alpha_max that is drawn, with a warning
+OLDEST_GSPLAT = (1, 5)  # first version with one radius per axis
+ALPHA_MAX_SLACK = 0.01  # accepted difference of alpha_max, with a warning
 
 
 @dataclass(frozen=True)
 class Kernels:
-    """What is called of gsplat, and the thresholds that are compiled into it.
+    """Functions of gsplat, and the thresholds compiled into them.
 
     Attributes:
-        isect_tiles: Pairs of tile and Gaussian, sorted by tile and depth.
-        isect_offset_encode: Where the pairs of each tile begin.
-        rasterize_to_pixels: Blended channels and alpha, differentiable.
-        version: Of gsplat, for messages.
+        isect_tiles: Returns pairs of tile and Gaussian, sorted by tile and depth.
+        isect_offset_encode: Returns the first pair of each tile.
+        rasterize_to_pixels: Returns blended channels and alpha, differentiable.
+        version: gsplat version, for messages.
         alpha_min: Contributions below this are dropped.
-        alpha_max: Contributions are capped here.
+        alpha_max: Cap on contributions.
         transmittance_min: A pixel is finished before its transmittance reaches this.
     """
 
@@ -59,7 +59,7 @@ class Kernels:
 
 @dataclass(frozen=True)
 class _Projected:
-    """Gaussians that touch the image, near to far, as gsplat takes them, and the tiles that they touch."""
+    """Gaussians that touch the image, near to far, in gsplat's layout, and the tiles that they touch."""
 
     means2d: torch.Tensor  # [V, 2] px
     conics: torch.Tensor  # [V, 3] inverse covariance: xx, xy, yy
@@ -82,7 +82,7 @@ def rasterize_splats(
     settings: RasterSettings,
     stats: RasterStats | None,
 ) -> SplatImage:
-    """Draw as `rasterizer.rasterize_splats` says; inputs are checked there."""
+    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
     kernels = find_kernels()
     if isinstance(kernels, str):
         raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
@@ -94,7 +94,7 @@ def rasterize_splats(
         order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
         tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
-        # Once more with gradients, only what is seen: the graph of a float64 projection is the largest thing in memory.
+        # Project only visible Gaussians with gradients: the graph of a float64 projection dominates the memory.
         seen = (means[order].double(), quats[order].double(), scales[order].double())
         means2d, axes, z = reference.project(*seen, camera, settings)
     else:
@@ -120,9 +120,9 @@ def rasterize_splats(
 
 
 def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
-    """Why tensors of this device and dtype cannot be drawn here, and the remedy; None where they can.
+    """Return the reason why tensors of this device and dtype cannot be rasterized here, and the remedy, or None.
 
-    The first call may take minutes: gsplat compiles its kernels when they are first loaded on a machine.
+    The first call may take minutes, as gsplat compiles its kernels when they are first loaded on a machine.
     """
     if torch.version.cuda is None:
         return (
@@ -144,11 +144,11 @@ def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
 
 @functools.cache
 def find_kernels() -> Kernels | str:
-    """Kernels of gsplat, or why they cannot be used, and the remedy; found once, as a build may fail after minutes."""
+    """Load the kernels of gsplat; return the reason and the remedy on failure. Cached, as a build can fail slowly."""
     log.info("rasterizer 'cuda': loading gsplat; the first time on a machine it compiles for minutes")
     version = "(unknown version)"
     try:
-        # gsplat reports its build on stdout, which is that of the caller: `--progress json` writes there.
+        # gsplat prints build messages to stdout, which `--progress json` uses.
         with contextlib.redirect_stdout(sys.stderr):
             import gsplat
 
@@ -157,7 +157,7 @@ def find_kernels() -> Kernels | str:
                 oldest = ".".join(map(str, OLDEST_GSPLAT))
                 return f"gsplat {version} is too old; remedy: pip install -U 'gsplat>={oldest}'"
             from gsplat.cuda import _backend
-    except Exception as error:  # a compiler, a linker and a loader may fail in their own ways
+    except Exception as error:  # compiler, linker and loader raise many types
         if isinstance(error, ModuleNotFoundError) and error.name == "gsplat":
             return "gsplat is not installed; remedy: pip install 'r5dgs[cuda]'"
         what = (str(error).splitlines() or [""])[0]
@@ -177,7 +177,7 @@ def find_kernels() -> Kernels | str:
 
 
 def _read_thresholds() -> dict[str, float]:
-    """Thresholds of the gsplat that is installed: 1.6 states them, those of 1.5 stand in its kernels."""
+    """Thresholds of the installed gsplat: 1.6 exports them, those of 1.5 are hard-coded in its kernels."""
     try:
         from gsplat.cuda import _constants as constants
     except ImportError:
@@ -190,12 +190,12 @@ def _read_thresholds() -> dict[str, float]:
 
 
 def check_settings(settings: RasterSettings, kernels: Kernels, opacities: torch.Tensor) -> None:
-    """Raise BackendError naming the setting that these kernels cannot meet; warn where they meet it nearly.
+    """Raise BackendError for a setting that the kernels cannot meet; warn if they nearly meet it.
 
     Args:
-        settings: What is asked for.
-        kernels: With the thresholds compiled into them.
-        opacities: Where none exceeds either cap, ``alpha_max`` is never used, and any value of it is met. [N]
+        settings: Requested settings.
+        kernels: Kernels with their compiled thresholds.
+        opacities: If none exceeds either cap, ``alpha_max`` has no effect and any value is accepted. [N]
     """
     for name in ("alpha_min", "transmittance_min"):
         wanted, there = getattr(settings, name), getattr(kernels, name)
@@ -233,11 +233,11 @@ def _tile_lists(
     camera: Camera,
     kernels: Kernels,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which Gaussians touch which tile: first pair of each tile [1, tiles high, tiles wide], Gaussian of each pair [P].
+    """List the Gaussians of each tile: first pair of each tile [1, tiles high, tiles wide], Gaussian of each pair [P].
 
-    gsplat is given the box of each alpha_min ellipse inside the image, whose numbers are small whatever those of the
-    Gaussian, and the rank in depth for the depth, which float32 holds where it would round neighbours together. Equal
-    ranks, from the 16.7 millionth on, stay in order all the same, as the sort is stable.
+    gsplat gets the box of each alpha_min ellipse, clipped to the image, which keeps its numbers small. Depths are
+    replaced by ranks, which float32 does not round together. Ranks beyond 2^24 (16.7 million) may be equal, but the
+    sort is stable.
     """
     size = means2d.new_tensor([camera.width, camera.height])
     low, high = (means2d - extent).clamp_min(0), torch.minimum(means2d + extent, size)
@@ -252,9 +252,9 @@ def _tile_lists(
 
 
 def _blend(splats: _Projected, values: torch.Tensor, kernels: Kernels) -> tuple[torch.Tensor, torch.Tensor]:
-    """Blend values [V, D] front to back: their weighted sums [H, W, D] and alpha [H, W]."""
+    """Blend values [V, D] front to back: weighted sums [H, W, D] and alpha [H, W]."""
     if not len(values):
-        # Sums over nothing are zero, and keep the result on the graph of the inputs.
+        # An empty sum is zero and keeps the result connected to the inputs' graph.
         nothing = sum(t.sum() for t in (splats.means2d, splats.conics, splats.opacities, values))
         zeros = values.new_zeros((splats.height, splats.width, values.shape[1] + 1)) + nothing
         return zeros[..., 1:], zeros[..., 0]
@@ -287,9 +287,9 @@ def _heaviest(
     kernels: Kernels,
     settings: RasterSettings,
 ) -> torch.Tensor:
-    """Label with the largest sum of weights, the smallest of equals, -1 where alpha is small. [H, W] int32
+    """Label with the largest sum of weights per pixel, the smallest on ties, -1 if alpha is small. [H, W] int32
 
-    Each label is a channel that its Gaussians fill with ones, so the labels of a scene take a pass per 32 of them.
+    Each label is a channel that is 1 for its Gaussians, so one pass covers 32 labels.
     """
     known, members = torch.unique(labels.clamp_min(-1), return_inverse=True)
     ids = torch.full(alpha.shape, -1, dtype=torch.int32, device=alpha.device)
@@ -297,7 +297,7 @@ def _heaviest(
     for first in range(0, len(known), CHANNEL_COUNTS[-1]):
         some = torch.arange(first, min(first + CHANNEL_COUNTS[-1], len(known)), device=alpha.device)
         votes, _ = _blend(splats, (members[:, None] == some).to(alpha.dtype), kernels)
-        weight, which = votes.max(-1)  # the first of equals, and labels ascend
+        weight, which = votes.max(-1)  # returns the first maximum; labels ascend
         ids = torch.where(weight > most, known[some[which]].to(torch.int32), ids)
         most = torch.maximum(weight, most)
     return torch.where(alpha >= settings.id_alpha_min, ids, -1)
@@ -306,10 +306,10 @@ def _heaviest(
 def _fill_stats(
     stats: RasterStats, means2d: torch.Tensor, cov: torch.Tensor, order: torch.Tensor, means: torch.Tensor
 ) -> None:
-    """Write visibility and radii now, and the norm of the screen-space gradient when the backward pass comes by."""
+    """Write visibility and radii now, and the norm of the screen-space gradient in the backward pass."""
 
     def spread(rows: torch.Tensor) -> torch.Tensor:
-        """Rows of the visible Gaussians among those of all, zero elsewhere. [N]"""
+        """Scatter rows of the visible Gaussians to all Gaussians, zero elsewhere. [N]"""
         return means.new_zeros(len(means)).index_copy_(0, order, rows.to(means.dtype))
 
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Checks of environment variables that numba reads; imported before numba, whose own errors are tracebacks."""
+"""Checks of environment variables that numba reads. Imported before numba, which fails on them with tracebacks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MOST_THREADS = 1024
 
 
 def check_threads(value: str | None) -> None:
-    """Raise `ConfigError` for a value of NUMBA_NUM_THREADS that is no number of threads; None and "" are unset."""
+    """Raise `ConfigError` if a value of NUMBA_NUM_THREADS is not a number of threads; None and "" mean unset."""
     if not value:
         return
     if not (value.isascii() and value.isdecimal() and len(value) < 9 and 1 <= int(value) <= MOST_THREADS):

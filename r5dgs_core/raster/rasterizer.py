@@ -1,4 +1,4 @@
-"""Public door of the rasterizer: checks the inputs once, picks a backend, shades Gaussians by their harmonics."""
+"""Public API of the rasterizer: validates inputs, selects a backend and evaluates spherical harmonics."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ def rasterize_splats(
     backend: str = "auto",
     stats: RasterStats | None = None,
 ) -> SplatImage:
-    """Draw Gaussians with any number of channels, differentiably in every float input (not in the camera).
+    """Rasterize Gaussians with any number of channels, differentiable in every float input except the camera.
 
     Args:
         means: Centres, world. [N, 3]
-        quats: Rotations wxyz; normalised here, gradients pass through the normalisation. [N, 4]
-        scales: Standard deviations along the own axes, world units, not negative. [N, 3]
+        quats: Rotations wxyz; normalised here, with gradients through the normalisation. [N, 4]
+        scales: Standard deviations along the Gaussian's axes, world units, >= 0. [N, 3]
         opacities: In [0, 1]. [N]
         channels: Values to blend; D >= 1. [N, D]
         camera: The view.
-        background: Shows through by 1 - alpha; zeros where None. Of any float dtype. [D] or [H, W, D]
-        labels: Integers; ``ids`` of the result is the label with the largest weight, negative ones vote for -1; at most
-            2^31 - 1, with backend "cpu" 2^24 - 1. [N]
-        settings: Thresholds; those of 3DGS where None.
+        background: Blended with weight 1 - alpha; zeros if None. Any float dtype. [D] or [H, W, D]
+        labels: Integers; ``ids`` of the result is the label with the largest weight; negative labels count as -1. At
+            most 2^31 - 1, or 2^24 - 1 with backend "cpu". [N]
+        settings: Thresholds; those of 3DGS if None.
         backend: "cpu" (numba, float32), "cuda" (gsplat, float32 tensors on a GPU), "reference" (plain torch, any float
-            dtype and device), or "auto": the fastest one that can take these tensors.
-        stats: Filled with visibility and radii by the call, and with screen-space gradients by the backward pass.
+            dtype and device), or "auto": the fastest that supports these tensors.
+        stats: Receives visibility and radii from this call, and screen-space gradients from the backward pass.
 
     Returns:
-        Image, alpha and depth, on the device and in the dtype of ``means``.
+        Image, alpha and depth, with device and dtype of ``means``.
 
     Raises:
-        TypeError: What should be a tensor is none.
-        ValueError: A shape, dtype or device does not fit, or a value of an input or of the camera is not finite or out
-            of its range; the message names the input and the first index.
-        BackendError: The backend is not there.
+        TypeError: An input is not a tensor.
+        ValueError: An input has a wrong shape, dtype or device, or an input or the camera has a value that is not
+            finite or out of range; the message names the input and the first index.
+        BackendError: The backend is not available.
 
     Source: Kerbl et al. 2023 (3DGS), sections 4 and 6, after Zwicker et al. 2001 (EWA splatting).
     """
@@ -83,23 +83,23 @@ def rasterize(
     backend: str = "auto",
     stats: RasterStats | None = None,
 ) -> RenderOutput:
-    """Draw Gaussians as a camera sees them: colour, and features in the same pass.
+    """Rasterize the colours of Gaussians for a camera, and features in the same pass.
 
     Args:
-        gaussians: Anything with ``means``, ``quats``, ``log_scales``, ``opacity_logits``, ``sh`` [N, K, 3] and, if it
-            has them, ``object_ids`` [N]. What has ``scales`` and ``opacities`` needs no logarithms and logits.
+        gaussians: Object with ``means``, ``quats``, ``log_scales``, ``opacity_logits``, ``sh`` [N, K, 3] and,
+            optionally, ``object_ids`` [N]. ``scales`` and ``opacities`` may replace logarithms and logits.
         camera: The view.
         features: Further values to blend, e.g. identity encodings. [N, F]
-        background: Colour behind the Gaussians; black where None. Of any float dtype. [3] or [H, W, 3]
-        colors: Final colours, where the caller knows them better than `seen_colors`; ``sh`` is then not read. [N, 3]
-        ids: Whether to find the object of each pixel where ``object_ids`` exist.
-        settings: As in `rasterize_splats`, like ``backend`` and ``stats``.
+        background: Colour behind the Gaussians; black if None. Any float dtype. [3] or [H, W, 3]
+        colors: Final colours, which replace those of `seen_colors`; ``sh`` is then not read. [N, 3]
+        ids: True to compute the object of each pixel, if ``object_ids`` exist.
+        settings: As for `rasterize_splats`, like ``backend`` and ``stats``.
 
     Returns:
         Colour, alpha, depth, features and ids.
 
     Raises:
-        TypeError, ValueError, BackendError: As `rasterize_splats`; what is named is what was given here.
+        TypeError, ValueError, BackendError: As for `rasterize_splats`; messages name the inputs of this function.
     """
     means = gaussians.means
     _check_tensor("means", means)
@@ -143,18 +143,18 @@ def rasterize(
 
 
 def seen_colors(gaussians: Any, camera: Camera, *, fused: bool = True) -> torch.Tensor:
-    """Display-referred colour of each Gaussian from this camera: max(0, 0.5 + harmonics). [N, 3]
+    """Return the display-referred colour of each Gaussian for a camera: max(0, 0.5 + harmonics). [N, 3]
 
     Args:
-        gaussians: Anything with ``means`` [N, 3] and ``sh`` [N, K, 3].
+        gaussians: Object with ``means`` [N, 3] and ``sh`` [N, K, 3].
         camera: The view.
-        fused: Whether the kernels of the `cpu` backend may be used where they can.
+        fused: True to allow the kernels of the `cpu` backend.
     """
     return shade.seen_colors(gaussians.means, gaussians.sh, camera.center, fused=fused)
 
 
 def check_splats(means, quats, scales, opacities, channels, camera, background, labels) -> None:
-    """Raise ValueError or TypeError naming the first input whose kind, shape, dtype or content cannot be drawn."""
+    """Raise ValueError or TypeError for the first input with an invalid type, shape, dtype, device or value."""
     inputs = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "channels": channels}
     for name, tensor in inputs.items():
         _check_tensor(name, tensor)
@@ -182,7 +182,7 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
         _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
 
 
-# Smallest and largest value of the inputs that have them, and the remedy.
+# Bounds of inputs with a limited range, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "scales": (0.0, math.inf, "pass exp(log_scales)"),
     "opacities": (0.0, 1.0, "pass sigmoid(opacity_logits)"),
@@ -200,7 +200,7 @@ def _check_device(name: str, tensor: torch.Tensor, means: torch.Tensor) -> None:
 
 
 def _check_companion(name: str, tensor: Any, means: torch.Tensor, shape: tuple[int, int | str]) -> None:
-    """Raise where this is no tensor beside the means, of shape [N, a number of channels]."""
+    """Raise unless the value is a tensor on the device of the means with the given shape; a str matches any size."""
     _check_tensor(name, tensor)
     if tensor.ndim != 2 or any(isinstance(b, int) and a != b for a, b in zip(tensor.shape, shape, strict=True)):
         raise ValueError(f"{name}: expected shape ({shape[0]}, {shape[1]}), got {tuple(tensor.shape)}")
@@ -208,7 +208,7 @@ def _check_companion(name: str, tensor: Any, means: torch.Tensor, shape: tuple[i
 
 
 def _check_background(background: Any, means: torch.Tensor, camera: Camera, depth: int) -> None:
-    """Raise where this cannot lie behind an image of so many channels."""
+    """Raise unless the value is a background for an image with ``depth`` channels."""
     _check_tensor("background", background)
     if tuple(background.shape) not in {(depth,), (camera.height, camera.width, depth)}:
         raise ValueError(
@@ -223,12 +223,12 @@ def _check_background(background: Any, means: torch.Tensor, camera: Camera, dept
     _check_device("background", background, means)
 
 
-_MOST_LABEL = (1 << 31) - 1  # what ids of type int32 hold
-_NARROW = (torch.uint8, torch.int8, torch.int16, torch.int32)  # whose values are labels, all of them
+_MOST_LABEL = (1 << 31) - 1  # ids are int32
+_NARROW = (torch.uint8, torch.int8, torch.int16, torch.int32)  # dtypes that cannot exceed _MOST_LABEL
 
 
 def _check_labels(labels: Any, means: torch.Tensor) -> None:
-    """Raise where these are no integers, one for each Gaussian."""
+    """Raise unless the labels are integers in range, one per Gaussian."""
     _check_tensor("labels", labels)
     whole = not (labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool)
     if tuple(labels.shape) != (len(means),) or not whole:
@@ -237,7 +237,7 @@ def _check_labels(labels: Any, means: torch.Tensor) -> None:
     if labels.dtype in _NARROW or not len(labels):
         return
     numbers = labels.long()
-    if labels.dtype == torch.uint64:  # those from 2^63 on turn negative
+    if labels.dtype == torch.uint64:  # values from 2^63 on have become negative
         numbers = torch.where(numbers < 0, torch.iinfo(torch.int64).max, numbers)
     if numbers.max() > _MOST_LABEL:
         at = int(numbers.argmax())
@@ -245,7 +245,7 @@ def _check_labels(labels: Any, means: torch.Tensor) -> None:
 
 
 def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | None:
-    """What in the inputs of `rasterize` explains that it failed: an error that names it as the caller knows it."""
+    """Find the invalid input of `rasterize` after a failure: an error that uses the caller's names, or None."""
     n = len(gaussians.means)
     given: dict[str, Any] = {
         name: getattr(gaussians, name, None) for name in ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -275,11 +275,11 @@ def _raw_culprit(gaussians: Any, colors: Any, features: Any) -> ValueError | Non
 
 
 def _check_values(name: str, values: torch.Tensor, low: float, high: float, remedy: str) -> None:
-    """Raise ValueError naming the first value that is not finite or lies outside low .. high."""
+    """Raise ValueError for the first value that is not finite or outside low .. high."""
     if not values.numel():
         return
-    # Smallest and largest take one fast pass each and are NaN where a value is; only then is the culprit looked for.
-    # On the CPU numpy finds them: torch would wake its thread pool for it.
+    # Minimum and maximum take one fast pass each and propagate NaN; only on failure is the index searched.
+    # numpy on the CPU: torch would wake its thread pool.
     if values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64):
         smallest, largest = values.numpy().min(), values.numpy().max()
     else:

@@ -1,13 +1,12 @@
-"""Rasterizer in plain torch: every pixel looks at every Gaussian near it. Slow and exact: the oracle of the tests.
+"""Reference rasterizer in plain torch. Slow and exact: the oracle of the tests.
 
-Whatever the dtype of the inputs, everything is computed in float64: float32 inputs are drawn as the same numbers in
-float64 would be, and only results and gradients are rounded.
+Everything is computed in float64, for inputs of any dtype; only results and gradients are rounded to it.
 
 Notation: z depth, u = x / z and v = y / z slopes, P the axes of a Gaussian in px, one per column, C = P P^T + dilation
 its covariance in px^2, T transmittance.
 
-Nothing cancels, however long and thin a Gaussian is: det C and d^T C^-1 d are sums of squares (Cauchy and Binet), with
-x for the cross product in the plane and k, l for columns of P:
+Long thin Gaussians cause no cancellation: det C and d^T C^-1 d are sums of squares (Cauchy-Binet), with x for the
+cross product in the plane and k, l for columns of P:
 
     det C = sum over k < l of (P_k x P_l)^2 + dilation (|P|^2 + dilation)
     det C d^T C^-1 d = sum over k of (d x P_k)^2 + dilation |d|^2
@@ -21,9 +20,9 @@ from torch.utils.checkpoint import checkpoint
 from ..scene.cameras import Camera
 from .settings import RasterSettings, RasterStats, SplatImage
 
-# Results depend on neither of these. A tile is the unit of work: every pixel in it with every Gaussian that reaches it.
-TILE = 32  # px; small ones leave out more
-TILE_WORK = 1 << 18  # pixels times Gaussians; tiles are larger where a scene has so few Gaussians
+# A tile is the unit of work: all its pixels with all Gaussians that reach it. Neither constant affects results.
+TILE = 32  # px; smaller tiles skip more Gaussians
+TILE_WORK = 1 << 18  # pixels times Gaussians; tiles grow in scenes with few Gaussians
 
 
 def rasterize_splats(
@@ -38,7 +37,7 @@ def rasterize_splats(
     settings: RasterSettings,
     stats: RasterStats | None,
 ) -> SplatImage:
-    """Draw as `rasterizer.rasterize_splats` says; inputs are checked there."""
+    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
     dtype, height, width = means.dtype, camera.height, camera.width
     means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
     means2d, axes, z = project(means, quats, scales, camera, settings)
@@ -64,7 +63,7 @@ def rasterize_splats(
             near = _overlapping(centers, extent, box)
             near_labels = None if kept_labels is None else kept_labels[near]
             arguments = (*(t[near] for t in inputs), near_labels, box, settings)
-            # Checkpoints are computed again by the backward pass: otherwise it would keep every pair of all tiles.
+            # Checkpointing: otherwise the graph would keep every pixel-Gaussian pair of all tiles.
             row.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
         rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
     blended, transmittance, ids = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
@@ -88,21 +87,21 @@ def project(
 
     Args:
         means: Centres, world. [N, 3]
-        quats: Rotations wxyz, any length; length zero counts as no rotation. [N, 4]
+        quats: Rotations wxyz, any length; zero quaternions mean no rotation. [N, 4]
         scales: Standard deviations, world units. [N, 3]
         camera: The view.
-        settings: For near plane and frustum clamp.
+        settings: Near plane and frustum clamp.
 
     Returns:
-        Centres in px [N, 2], axes in px, one per column [N, 2, 3], depths [N]. Rows before the near plane are finite
-        and meaningless.
+        Centres in px [N, 2], axes in px, one per column [N, 2, 3], depths [N]. Rows in front of the near plane are
+        finite but meaningless.
 
     Source: Zwicker et al. 2001, Eq. 31, with the Jacobian at a slope clamped to the frustum as in 3DGS.
     """
     T = torch.as_tensor(camera.T_cam_world, dtype=means.dtype, device=means.device)
     k = camera.intrinsics
     fx, skew, cx, fy, cy = float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])
-    # Term by term: a matrix product may round equal rows differently, and equal centres must have equal depths.
+    # Term by term: a matrix product may round equal rows differently, but equal centres need equal depths.
     a, b, c = means.unbind(1)
     x, y, z = (T[i, 3] + T[i, 0] * a + T[i, 1] * b + T[i, 2] * c for i in range(3))
     safe_z = torch.where(z > settings.near_plane, z, 1)
@@ -123,7 +122,7 @@ def project(
 
 
 def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
-    """Bounds of x/z (low, high) and y/z (low, high) between which the projection is linearised."""
+    """Bounds of x/z (low, high) and y/z (low, high) to which the point of linearisation is clamped."""
     k = camera.intrinsics
     slack_u = settings.frustum_slack * 0.5 * camera.width / k[0, 0]
     slack_v = settings.frustum_slack * 0.5 * camera.height / k[1, 1]
@@ -136,7 +135,7 @@ def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, flo
 
 
 def rotmats(quats: torch.Tensor) -> torch.Tensor:
-    """Rotation matrices of quaternions wxyz of any length; zero gives the identity. [N, 4] -> [N, 3, 3]"""
+    """Convert quaternions wxyz of any length to rotation matrices; zero gives the identity. [N, 4] -> [N, 3, 3]"""
     square = (quats * quats).sum(1, keepdim=True)
     proper = square > 0
     length = torch.sqrt(torch.where(proper, square, 1))
@@ -173,18 +172,18 @@ def visible_rows(
     camera: Camera,
     settings: RasterSettings,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Find the Gaussians that can touch the image: beyond the near plane, with an alpha_min ellipse that reaches it.
+    """Find the Gaussians that can touch the image: behind the near plane, with an alpha_min ellipse that reaches it.
 
     Args:
         means2d: Centres, px. [N, 2]
         cov: Covariances with dilation, px^2. [N, 2, 2]
         z: Depths in the camera frame. [N]
         opacities: In [0, 1]. [N]
-        camera: For the size of the image.
-        settings: For near plane and alpha_min.
+        camera: Gives the image size.
+        settings: Near plane and alpha_min.
 
     Returns:
-        Their rows, near to far, equal depths in the order of rows [V]; half width and height of the ellipse of every
+        Rows of the visible Gaussians, near to far, ties in row order [V]; half width and height of the ellipse of every
         Gaussian, px [N, 2].
     """
     reach = 2 * torch.log((opacities / settings.alpha_min).clamp_min(1))
@@ -197,7 +196,7 @@ def visible_rows(
 
 
 def _overlapping(means2d, extent, box):
-    """Which Gaussians may reach a pixel of the box (x0, y0, x1, y1). [V] bool"""
+    """Mask of the Gaussians that may reach a pixel of the box (x0, y0, x1, y1). [V] bool"""
     low, high = means2d.new_tensor(box[:2]), means2d.new_tensor(box[2:])
     return ((means2d + extent > low) & (means2d - extent < high)).all(1)
 
@@ -218,10 +217,10 @@ def _blend(means2d, axes, opacities, values, labels, box, settings):
     alpha = (opacities * torch.exp(power)).clamp_max(settings.alpha_max)
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0)
 
-    with torch.no_grad():  # a pixel stops at the first Gaussian that would bring T below the minimum
+    with torch.no_grad():  # a pixel stops before the first Gaussian that would bring T below the minimum
         keep = torch.cumprod(1 - alpha, 1) >= settings.finished_at
     alpha = torch.where(keep, alpha, 0)
-    # T is kept as its logarithm: the gradient of a cumulative product divides by terms that may have underflowed.
+    # Sum logarithms of T: the gradient of a cumulative product divides by terms that may have underflowed.
     log_factors = torch.log1p(-alpha)
     log_passed = torch.cumsum(log_factors, 1)
     weights = alpha * torch.exp(log_passed - log_factors)
@@ -231,11 +230,11 @@ def _blend(means2d, axes, opacities, values, labels, box, settings):
 
 
 def _heaviest(weights, labels, transmittance, settings):
-    """Label with the largest sum of weights, the smallest of equals, -1 where alpha is small. [P] int32"""
+    """Label with the largest sum of weights per pixel, the smallest on ties, -1 if alpha is small. [P] int32"""
     ids = torch.full((len(weights),), -1, dtype=torch.int32, device=weights.device)
     if labels is None or not len(labels):
         return ids
-    names, planes = torch.unique(labels.long().clamp_min(-1), return_inverse=True)  # rising, and max takes the first
+    names, planes = torch.unique(labels.long().clamp_min(-1), return_inverse=True)  # ascending; max returns the first
     votes = weights.new_zeros((len(weights), len(names))).index_add_(1, planes, weights)
     most, winners = votes.max(1)
     enough = (1 - transmittance >= settings.id_alpha_min) & (most > 0)
@@ -243,7 +242,7 @@ def _heaviest(weights, labels, transmittance, settings):
 
 
 def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtype: torch.dtype) -> None:
-    """Write visibility and radii, and no gradient yet."""
+    """Write visibility and radii, and zero gradient norms."""
     visible = torch.zeros(len(cov), dtype=torch.bool, device=cov.device)
     visible[order] = True
     stats.visible = visible
@@ -252,5 +251,5 @@ def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtyp
 
 
 def _keep_norm(stats: RasterStats, gradient: torch.Tensor, dtype: torch.dtype) -> None:
-    """Write the norms of the gradient with respect to the projected centres, when the backward pass comes by."""
+    """Write the norms of the gradient by the projected centres; called in the backward pass."""
     stats.grad_norm = gradient.norm(dim=1).to(dtype)

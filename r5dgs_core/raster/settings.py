@@ -1,4 +1,4 @@
-"""What goes into the rasterizer beside the Gaussians, and what comes out of it."""
+"""Settings, statistics and results of the rasterizer."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 @dataclass(frozen=True)
 class RasterSettings:
-    """Thresholds of 3D Gaussian splatting; the defaults are those of 3DGS.
+    """Thresholds of Gaussian splatting; the defaults are those of 3DGS.
 
     Attributes:
-        near_plane: Gaussians whose centre lies nearer than this depth are not drawn, world units.
-        dilation: Added to both variances of the projected Gaussian, px^2 (a low-pass of about half a pixel); 0.01 or
-            more: rounding of a needle's exponent grows as its width shrinks, and the margin within which the kernels
-            decide in float64 is made for no thinner ones.
-        frustum_slack: The slope of a centre seen from the camera is clamped to the image border plus this share of the
-            half field of view before the projection is linearised there: 1.3 times the field of view for 0.3.
+        near_plane: Gaussians whose centre has a smaller depth are culled, world units.
+        dilation: Low-pass filter: variance added along both image axes, px^2. At least 0.01, because rounding errors of
+            the exponent grow as Gaussians get thinner, and the kernels' float64 margin covers none thinner than that.
+        frustum_slack: Slopes are clamped to the image border plus this share of half the field of view before the
+            projection is linearised: 0.3 means 1.3 times the field of view.
         alpha_min: Contributions below this are dropped.
-        alpha_max: Contributions are capped here; the gradient is zero where the cap holds.
+        alpha_max: Cap on contributions; the gradient of capped contributions is zero.
         transmittance_min: A pixel is finished before the contribution that would bring its transmittance down to this,
-            two layers at the default cap for example; see `finished_at`. 1e-30 or more, as pixels are float32.
-        id_alpha_min: Pixels with less alpha than this belong to no object (id -1). In [0, 1].
+            e.g. two layers at the default cap; see `finished_at`. At least 1e-30, as pixels are float32.
+        id_alpha_min: Pixels with less alpha than this get id -1. In [0, 1].
     """
 
     near_plane: float = 0.01
@@ -38,10 +37,10 @@ class RasterSettings:
 
     @property
     def finished_at(self) -> float:
-        """What transmittance must not fall below: ``transmittance_min`` with a margin for rounding.
+        """Lower bound on transmittance: ``transmittance_min`` with a margin for rounding.
 
-        Two capped layers leave (1 - 0.99)^2 = 1e-4 of the light, a rounding below it in float32 and a rounding above in
-        float64; 3DGS and gsplat compute in float32 and stop there, so everyone has to.
+        Two capped layers leave (1 - 0.99)^2 = 1e-4, which rounds below 1e-4 in float32 and above it in float64. 3DGS
+        and gsplat compute in float32 and stop there, so all backends must.
         """
         return self.transmittance_min * (1 + 1e-6)
 
@@ -67,13 +66,13 @@ class RasterSettings:
 
 @dataclass
 class RasterStats:
-    """What densification wants to know of one call; pass an empty one and read it afterwards.
+    """Statistics of one call for densification. Pass an empty instance and read it afterwards.
 
     Attributes:
-        visible: Whether the Gaussian touches the image, known after the call. [N] bool
-        radii: Three standard deviations along the long axis of the projected Gaussian, px, 0 where not visible. [N]
-        grad_norm: Norm of the gradient with respect to the projected centre, per px of this view, known after the
-            backward pass, 0 where not visible. [N]
+        visible: True if the Gaussian touches the image; set by the call. [N] bool
+        radii: Three standard deviations along the long axis of the projected Gaussian, px, 0 if not visible. [N]
+        grad_norm: Norm of the gradient by the projected centre, per px of this view; set by the backward pass, 0 if not
+            visible. [N]
     """
 
     visible: torch.Tensor | None = None
@@ -83,13 +82,13 @@ class RasterStats:
 
 @dataclass(frozen=True)
 class SplatImage:
-    """An image of splats with any number of channels.
+    """Image of splats with any number of channels.
 
     Attributes:
-        image: Blended channels over the background. [H, W, D]
+        image: Channels blended over the background. [H, W, D]
         alpha: Coverage. [H, W]
-        depth: Expected depth z in the camera frame, divided by alpha; 0 where alpha is 0. [H, W]
-        ids: Label with the largest weight, -1 where there is none; only where labels were given. [H, W] int32
+        depth: Expected depth z in the camera frame, divided by alpha; 0 if alpha is 0. [H, W]
+        ids: Label with the largest weight, -1 if alpha is small; None without labels. [H, W] int32
     """
 
     image: torch.Tensor
@@ -100,15 +99,15 @@ class SplatImage:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """What a camera sees of the Gaussians.
+    """Rendered image of Gaussians.
 
     Attributes:
         color: Display-referred colour over the background. [H, W, 3]
         alpha: Coverage. [H, W]
-        depth: Expected depth z in the camera frame, divided by alpha; 0 where alpha is 0. [H, W]
-        features: Blended features over zeros, or None where none were given. [H, W, F]
-        ids: Object with the largest weight, -1 where there is none, or None without object ids. [H, W] int32
-        holdout: Coverage of hold-outs, which alpha and depth leave out, or None without any. [H, W]
+        depth: Expected depth z in the camera frame, divided by alpha; 0 if alpha is 0. [H, W]
+        features: Features blended over zeros, or None without features. [H, W, F]
+        ids: Object with the largest weight, -1 if alpha is small, or None without object ids. [H, W] int32
+        holdout: Coverage of hold-outs, which alpha and depth leave out, or None without hold-outs. [H, W]
     """
 
     color: torch.Tensor

@@ -1,7 +1,7 @@
-"""Colours out of spherical harmonics: of Gaussians as an eye sees them, differentiably, and of a sky.
+"""Colours from spherical harmonics: view-dependent colours of Gaussians, differentiable, and skies.
 
-Float32 tensors on the CPU go through the kernels of `sh_kernels`, in one pass and without intermediate arrays; other
-tensors, and machines without numba, through plain torch. Harmonics of degree 0 know no direction and need no kernel.
+Float32 tensors on the CPU use the fused kernels of `sh_kernels`; other tensors, and machines without numba, use plain
+torch. Degree 0 does not depend on the direction and needs no kernel.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from ..scene import cameras, sh_color
 from ..scene.cameras import Camera
 from . import backends
 
-_WORTH_A_THREAD = 2000  # Gaussians
-_ROWS_WORTH_A_THREAD = 64  # of a sky
+_WORTH_A_THREAD = 2000  # Gaussians per thread
+_ROWS_WORTH_A_THREAD = 64  # rows of a sky per thread
 _NO_FACTOR = np.empty(0, np.float32)
 _NO_POSES = np.empty(0, np.int64)
 
@@ -32,27 +32,27 @@ def seen_colors(
     factor: torch.Tensor | None = None,  # [N]
     fused: bool = True,
 ) -> torch.Tensor:
-    """Display-referred colour of each Gaussian: factor times max(0, 0.5 + harmonics along the line of sight).
+    """Return the display-referred colour of each Gaussian: factor * max(0, 0.5 + harmonics along the line of sight).
 
-    Differentiable in means, coefficients and factor. A Gaussian at the eye shows its harmonics of degree 0, and a
-    clamped colour sends no gradient back.
+    Differentiable in means, coefficients and factor. A Gaussian at the eye has its degree-0 colour. Clamped colours
+    have zero gradient.
 
     Args:
         means: Centres. [N, 3]
-        sh: Coefficients in the order of `sh_color.basis`; those of degree 0 alone where ``rest`` is given.
+        sh: Coefficients in the order of `sh_color.basis`; only those of degree 0 if ``rest`` is given.
         eyes: Eye of each pose in the frame of ``means``, or one for all. [P, 3] or [3]
-        rest: The coefficients of degree 1 and more. [N, K - 1, 3]
-        view_maps: Linear maps that bring the directions of each pose into the frame of the coefficients, up to length;
-            none where None. [P, 3, 3]
-        pose_ids: Pose of each Gaussian; the first for all where None. [N] integers, array or tensor
-        factor: On the colour; 1 where None. [N]
-        fused: Whether the kernels may be used where they can.
+        rest: Coefficients of degree 1 and higher. [N, K - 1, 3]
+        view_maps: Linear map of each pose from directions to the frame of the coefficients; the result is normalised.
+            None for the identity. [P, 3, 3]
+        pose_ids: Pose of each Gaussian; None for the first. [N] integers, array or tensor
+        factor: Factor on the colour; 1 if None. [N]
+        fused: True to allow the kernels.
 
     Returns:
-        The colours, not clamped at 1, dtype and device of ``means``. [N, 3]
+        Colours, not clamped at 1, dtype and device of ``means``. [N, 3]
 
     Raises:
-        ValueError: A shape does not fit, or a pose is not there.
+        ValueError: A shape does not match, or a pose does not exist.
     """
     n = len(means)
     count = sh.shape[1] + (0 if rest is None else rest.shape[1]) if sh.ndim == 3 else 0
@@ -74,10 +74,10 @@ def seen_colors(
 
 
 def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
-    """A sky as a camera sees it: 0.5 + harmonics along the ray of each pixel, within [0, 1].
+    """Render a sky for a camera: 0.5 + harmonics along the ray of each pixel, clamped to [0, 1].
 
     Args:
-        sh: Coefficients over the world's directions. [K, 3]
+        sh: Coefficients over world directions. [K, 3]
         camera: The camera.
 
     Returns:
@@ -98,7 +98,7 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 class _Poses:
-    """Eyes [P, 3] and maps [P, 3, 3], float64, and the pose of each Gaussian: [N], or [0] where all have the first."""
+    """Eyes [P, 3] and maps [P, 3, 3], float64, and the pose of each Gaussian: [N], or [0] if all use the first."""
 
     def __init__(self, eyes: np.ndarray, view_maps: np.ndarray | None, pose_ids: Any, n: int):
         eyes = np.asarray(eyes, np.float64).reshape(-1, 3)
@@ -106,8 +106,8 @@ class _Poses:
         count = max(len(eyes), len(maps))
         if not {len(eyes), len(maps)} <= {1, count}:
             raise ValueError(f"view_maps: expected one for each of {len(eyes)} eyes, got {len(maps)}")
-        # Copies, so that the kernels see one kind of array, contiguous and never read-only, and that nothing that
-        # happens to the caller's before the backward pass changes what it computes.
+        # Copies: contiguous and writable, so that the kernels compile for one array type, and independent of changes
+        # that the caller makes before the backward pass.
         self.eyes = np.broadcast_to(eyes, (count, 3)).copy()
         self.maps = np.broadcast_to(maps, (count, 3, 3)).copy()
         self.ids = _NO_POSES
@@ -126,7 +126,7 @@ def _fits_kernels(*tensors: torch.Tensor | None) -> bool:
 def _plain_colors(
     means: torch.Tensor, sh: torch.Tensor, factor: torch.Tensor | None, poses: _Poses
 ) -> torch.Tensor:  # fmt: skip
-    """`seen_colors` in plain torch."""
+    """Implement `seen_colors` in plain torch."""
 
     def like_means(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array, dtype=means.dtype, device=means.device)
@@ -174,7 +174,7 @@ class _Shade(torch.autograd.Function):
 
 
 def _kernel_inputs(means, sh, rest, factor, poses: _Poses) -> tuple:
-    """What both kernels read, in their order."""
+    """Arguments of both kernels, in their order."""
     constants = _array(sh).reshape(-1)
     if rest is None:
         count = sh.shape[1]

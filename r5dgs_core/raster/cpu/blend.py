@@ -1,8 +1,7 @@
-"""Kernel that blends the pairs of each tile; tiles, blocks and batches are those of `batches`.
+"""Blending kernel; see `batches` for tiles, blocks and batches.
 
 The first four values of a pair are added as soon as its weight is known, further values in a second sweep over the
-blocks of the same Gaussian. A finished pixel keeps its transmittance T with the sign turned, and so does one outside
-the image.
+Gaussian's blocks. The transmittance T of pixels that are finished or outside the image is stored with a negative sign.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ from .simd.vectors import any_of, bits_of, fma, larger, lowest_bit, select, unli
 
 @helper
 def _start_tile(passed, x0, y0, width, height):
-    """Set the transmittance of the pixels of a tile; returns the blocks that have pixels inside the image."""
+    """Initialise the transmittance of a tile's pixels; return the blocks with pixels inside the image."""
     alive = np.uint64(0)
     columns, rows = min(width - x0, TILE), min(height - y0, TILE)
     for block in range(BLOCKS * BLOCKS):
@@ -77,23 +76,24 @@ def blend(
     worker, workers, tiles, tile_starts, pair_rows, geometry, channels, depths, votes, names, background, limits, image,
     alpha, depth, transmittance, last_pairs, ids, tile_ends, pair_blocks,
 ):  # fmt: skip
-    """Blend every workers-th of some tiles; the pixels of others stay as they are.
+    """Blend the worker's share of some tiles, every ``workers``-th; other pixels are not written.
 
     Args:
-        tiles: Which tiles, numbered row by row. [K]
+        tiles: Tiles to blend, numbered row by row. [K]
         tile_starts, pair_rows: Their pairs, see `tiles`. [K + 1], [P]
         geometry: Projected Gaussians. [N, 8] float64
-        channels, depths: What is blended. [N, D], [N]
-        votes: Place of each Gaussian's label among ``names``. [N] int32, or empty
-        names: The labels, rising, -1 or more. [L] float32, or empty
+        channels, depths: Values to blend. [N, D], [N]
+        votes: Index of each Gaussian's label in ``names``. [N] int32, or empty
+        names: The labels, ascending, -1 or more. [L] float32, or empty
         background: One row per pixel, or one for all. [H * W or 1, D]
         limits: Thresholds, see `exact_thresholds`. [6] float64
         image, alpha, depth: Results. [H, W, D], [H, W], [H, W]
-        transmittance: Its end, for the backward pass. [H, W], or empty
-        last_pairs: Pairs of the tile that a pixel saw before it was finished, likewise. [H, W] float32, or empty
-        ids: Label of each pixel. [H, W], or empty
-        tile_ends: One past the last pair that had a pixel left to draw on. [K]
-        pair_blocks: The blocks that each pair drew on. [P] uint64
+        transmittance: Result, final transmittance, for the backward pass. [H, W], or empty
+        last_pairs: Result, number of the tile's pairs before the pixel was finished, for the backward pass.
+            [H, W] float32, or empty
+        ids: Result, label of each pixel. [H, W], or empty
+        tile_ends: Result, one past the last pair processed before all pixels were finished. [K]
+        pair_blocks: Result, the blocks that each pair contributes to. [P] uint64
     """
     height, width, n_channels = image.shape
     n_values = padded(n_channels)
@@ -101,7 +101,7 @@ def blend(
     more, planes = n_values > FIRST, len(names)
     buffer, ballot = aligned(n_values * PIXELS), aligned(planes * PIXELS)
     passed, weights, last = aligned(PIXELS), aligned(PIXELS), aligned(PIXELS)
-    covered = aligned(PIXELS)  # sum of weights: unlike 1 - T it is exact where little is covered
+    covered = aligned(PIXELS)  # sum of weights: unlike 1 - T, exact at low coverage
     table, blocks = np.zeros((BATCH, VALUES + n_values), np.float32), np.empty(BATCH, np.uint64)
     flat = table.reshape(-1)
     cut, close, zero = limits[LOG2_ALPHA_MIN], limits[CLOSE_LOG2], splat(float32(0))
@@ -189,7 +189,7 @@ def blend(
 
 @helper
 def _blend_more(drawn, n_values, weights, flat, value, buffer):
-    """Add the values beyond the first four of one Gaussian to the blocks ``drawn``."""
+    """Add one Gaussian's values beyond the first four to the blocks ``drawn``."""
     for chunk in range(FIRST, n_values, MORE):
         v = value + chunk
         v0, v1, v2, v3 = broadcast(flat, v), broadcast(flat, v + 1), broadcast(flat, v + 2), broadcast(flat, v + 3)
@@ -215,7 +215,7 @@ def _finish_tile(
     x0, y0, names, buffer, ballot, passed, covered, last, background, limits, image, alpha, depth, transmittance,
     last_pairs, ids,
 ):  # fmt: skip
-    """Write the pixels of a tile."""
+    """Write the pixels of a tile to the results."""
     height, width, n_channels = image.shape
     planes = len(names)
     zero, one, nobody = splat(float32(0)), splat(float32(1)), splat(float32(-1))

@@ -1,4 +1,4 @@
-"""Kernel for the gradient of what `blend` blends; tiles, blocks and batches are those of `batches`."""
+"""Kernel for the gradient of `blend`; see `batches` for tiles, blocks and batches."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def blend_backward(
     worker, workers, tile_starts, tile_ends, pair_rows, pair_slots, pair_blocks, geometry, channels, depths, background,
     limits, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, with_geometry, slots, filled,
 ):  # fmt: skip
-    """Write the gradient slots of the pairs of every workers-th tile: moments, the gradients of values, zeros.
+    """Write the gradient slots of the pairs of every ``workers``-th tile: moments, gradients of values, zeros.
 
-    Goes far to near. With s_i the inner product of values and gradient, and B_i what lies behind i as if it were seen
-    through nothing, dL/d(alpha_i) = T_i (s_i - B_i) and B_{i-1} = B_i + alpha_i (s_i - B_i), beginning with the inner
-    product of background and gradient: one number per pixel serves all channels, and nothing cancels behind opaque
-    Gaussians. T_i is found again as T_{i+1} / (1 - alpha_i).
+    Goes far to near. With s_i the inner product of values and gradient, and B_i the same for everything behind i at
+    full transmittance, dL/d(alpha_i) = T_i (s_i - B_i) and B_{i-1} = B_i + alpha_i (s_i - B_i), starting with the inner
+    product of background and gradient. One number per pixel thus serves all channels, and nothing cancels behind opaque
+    Gaussians. T_i is recovered as T_{i+1} / (1 - alpha_i).
 
     Args:
         as in `blend`; d_image [H, W, D], d_alpha [H, W] and d_depth [H, W] are the gradients of the results, the
-            latter two empty where there is none; with_geometry is whether more than channels want a gradient, or else
-            the moments are zero; slots [S, 16 k] the result, see `projection.MOMENTS`, and filled [S],
-            zeros before, says which of them were written: those of pairs that drew anything.
+            latter two empty if absent; with_geometry is True if more than the channels need gradients, otherwise
+            the moments are zero; slots [S, 16 k] is the result, see `projection.MOMENTS`; filled [S], initially
+            False, marks the slots that were written: those of pairs that contribute.
     """
     height, width, n_channels = d_image.shape
     n_values, n_slots = padded(n_channels), slots.shape[1]
@@ -125,7 +125,7 @@ def blend_backward(
                     seen_behind = load(behind, at)
                     gained = inner - seen_behind
                     store(behind, at, fma(opaque, gained, seen_behind))
-                    # dL/d(ln alpha); zero where the cap holds, as the capped alpha does not move
+                    # dL/d(ln alpha); zero for capped alphas, which are constant
                     to_log = weight * gained
                     capped = valid & (exponent >= cap_low)
                     if unlikely(any_of(capped)):
@@ -146,7 +146,7 @@ def _start_backward(
     x0, y0, background, alpha, depth, transmittance, last_pairs, d_image, d_alpha, d_depth, gradient, passed, behind,
     last,
 ):  # fmt: skip
-    """Fill the tile buffers: gradient with respect to each value, transmittance, and what lies behind everything."""
+    """Fill the tile buffers: gradient by each value, transmittance, and inner product with the background."""
     height, width, n_channels = d_image.shape
     gradient[:] = 0
     flat_gradient, flat_background = d_image.reshape(-1), background.reshape(-1)
@@ -235,7 +235,7 @@ def _inner_more(drawn, n_values, flat, value, gradient, inners):
 
 @helper
 def _sum_more(drawn, n_values, weights, gradient, flat_slots, slot):
-    """Gradients of one Gaussian's values beyond the first four, summed over the blocks ``drawn``."""
+    """Sum the gradients of one Gaussian's values beyond the first four over the blocks ``drawn``."""
     zero = splat(float32(0))
     for chunk in range(FIRST, n_values, 2 * MORE):
         low = _sum_chunk(drawn, chunk, weights, gradient)

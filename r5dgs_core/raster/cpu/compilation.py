@@ -1,11 +1,11 @@
-"""How the kernels of the `cpu` backend are compiled, cached and run on several threads.
+"""Compilation, caching and multithreaded execution of the numba kernels of the `cpu` backend.
 
-A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work and releases the interpreter
-lock. Plain Python threads run the shares: compiling takes a fraction of what numba's own parallel loops take, calls
-from several threads at once are safe, and results cannot depend on a threading layer.
+A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work without the interpreter lock.
+Plain Python threads run the shares. Compared with numba's parallel loops, this compiles in a fraction of the time,
+allows calls from several threads, and gives results that do not depend on a threading layer.
 
-What one process compiles the next one loads. The first compilation of a process is told by a warning, or as `telling`
-says.
+Machine code is cached between processes. The first compilation of a process is announced by a warning, or as set by
+`telling`.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True}
 
-_SHARED = ("raster/**/*.py", "scene/sh_color.py", "scene/spherical_harmonics.py")  # helpers and frozen constants
+_SHARED = ("raster/**/*.py", "scene/sh_color.py", "scene/spherical_harmonics.py")  # of helpers and frozen constants
 _OURS = re.compile("r5dgs-[0-9a-f]{12}")
 _KEPT_S = 28 * 24 * 3600.0
-_SYSTEM_USERS = (0, 65534)  # root, and what root's files belong to inside a container of the user
+_SYSTEM_USERS = (0, 65534)  # root, and the owner that root's files have inside a user's container
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -51,10 +51,10 @@ _threads = max(1, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 def kernel(function) -> Any:
-    """Compile at the first call, without the interpreter lock, and keep the machine code for the next process.
+    """Compile a function on its first call, without the interpreter lock, and cache the machine code on disk.
 
-    The machine code belongs to the state of the file that defines ``function`` and of `shared_sources`: a kernel
-    outside this package may freeze constants and call helpers of these files alone.
+    The cache is keyed by the content of the file that defines ``function`` and of `shared_sources`. A kernel outside
+    this package may therefore use only constants and helpers of these files.
     """
     with _lock:
         before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
@@ -70,25 +70,25 @@ def kernel(function) -> Any:
 
 
 def helper(function) -> Any:
-    """Compile for use inside kernels alone: becomes part of their machine code, and costs no time of its own.
+    """Compile a function for use inside kernels only, as part of their machine code.
 
-    Never call one from Python: it has no wrapper that unpacks Python's objects, and the interpreter would crash.
+    Calling it from Python crashes the interpreter, as it has no wrapper that unpacks Python objects.
     """
     return numba.njit(**_OPTIONS, **_INNER)(function)
 
 
 class _Watch(numba_events.Listener):
-    """Sees every compilation in this process, one at a time under numba's own lock; what is loaded passes unseen.
+    """Listener for kernel compilations in this process, which numba's own lock serializes. Cache loads are not seen.
 
-    The garbage collector rests meanwhile: again and again it would look through all that the compiler holds, which is
-    a twelfth of the time.
+    Garbage collection is disabled during a compilation, because scanning the compiler's objects takes a twelfth of the
+    time.
     """
 
     def __init__(self) -> None:
         self.kernels: weakref.WeakSet = weakref.WeakSet()
         self.compiled = 0
         self.tell: Callable[[str], object] = log.warning
-        self._depth = 0  # of a kernel, and of the helpers in it
+        self._depth = 0  # nesting: a kernel and its helpers
         self._collects = False
 
     def on_start(self, event) -> None:
@@ -114,13 +114,13 @@ numba_events.register("numba:compile", _watch)
 
 
 def compiled() -> int:
-    """Number of kernels that this process had to compile so far, as no earlier one did."""
+    """Number of kernels that this process has compiled, because they were not cached."""
     return _watch.compiled
 
 
 @contextlib.contextmanager
 def telling(tell: Callable[[str], object]) -> Iterator[None]:
-    """Tell of the process's first compilation by ``tell(text)`` instead of a warning in the log; from any thread."""
+    """Announce the process's first compilation, in any thread, by ``tell(text)`` instead of a warning in the log."""
     before, _watch.tell = _watch.tell, tell
     try:
         yield
@@ -129,40 +129,40 @@ def telling(tell: Callable[[str], object]) -> Iterator[None]:
 
 
 def cache_folder() -> Path | None:
-    """Where the machine code of this version is kept; None where no place can be written."""
+    """Folder of the machine code of this version, or None if no candidate is writable."""
     folder = _cache_folder(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
     return None if folder is None else Path(folder)
 
 
 def set_threads(count: int) -> None:
-    """Number of threads that `run` uses from now on; at first NUMBA_NUM_THREADS, or the usable cores."""
+    """Set the number of threads for `run`; the default is NUMBA_NUM_THREADS, or the usable cores."""
     global _pool, _threads
     if count < 1:
         raise ValueError(f"threads: expected at least 1, got {count}")
     with _lock:
-        _pool, _threads = None, count  # the old threads end by themselves once nobody uses them
+        _pool, _threads = None, count  # the old threads end once they are unreferenced
 
 
 def threads() -> int:
-    """Number of threads that `run` uses."""
+    """Number of threads for `run`."""
     return _threads
 
 
 def run(function, work: int, *arguments) -> None:
-    """Call ``function(worker, workers, *arguments)`` for all workers at once and wait for them.
+    """Call ``function(worker, workers, *arguments)`` for all workers in parallel and wait for them.
 
     Args:
-        function: A `kernel`; what it computes must not depend on ``workers``.
-        work: Independent pieces of work that are worth a thread; fewer than two run on this thread alone.
+        function: A `kernel` whose result does not depend on ``workers``.
+        work: Number of threads that the work can keep busy; with fewer than two, the calling thread does it all.
         arguments: Passed on.
     """
     run_parts(function, min(_threads, work), *arguments)
 
 
 def run_parts(function, parts: int, *arguments) -> None:
-    """Call ``function(part, parts, *arguments)`` for every part, on as many threads as there are, and wait for them.
+    """Call ``function(part, parts, *arguments)`` for every part, on the available threads, and wait for them.
 
-    For kernels whose parts belong together over several calls; others let `run` choose the number.
+    For kernels whose parts must match over several calls; use `run` for all others.
     """
     if parts < 2:
         function(0, 1, *arguments)
@@ -171,7 +171,7 @@ def run_parts(function, parts: int, *arguments) -> None:
     others = [pool.submit(function, part, parts, *arguments) for part in range(1, parts)]
     try:
         function(0, parts, *arguments)
-    finally:  # the arrays must outlive every share, whatever happened to ours
+    finally:  # the arrays must outlive all shares, even if ours raised
         for other in others:
             other.result()
 
@@ -185,7 +185,7 @@ def _get_pool() -> ThreadPoolExecutor:
 
 
 def _forget_pool() -> None:
-    """A forked child has no threads: let it make its own."""
+    """Reset lock and pool in a forked child, which inherits no threads."""
     global _lock, _pool
     _lock, _pool = threading.Lock(), None
 
@@ -196,10 +196,10 @@ if hasattr(os, "register_at_fork"):
 
 @functools.cache
 def _cache_folder(chosen: str) -> str | None:
-    """Folder for machine code, apart for each state of the shared sources; None if no place can be written.
+    """Folder for machine code, one per state of the shared sources; None if no candidate is writable.
 
-    Numba looks only at time and size of the file of the compiled function, not at the files of the functions it calls
-    and of the constants that it freezes, hence the digest.
+    numba checks only the modification time and size of the kernel's own file, not of the files of its helpers and
+    constants, hence the digest.
     """
     digest = _digest(shared_sources())
     tried = []
@@ -214,12 +214,12 @@ def _cache_folder(chosen: str) -> str | None:
         except OSError as error:
             tried.append(f"{base} ({error.strerror})")
             continue
-        if danger is not None:  # machine code that others can replace is not loaded
+        if danger is not None:  # never load machine code that other users can replace
             log.warning("rasterizer: no compiled code is kept in %s, as %s; remedy: remove it", folder, danger)
             tried.append(f"{base} (others can write there)")
             continue
         with contextlib.suppress(OSError):
-            os.utime(folder)  # it is in use
+            os.utime(folder)  # marks the folder as in use, see `_remove_old`
         if is_new:
             _remove_old(base)
         return str(folder)
@@ -232,15 +232,15 @@ def _cache_folder(chosen: str) -> str | None:
 
 
 def _danger(folder: Path) -> str | None:
-    """Return a reason why others than the user can put code into a folder, or None if only the user can."""
-    if not hasattr(os, "getuid"):  # Windows: folders inherit the rights of the user's profile
+    """Return the reason why other users can put code into a folder, or None if they cannot."""
+    if not hasattr(os, "getuid"):  # Windows: folders inherit the permissions of the user's profile
         return None
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         return "it is a link or belongs to another user"
     if status.st_mode & 0o022:
         return "others can write there"
-    for parent in folder.resolve().parents:  # whoever can rename a folder can put another one into its place
+    for parent in folder.resolve().parents:  # who can rename a folder can replace it
         status = parent.stat()
         if status.st_uid not in (os.getuid(), *_SYSTEM_USERS):
             return f"{parent} belongs to another user"
@@ -250,13 +250,13 @@ def _danger(folder: Path) -> str | None:
 
 
 def shared_sources() -> list[Path]:
-    """Files that the machine code of any kernel may be made of, beside its own: helpers and frozen constants."""
+    """Source files that any kernel may use besides its own: helpers and frozen constants."""
     core = Path(__file__).parents[2]
     return sorted(path for pattern in _SHARED for path in core.glob(pattern))
 
 
 def _digest(sources: Iterable[Path]) -> str:
-    """First 12 hexadecimal digits of the SHA-256 of files."""
+    """First 12 hexadecimal digits of the SHA-256 of the files' contents."""
     digest = hashlib.sha256()
     for source in sources:
         digest.update(source.read_bytes())
@@ -264,7 +264,7 @@ def _digest(sources: Iterable[Path]) -> str:
 
 
 def _remove_old(base: Path) -> None:
-    """Remove machine code of other versions that no process has used for weeks; what cannot be removed stays."""
+    """Remove machine code of other versions that is unused for four weeks; ignore folders that cannot be removed."""
     for folder in base.glob("r5dgs-*"):
         with contextlib.suppress(OSError):
             status = folder.lstat()
@@ -274,7 +274,7 @@ def _remove_old(base: Path) -> None:
 
 
 def _bases(chosen: str) -> Iterator[Path]:
-    """Places for machine code, best first: the user's choice, the user's cache, an own temporary folder."""
+    """Yield candidate folders for machine code, best first: the user's choice, the user's cache, a temporary one."""
     if chosen:
         yield Path(chosen)
     user_cache = _user_cache()
@@ -293,15 +293,15 @@ def _user_cache() -> Path | None:
             base = Path.home() / "Library" / "Caches"
         else:
             base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:  # no HOME, and the user is in no table
+    except RuntimeError:  # no HOME, and no entry in the user database
         return None
     return Path(base) / "r5dgs" / "numba"
 
 
 def _own_temporary() -> Path | None:
-    """A folder of this user alone: machine code that others could replace is not loaded."""
+    """Temporary folder that only this user can write, or None."""
     try:
-        if not hasattr(os, "getuid"):  # Windows: the temporary folder is the user's
+        if not hasattr(os, "getuid"):  # Windows: the temporary folder is private
             return Path(tempfile.gettempdir()) / "r5dgs"
         folder = Path(tempfile.gettempdir()) / f"r5dgs-{os.getuid()}"
         folder.mkdir(mode=0o700, exist_ok=True)

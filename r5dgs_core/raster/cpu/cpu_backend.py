@@ -1,4 +1,4 @@
-"""Backend `cpu`: float32 on any number of threads, forward and backward; results do not depend on that number."""
+"""Backend `cpu`: float32 on any number of threads, forward and backward. Results do not depend on that number."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from . import segments as cpu_segments
 from . import tiles as cpu_tiles
 from .compilation import run
 
-_WORTH_A_THREAD = 2000  # Gaussians; fewer are projected before a second thread would wake up
-_FEW_LABELS = 16  # labels below this are not looked through for gaps
-_MOST_LABEL = 1 << 24  # labels below this are whole numbers in float32
-# Distance of log2(alpha) from a cut-off within which float64 decides: several times the largest rounding of needles at
-# the usual dilation, which grows as the whitening does.
+_WORTH_A_THREAD = 2000  # Gaussians per thread; fewer are projected before a second thread wakes up
+_FEW_LABELS = 16  # labels below this are used without removing gaps
+_MOST_LABEL = 1 << 24  # labels below this are exact in float32
+# Distance of log2(alpha) from a threshold below which float64 decides: several times the largest rounding error of thin
+# Gaussians at the usual dilation. The error grows with the whitening.
 _CLOSE_LOG2, _USUAL_DILATION = 2e-4, 0.3
 _EMPTY = np.empty((0, 0), np.float32)
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What a call draws by, beside its tensors."""
+    """Arguments of a call other than its tensors."""
 
     camera: Camera
     view: np.ndarray
@@ -39,7 +39,7 @@ class _Plan:
 
 @dataclass(frozen=True)
 class _Pass:
-    """What the backward pass needs of the forward pass, all numpy and never handed out."""
+    """State of the forward pass for the backward pass, numpy arrays that are never exposed."""
 
     geometry: np.ndarray
     depths: np.ndarray
@@ -65,7 +65,7 @@ def rasterize_splats(
     settings: RasterSettings,
     stats: RasterStats | None,
 ) -> SplatImage:
-    """Draw as `rasterizer.rasterize_splats` says; inputs are checked there."""
+    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
     view, limits, votes = pack_view(camera, settings), pack_limits(settings), pack_labels(labels)
     plan = _Plan(camera, view, limits, votes, stats)
     inputs = (means, quats, scales, opacities, channels, background)
@@ -78,7 +78,7 @@ def rasterize_splats(
 
 
 def pack_view(camera: Camera, settings: RasterSettings) -> np.ndarray:
-    """Everything that projection needs, in the order of the constants in `projection`. [26] float64"""
+    """Camera and settings of the projection, in the order of the constants in `projection`. [26] float64"""
     k, T = camera.intrinsics, camera.T_cam_world
     return np.array(
         [
@@ -99,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.state, *results = _forward(inputs, plan, True)
         ctx.set_materialize_grads(False)
         image, alpha, depth, ids = (torch.from_numpy(result) for result in results)
-        # Saved as tensors: whoever changes one in place gets torch's error instead of a wrong gradient.
+        # Saved as tensors, so that in-place changes raise torch's error instead of giving a wrong gradient.
         ctx.save_for_backward(*inputs, alpha, depth)
         ctx.plan, ctx.image_shape = plan, image.shape
         ctx.mark_non_differentiable(ids)
@@ -136,7 +136,7 @@ def project(
     view: np.ndarray, arrays: Sequence[np.ndarray], geometry: np.ndarray, depths: np.ndarray, boxes: np.ndarray,
     radii: np.ndarray,
 ) -> None:  # fmt: skip
-    """Project means, quats, scales and opacities; the results are those of `projection.project`."""
+    """Project means, quats, scales and opacities; results as in `projection.project`."""
     means, quats, scales, opacities = arrays
     run(
         projection.project, len(opacities) // _WORTH_A_THREAD,
@@ -145,7 +145,7 @@ def project(
 
 
 def pack_limits(settings: RasterSettings) -> np.ndarray:
-    """The thresholds in the order of the constants in `exact_thresholds`. [6] float64"""
+    """Thresholds in the order of the constants in `exact_thresholds`. [6] float64"""
     return np.array(
         [
             math.log2(settings.alpha_min),
@@ -159,30 +159,30 @@ def pack_limits(settings: RasterSettings) -> np.ndarray:
 
 
 def pack_background(background: torch.Tensor | None, n_channels: int) -> np.ndarray:
-    """One row for all pixels [1, D], or one for each [H * W, D]; float32."""
+    """Background as one row for all pixels [1, D], or one per pixel [H * W, D]; float32."""
     if background is None:
         return np.zeros((1, n_channels), np.float32)
     return background.detach().to(torch.float32).contiguous().numpy().reshape(-1, n_channels)
 
 
 def pack_labels(labels: torch.Tensor | None) -> tuple[np.ndarray, np.ndarray]:
-    """The labels that occur, rising, all negative ones as -1 [L] float32, and the place of each Gaussian's in that [N].
+    """Distinct labels, ascending, negative ones as -1 [L] float32, and the index of each Gaussian's label [N] int32.
 
     Raises:
-        ValueError: A label is too large to be counted.
+        ValueError: A label is 2^24 or more.
     """
     if labels is None:
         return np.empty(0, np.float32), np.empty(0, np.int32)
     numbers = to_numbers(labels)
     most = numbers.max(initial=-1)
-    if most < _FEW_LABELS and numbers.min(initial=-1) >= -1:  # nothing to find: as many planes as numbers
+    if most < _FEW_LABELS and numbers.min(initial=-1) >= -1:  # one plane per number, without a search for gaps
         return np.arange(-1, most + 1, dtype=np.float32), (numbers + 1).astype(np.int32)
     names, places = np.unique(np.maximum(numbers, -1), return_inverse=True)
     return names.astype(np.float32), places.astype(np.int32)
 
 
 def to_numbers(labels: torch.Tensor) -> np.ndarray:
-    """Labels of any integer type as int64. Raises ValueError where one is too large to be counted."""
+    """Convert labels of any integer type to int64. Raises ValueError if one is 2^24 or more."""
     numbers = labels.detach().numpy().astype(np.int64)
     if len(numbers) and numbers.max() >= _MOST_LABEL:
         at = numbers.argmax()
@@ -191,12 +191,12 @@ def to_numbers(labels: torch.Tensor) -> np.ndarray:
 
 
 def to_array(tensor: torch.Tensor) -> np.ndarray:
-    """The tensor's memory as an array, C-contiguous."""
+    """View a tensor's memory as a C-contiguous array."""
     return tensor.detach().contiguous().numpy()
 
 
 def aligned(shape: tuple[int, int], dtype: type) -> np.ndarray:
-    """An array whose rows of 64 bytes each lie in one cache line."""
+    """Allocate an array aligned to 64 bytes, so that each row of 64 bytes is one cache line."""
     size = shape[0] * shape[1] * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
     skip = -memory.ctypes.data % 64
@@ -213,10 +213,10 @@ def segment_weights(
     count: int,
     settings: RasterSettings,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights of Gaussians in segments of an image as entries: Gaussians, segments, weights. Of [E]
+    """Weights of Gaussians in segments of an image as entries: Gaussians, segments, weights. [E] each
 
-    Several entries of the same Gaussian and segment, one per tile, add up. Inputs are those of
-    `segment_weights.segment_weights` and are checked there.
+    There is one entry per tile, so entries of the same Gaussian and segment must be summed. Inputs as for
+    `segment_weights.segment_weights`, which checks them.
     """
     limits = pack_limits(settings)
     plan = _Plan(camera, pack_view(camera, settings), limits, pack_labels(None), None)
@@ -237,7 +237,7 @@ def segment_weights(
 
 
 def _kinds_per_tile(segments: np.ndarray) -> np.ndarray:
-    """Number of segments that the pixels of each tile belong to. [H, W] -> [tiles] int64"""
+    """Number of segments in each tile. [H, W] -> [tiles] int64"""
     size = projection.TILE
     rows, columns = (-(-side // size) for side in segments.shape)
     padded = np.full((rows * size, columns * size), -1, np.int32)
@@ -250,7 +250,7 @@ def _kinds_per_tile(segments: np.ndarray) -> np.ndarray:
 def _forward(inputs, plan: _Plan, with_state: bool, with_slots: bool = True):
     """Project, sort, assign and blend. Returns the state or None, image, alpha, depth and ids.
 
-    Without slots the state does not serve for gradients.
+    The state supports gradients only if ``with_slots`` is True.
     """
     *shapes, channels = (to_array(t) for t in inputs[:5])
     (n, n_channels), height, width = channels.shape, plan.camera.height, plan.camera.width
@@ -289,7 +289,7 @@ def _forward(inputs, plan: _Plan, with_state: bool, with_slots: bool = True):
 
 
 def _backward(state: _Pass, plan: _Plan, inputs, results, d_image, d_alpha, d_depth, with_geometry):
-    """Gradients of means, quats, scales, opacities and channels, and the norms for densification [N]."""
+    """Gradients of means, quats, scales, opacities and channels, and the gradient norms for densification [N]."""
     means, quats, scales, opacities, channels = (to_array(t) for t in inputs[:5])
     alpha, depth = (to_array(t) for t in results)
     n, n_channels = channels.shape

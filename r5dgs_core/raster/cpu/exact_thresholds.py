@@ -1,8 +1,8 @@
-"""Decisions at the cut-offs as float64 takes them, for the few pixels where float32 cannot tell.
+"""Float64 decisions at the thresholds, for the few pixels that float32 cannot decide.
 
-A contribution right at ``alpha_min``, or a pixel right at ``transmittance_min``, is kept or dropped as a whole:
-rounding that tips the balance would change the pixel by far more than rounding. The kernels that blend therefore ask
-here whenever they come close. Blocks, lanes and tiles are those of `blend`.
+A contribution near ``alpha_min``, or a pixel near ``transmittance_min``, is kept or dropped as a whole, so rounding at
+the threshold changes the pixel by far more than rounding. The blending kernels therefore call these helpers for such
+pixels. See `batches` for blocks, lanes and tiles.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from .compilation import helper
 from .projection import L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
 from .simd.float32x16 import LANES
 
-BLOCK = 4  # px, width and height of a block; LANES pixels
+BLOCK = 4  # px, side of a block, which has LANES pixels
 BLOCKS = 8  # blocks along each side of a tile
 
-# Relative distance of transmittance from its minimum beyond which float32 decides, far above its rounding.
+# Relative distance of the transmittance from its minimum beyond which float32 decides, far above its rounding.
 CLOSE_TRANSMITTANCE = 2e-4
 
-# Entries of the limits vector; CLOSE_LOG2 is the distance of log2(alpha) from a cut-off beyond which float32 decides.
+# Entries of the limits vector. CLOSE_LOG2: distance of log2(alpha) from a threshold beyond which float32 decides.
 LOG2_ALPHA_MIN, LOG2_ALPHA_MAX, ALPHA_MAX, TRANSMITTANCE_MIN, ID_ALPHA_MIN, CLOSE_LOG2 = range(6)
 
 
 @helper
 def log2_alpha(geometry, i, x, y):
-    """Logarithm to base 2 of what Gaussian i contributes, before the cap, at a point of the image in px."""
+    """Log2 of the contribution of Gaussian i, before the cap, at a point of the image in px."""
     dx, dy = x - geometry[i, MEAN_X], y - geometry[i, MEAN_Y]
     u = geometry[i, L11] * dx - geometry[i, L12] * dy
     v = geometry[i, L22] * dy
@@ -34,7 +34,7 @@ def log2_alpha(geometry, i, x, y):
 
 @helper
 def lanes_at_least(bits, geometry, i, x0, y0, block, threshold):
-    """Those of the lanes ``bits`` of a block where the contribution of Gaussian i reaches a threshold (log2)."""
+    """Subset of the lanes ``bits`` of a block in which Gaussian i reaches a threshold (log2 of alpha)."""
     kept = np.uint64(0)
     left, top = x0 + block % BLOCKS * BLOCK + 0.5, y0 + block // BLOCKS * BLOCK + 0.5
     for lane in range(LANES):
@@ -46,9 +46,9 @@ def lanes_at_least(bits, geometry, i, x0, y0, block, threshold):
 
 @helper
 def lanes_that_finish(bits, geometry, pair_rows, pair_blocks, begin, end, x0, y0, block, limits):
-    """Those of the lanes ``bits`` of a block whose pixel the pairs begin : end bring below the minimal transmittance.
+    """Subset of the lanes ``bits`` of a block whose transmittance the pairs begin : end bring below the minimum.
 
-    ``pair_blocks`` says on which blocks each of these pairs drew anything.
+    ``pair_blocks`` holds the blocks that each pair contributes to.
     """
     finished = np.uint64(0)
     left, top = x0 + block % BLOCKS * BLOCK + 0.5, y0 + block // BLOCKS * BLOCK + 0.5

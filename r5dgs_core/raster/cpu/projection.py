@@ -1,10 +1,10 @@
-"""Kernels that project Gaussians to the image and bring their gradients back, eight at a time in float64.
+"""Kernels for projecting Gaussians to the image and for the gradients, eight Gaussians at a time in float64.
 
-Notation: p = (x, y, z) centre in the camera frame, u = x / z and v = y / z slopes, W world to camera rotation, R of the
-Gaussian, M = W R diag(s), J Jacobian of the projection, P = J M, C = P P^T + dilation.
+Notation: p = (x, y, z) centre in the camera frame, u = x / z and v = y / z slopes, W world to camera rotation, R
+rotation of the Gaussian, M = W R diag(s), J Jacobian of the projection, P = J M, C = P P^T + dilation.
 
-The conic C^-1 is kept as L^T L with L = [[l11, -l12], [0, l22]]: the exponent is then a sum of two squares, which does
-not cancel for long thin Gaussians as the expanded quadratic form does in float32.
+The conic C^-1 is stored as L^T L with L = [[l11, -l12], [0, l22]]. The exponent is then a sum of two squares, which
+avoids the float32 cancellation of the expanded quadratic form for long thin Gaussians.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .simd.float64x8 import (
 )
 from .simd.vectors import any_of, larger, select, smaller
 
-# Columns of the geometry table. Row of each Gaussian: centre in px; the whitening L scaled so that
+# Columns of the geometry table, one row per Gaussian: centre in px; whitening L, scaled so that
 # log2(alpha) = LOG2_OPACITY - (l11 dx - l12 dy)^2 - (l22 dy)^2; half extents of the alpha_min ellipse in px.
 MEAN_X, MEAN_Y, L11, L12, L22, LOG2_OPACITY, EXTENT_X, EXTENT_Y = range(8)
 GEOMETRY = 8
@@ -39,29 +39,29 @@ GEOMETRY = 8
 FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATION, ALPHA_MIN = range(14)
 ROTATION, TRANSLATION = 14, 23
 
-# Tiles of the image: side in px, and the most along one side, so that four numbers of tiles fit into one float64.
-TILE = 32  # larger tiles make fewer pairs, smaller ones finish earlier where scenes are opaque
+# Tiles of the image: side in px, and most per side, so that four tile indices fit into one float64.
+TILE = 32  # larger tiles make fewer pairs; smaller ones finish earlier in opaque scenes
 MOST_TILES = 8191
 BOX_DIGIT = MOST_TILES + 1
-BOX_MARGIN = 0.01  # px added to the extents, far more than rounding takes away; exact decisions come later
+BOX_MARGIN = 0.01  # px added to the extents, far above rounding; exact decisions come later
 
 # A slot begins with sums over pixels of A, A u, A v, A u u, A u v, A v v with A = dL/d(ln alpha) and (u, v) = L d
-# scaled as above; then come the gradients of four values, zeros to a whole vector, and the gradients of further values.
+# scaled as above. Then come the gradients of four values, zeros up to a whole vector, and gradients of further values.
 MOMENTS = 6
 
-_WHITEN = 0.5 / math.log(2.0)  # squares of the scaled (u, v) are this times those of L d
+_WHITEN = 0.5 / math.log(2.0)  # ratio of the scaled (u, v) squared to L d squared
 _UNWHITEN, _UNWHITEN_ROOT = 1 / _WHITEN, 1 / math.sqrt(_WHITEN)
 _TWICE_LN_2 = 2 * math.log(2.0)
 
 
 def padded_rows(n: int) -> int:
-    """Number of rows that tables written by the kernels of this module need for n Gaussians."""
+    """Number of rows of the tables that the kernels of this module write for n Gaussians."""
     return -(-n // DOUBLES) * DOUBLES
 
 
 @helper
 def _linearise(u, v, inverse_z, view):
-    """The Jacobian of the projection at slopes u, v: j00, j01, j02, j11, j12; and the clamped slopes."""
+    """Jacobian of the projection at slopes u, v: j00, j01, j02, j11, j12; and the clamped slopes."""
     u = smaller(larger(u, entry(view, U_LOW)), entry(view, U_HIGH))
     v = smaller(larger(v, entry(view, V_LOW)), entry(view, V_HIGH))
     j00, j01, j11 = entry(view, FX) * inverse_z, entry(view, SKEW) * inverse_z, entry(view, FY) * inverse_z
@@ -70,7 +70,7 @@ def _linearise(u, v, inverse_z, view):
 
 @helper
 def _rotation(view):
-    """W, row by row."""
+    """Entries of W, row by row."""
     r = ROTATION
     return (
         entry(view, r), entry(view, r + 1), entry(view, r + 2), entry(view, r + 3), entry(view, r + 4),
@@ -80,7 +80,7 @@ def _rotation(view):
 
 @helper
 def _product(a, b):
-    """a b of matrices given row by row."""
+    """Matrix product a b, row by row."""
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
         a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
@@ -110,7 +110,7 @@ def _rotate(view, w, x, y, z):
 
 @helper
 def _to_camera(view, a, b, c):
-    """World points (a, b, c) in the camera frame."""
+    """Transform world points (a, b, c) to the camera frame."""
     k = _rotation(view)
     return (
         entry(view, TRANSLATION) + k[0] * a + k[1] * b + k[2] * c,
@@ -121,7 +121,7 @@ def _to_camera(view, a, b, c):
 
 @helper
 def _unit(quats, i, last):
-    """Quaternions i to i + 7 made one long, and one over their lengths; zero counts as no rotation, with 0."""
+    """Normalised quaternions i to i + 7, and the inverses of their lengths; zero gives the identity and inverse 0."""
     zero, one = spread(0.0), spread(1.0)
     w, x, y, z = (
         column(quats, i, last, 4, 0), column(quats, i, last, 4, 1),
@@ -149,10 +149,10 @@ def _axes(j, r, s0, s1, s2):
 
 @helper
 def _covariance(p, dilation):
-    """c_xx, c_xy, c_yy of P P^T with dilation, and the determinant.
+    """Return c_xx, c_xy, c_yy of P P^T with dilation, and the determinant.
 
-    det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, and det(P P^T) is the sum of the squared minors of P (Cauchy and
-    Binet): nothing cancels, however long and thin the Gaussian is.
+    det(P P^T + d I) = det(P P^T) + d tr(P P^T) + d^2, and det(P P^T) is the sum of the squared minors of P
+    (Cauchy-Binet), so nothing cancels for long thin Gaussians.
     """
     xx = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
     xy = p[0] * p[3] + p[1] * p[4] + p[2] * p[5]
@@ -173,16 +173,16 @@ def _tiles(low, high, count):
 
 @kernel
 def project(worker, workers, view, means, quats, scales, opacities, geometry, depths, boxes, radii):
-    """Fill the rows of this worker.
+    """Project the worker's share of the Gaussians.
 
-    The inputs are flat; the results have n = `padded_rows` rows, of which those too many have no radius.
+    The inputs are flat. The results have n = `padded_rows` rows; padding rows have radius 0.
 
     Args:
         geometry: Projected Gaussians. [n, 8]
         depths: z in the camera frame. [n]
-        boxes: Tiles of the bounding box as digits to the base `BOX_DIGIT` of one number: one past the last row, the
-            first row, one past the last column, the first column. [n] float64
-        radii: Three standard deviations along the long axis, px, 0 where the image is not touched. [n]
+        boxes: Tiles of the bounding box, four digits to the base `BOX_DIGIT` in one number, most significant first: one
+            past the last row, first row, one past the last column, first column. [n] float64
+        radii: Three standard deviations along the long axis, px, 0 if the image is not touched. [n]
     """
     count = len(opacities)
     last, blocks = count - 1, len(depths) // DOUBLES
@@ -243,7 +243,7 @@ def slot_place(value):
 
 @helper
 def _sum_slots(i, count, slot_starts, flat_slots, filled, width, sums):
-    """Sum the filled slots of Gaussians i to i + 7 into the rows of ``sums``; returns a bit for each that has any."""
+    """Sum the filled slots of Gaussians i to i + 7 into the rows of ``sums``; return a bit set of those with any."""
     present = np.uint64(0)
     for k in range(min(DOUBLES, count - i)):
         begin, end = slot_starts[i + k], slot_starts[i + k + 1]
@@ -268,18 +268,18 @@ def project_backward(
     worker, workers, view, means, quats, scales, opacities, slot_starts, slots, filled, with_geometry, n_channels,
     d_means, d_quats, d_scales, d_opacities, d_channels, grad_norm,
 ):  # fmt: skip
-    """Sum the pair slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay zero.
+    """Sum the slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay zero.
 
     Args:
         view: See `cpu_backend.pack_view`. [26]
         means, quats, scales, opacities: The inputs, flat.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
-        slots, filled: Moments and gradients of the values of each pair of Gaussian and tile, and which there are.
-            [S, 16 k], [S]
-        with_geometry: Whether more than channels want a gradient.
+        slots, filled: Moments and gradients of the values of each pair of Gaussian and tile, and the mask of slots that
+            were written. [S, 16 k], [S]
+        with_geometry: True if more than the channels need gradients.
         n_channels: D.
-        d_means, d_quats, d_scales, d_opacities, d_channels: Gradients, flat, zero, with `padded_rows` rows.
-        grad_norm: Norm of the gradient with respect to the projected centre in px, zero and padded, too.
+        d_means, d_quats, d_scales, d_opacities, d_channels: Gradients, flat, initially zero, with `padded_rows` rows.
+        grad_norm: Norm of the gradient by the projected centre in px, initially zero and padded, too.
     """
     count, width = len(opacities), slots.shape[1]
     last, blocks = count - 1, len(grad_norm) // DOUBLES
@@ -320,7 +320,7 @@ def project_backward(
         xx, xy, yy, determinant = _covariance(p, dilation)
         l11, l22, shift = sqrt(yy / determinant), sqrt(one / yy), xy / yy
 
-        # To the centre: L^T (sum A u, sum A v).
+        # Gradient by the centre: L^T (sum A u, sum A v).
         root, square = spread(_UNWHITEN_ROOT), spread(_UNWHITEN)
         su, sv = column(sums, 0, end, width, 1) * root, column(sums, 0, end, width, 2) * root
         suu, suv = column(sums, 0, end, width, 3) * square, column(sums, 0, end, width, 4) * square
@@ -329,8 +329,8 @@ def project_backward(
         d_y2d = l22 * sv - shift * d_x2d
         set_column(grad_norm, i, 1, 0, sqrt(d_x2d * d_x2d + d_y2d * d_y2d))
 
-        # C = P P^T, P = J M, M = W R diag(s). dL/dP = L^T S L P with S the sums of squares; L P comes from the minors
-        # of P, because L^T S L expanded cancels for needles. d_m is dL/dM, row by row.
+        # C = P P^T, P = J M, M = W R diag(s). dL/dP = L^T S L P with S the second moments. L P is computed from the
+        # minors of P, because the expanded L^T S L cancels for thin Gaussians. d_m is dL/dM, row by row.
         d_a, d_b = _to_axes(p, (suu, suv, svv), l11, l22, shift, one / yy, dilation)
         d_m = (
             j00 * d_a[0], j00 * d_a[1], j00 * d_a[2],

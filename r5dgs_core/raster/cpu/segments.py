@@ -1,7 +1,7 @@
-"""Kernel that weighs the Gaussians of each segment of an image; tiles, blocks and batches are those of `batches`.
+"""Kernel for the weights of Gaussians in each segment of an image; see `batches` for tiles, blocks and batches.
 
-It follows a forward pass that said on which blocks each pair drew and where each pixel was finished, near to far, and
-adds the same weights again, this time per segment of a tile.
+It repeats a forward pass near to far, using its record of the blocks of each pair and the last pair of each pixel, and
+sums the same weights per segment and tile.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from .projection import TILE
 from .simd.float32x16 import LANES, broadcast, load, splat, store
 from .simd.vectors import any_of, lowest_bit, unlikely
 
-_NONE, _SEVERAL = -1, -2  # segments of a block
+_NONE, _SEVERAL = -1, -2  # no segment, or more than one, in a block
 
 
 @helper
 def _start_tile(x0, y0, segments, last_pairs, places, names, of_pixels, of_blocks, last):
-    """Number the segments of a tile from 0 on: of its pixels, of its blocks, and their names; returns how many.
+    """Number the segments of a tile from 0: of pixels and of blocks, and their names; return the number of segments.
 
-    ``places`` holds -1 for each segment of the image, before and after.
+    ``places`` is -1 for each segment of the image, before and after.
     """
     height, width = segments.shape
     kinds = 0
@@ -72,17 +72,17 @@ def weigh_segments(
     worker, workers, tile_starts, tile_ends, pair_rows, pair_blocks, geometry, depths, limits, last_pairs, segments,
     count, starts, counts, entry_rows, entry_segments, entry_weights,
 ):  # fmt: skip
-    """List the weights of the pairs of every workers-th tile in the tile's segments.
+    """List the weights of the pairs of every ``workers``-th tile in the tile's segments.
 
     Args:
-        tile_starts, tile_ends, pair_rows, pair_blocks, geometry, depths, limits, last_pairs: As `blend.blend`
-            takes and leaves them.
+        tile_starts, tile_ends, pair_rows, pair_blocks, geometry, depths, limits, last_pairs: Inputs and results of
+            `blend.blend`.
         segments: Segment of each pixel, negative for none. [H, W] int32
         count: Number of segments of the image.
-        starts: Where the entries of each tile begin; there is room for one per pair and segment of the tile. [tiles]
-        counts: Takes the number of entries of each tile. [tiles] int64
-        entry_rows, entry_segments, entry_weights: Take the entries: Gaussian, segment and the sum of its weights over
-            the pixels of the tile that belong to it. [E] int32, int32, float32
+        starts: First entry of each tile, with room for one entry per pair and segment of the tile. [tiles]
+        counts: Result, number of entries of each tile. [tiles] int64
+        entry_rows, entry_segments, entry_weights: Results, the entries: Gaussian, segment, and sum of its weights over
+            the segment's pixels in the tile. [E] int32, int32, float32
     """
     columns = (segments.shape[1] + TILE - 1) // TILE
     passed, last, weights = aligned(PIXELS), aligned(PIXELS), aligned(LANES)

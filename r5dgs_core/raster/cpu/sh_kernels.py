@@ -1,13 +1,13 @@
-"""Kernels that turn spherical harmonics into colours: of Gaussians as an eye sees them, and of a sky.
+"""Kernels for the colours of Gaussians from spherical harmonics, forward and backward.
 
 Notation: d = A (mean - eye) / |A (mean - eye)| viewing direction in the frame of the coefficients; b_k(d) basis
 functions beyond the constant one, k = 1 .. K - 1, in the order of `spherical_harmonics.basis`. A colour is
 
     factor max(0, 0.5 + C0 sh_0 + sum_k b_k(d) sh_k)
 
-Directions and basis are float64, so that an eye far from the origin costs no digits, sums over k float32. Coefficients
-come as two flat arrays with strides, the constant ones and the rest: one array [N, K, 3] serves as both, and so do the
-two parameters of training.
+Directions and basis are computed in float64, so that an eye far from the origin loses no digits; sums over k are
+float32. Coefficients come as two flat arrays with strides, degree 0 and the rest. They can be one array [N, K, 3], or
+the two parameters of training.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from numba import float32
 from ...scene.sh_color import C0, C1, C2_XX_YY, C2_XY, C2_ZZ, C3_0, C3_1, C3_2, C3_2_DIFFERENCE, C3_3
 from .compilation import helper, kernel
 
-BASES = 16  # to degree 3
+BASES = 16  # up to degree 3
 
 
 @helper
 def _direction(means, eyes, view_maps, i, pose):
-    """Unit direction d of Gaussian i, and one over the length that it had; all zero at the eye."""
+    """Unit direction d of Gaussian i, and the inverse of its length before normalisation; all zero at the eye."""
     a = np.float64(means[i, 0]) - eyes[pose, 0]
     b = np.float64(means[i, 1]) - eyes[pose, 1]
     c = np.float64(means[i, 2]) - eyes[pose, 2]
@@ -64,7 +64,7 @@ def evaluate_basis(x, y, z, count, basis):
 
 @helper
 def _differentiate_basis(x, y, z, count, h):
-    """Gradient of sum_k h_k b_k with respect to x, y, z as free variables."""
+    """Gradient of sum_k h_k b_k by x, y, z as free variables."""
     d_x, d_y, d_z = -C1 * h[3], -C1 * h[1], C1 * h[2]
     if count < 9:
         return d_x, d_y, d_z
@@ -86,7 +86,7 @@ def _differentiate_basis(x, y, z, count, h):
 
 @helper
 def _sum_basis(basis, count, constants, start, rest, rest_start):
-    """The three channels of 0.5 + C0 sh_0 + sum_k b_k sh_k, not clamped."""
+    """Three channels of 0.5 + C0 sh_0 + sum_k b_k sh_k, not clamped."""
     first, at = np.uint64(start), np.uint64(rest_start)
     half, c0 = float32(0.5), float32(C0)
     r = half + c0 * constants[first]
@@ -105,18 +105,18 @@ def shade(
     worker, workers, means, eyes, view_maps, pose_ids, constants, stride, rest, rest_start, rest_stride, count,
     factor, colors,
 ):  # fmt: skip
-    """Fill the rows of this worker of colors [N, 3].
+    """Compute the worker's share of the colours.
 
     Args:
         means: Centres. [N, 3]
         eyes: Eye of each pose, in the frame of the centres. [P, 3] float64
         view_maps: The map A of each pose. [P, 3, 3] float64
-        pose_ids: Pose of each Gaussian. [N] or, where all have pose 0, [0]
-        constants: Flat; coefficients of degree 0 of Gaussian i begin at i stride.
+        pose_ids: Pose of each Gaussian. [N], or [0] if all have pose 0
+        constants: Flat; the degree-0 coefficients of Gaussian i begin at i stride.
         rest: Flat; the others begin at rest_start + i rest_stride.
-        count: Coefficients of a channel, K: 4, 9 or 16.
-        factor: On the colour. [N] or, where it is 1, [0]
-        colors: Where they go. [N, 3]
+        count: Coefficients per channel, K: 4, 9 or 16.
+        factor: Factor on the colour. [N], or [0] if it is 1
+        colors: Result. [N, 3]
     """
     n, zero = len(means), float32(0)
     basis = np.empty(BASES, np.float32)
@@ -125,7 +125,7 @@ def shade(
         evaluate_basis(x, y, z, count, basis)
         r, g, b = _sum_basis(basis, count, constants, i * stride, rest, rest_start + i * rest_stride)
         strength = factor[i] if len(factor) else float32(1)
-        # Written so that what is not a number stays one.
+        # Comparisons that let NaN pass.
         colors[i, 0] = (zero if r < zero else r) * strength
         colors[i, 1] = (zero if g < zero else g) * strength
         colors[i, 2] = (zero if b < zero else b) * strength
@@ -136,13 +136,13 @@ def shade_backward(
     worker, workers, means, eyes, view_maps, pose_ids, constants, stride, rest, rest_start, rest_stride, count,
     factor, d_colors, d_constants, d_rest, d_means, d_factor,
 ):  # fmt: skip
-    """Write the gradients of this worker's rows: of the coefficients, with strides as theirs, of the means and factor.
+    """Compute the worker's share of the gradients: of the coefficients, laid out as they are, means and factor.
 
     Args:
         d_colors: Gradient of the colours. [N, 3]
-        d_constants, d_rest: Flat, every entry that a stride reaches is written.
-        d_means: [N, 3] or, where it is not wanted, [0, 3]
-        d_factor: [N] or, where it is not wanted, [0]
+        d_constants, d_rest: Results, flat; every entry that a stride reaches is written.
+        d_means: Result. [N, 3], or [0, 3] to skip it
+        d_factor: Result. [N], or [0] to skip it
     """
     n, zero = len(means), float32(0)
     basis, h = np.empty(BASES, np.float32), np.empty(BASES, np.float32)
@@ -170,7 +170,7 @@ def shade_backward(
             at += np.uint64(3)
         if len(d_means) == 0:
             continue
-        # Through d = v / |v|: what points along d is lost; then through v = A (mean - eye).
+        # Through d = v / |v|: remove the component along d; then through v = A (mean - eye).
         d_x, d_y, d_z = _differentiate_basis(x, y, z, count, h)
         along = x * d_x + y * d_y + z * d_z
         d_x, d_y, d_z = (d_x - along * x) * inverse, (d_y - along * y) * inverse, (d_z - along * z) * inverse

@@ -1,6 +1,6 @@
-"""Kernel that draws a sky: spherical harmonics along the ray of each pixel, within [0, 1].
+"""Kernel for rendering a sky: spherical harmonics along the ray of each pixel, clamped to [0, 1].
 
-A row of pixels is one vector in every step, so that the compiler finds vectors whatever the degree is.
+Every step processes a row of pixels, so that the compiler can vectorize it for any degree.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from .sh_kernels import BASES, evaluate_basis
 
 @kernel
 def draw_sky(worker, workers, rays, sh, image):
-    """Fill the rows of this worker.
+    """Render the worker's share of the rows.
 
     Args:
-        rays: Takes pixel coordinates (x, y, 1) to directions of any length in the sky's frame. [3, 3] float64
+        rays: Map from pixel coordinates (x, y, 1) to directions in the sky's frame, not normalised. [3, 3] float64
         sh: Coefficients; K = 4, 9 or 16. [K, 3] float64
-        image: [H, W, 3] float32
+        image: Result. [H, W, 3] float32
     """
     height, width = image.shape[:2]
     count = len(sh)
@@ -39,7 +39,7 @@ def draw_sky(worker, workers, rays, sh, image):
 
 @helper
 def _evaluate_row(rays, y, count, basis):
-    """Write the basis functions of a row of pixels. [K, W]"""
+    """Evaluate the basis functions for a row of pixels. [K, W]"""
     values = np.empty(BASES, np.float32)
     a, b, c = rays[0, 1] * y + rays[0, 2], rays[1, 1] * y + rays[1, 2], rays[2, 1] * y + rays[2, 2]
     for x in range(basis.shape[1]):

@@ -1,7 +1,7 @@
-"""Kernels that sort Gaussians by depth once and hand them out to the tiles that they touch.
+"""Kernels for sorting Gaussians by depth and assigning them to the tiles that they touch.
 
-A pair is a Gaussian in a tile. Pairs lie tile after tile, near to far within each; the slot of a pair numbers the same
-pairs Gaussian after Gaussian, so that gradients can be written per pair and summed per Gaussian in a fixed order.
+A pair is a Gaussian in a tile. Pairs are stored tile by tile, near to far within each. Slots number the same pairs
+Gaussian by Gaussian, so that gradients are written per pair and summed per Gaussian in a fixed order.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from .projection import (
 from .simd.vectors import prefetch
 
 _BOX_BITS = np.uint64(BOX_DIGIT.bit_length() - 1)
-AHEAD = 16  # Gaussians
+AHEAD = 16  # prefetch distance, Gaussians
 _DIGIT = 11  # bits per pass of the radix sort
-_WORTH_A_THREAD = 4000  # Gaussians
+_WORTH_A_THREAD = 4000  # Gaussians per thread
 _MOST_PAIRS = (1 << 31) - 1  # slots are numbered in int32
-_MOST_PAIRS_OF_A_TILE = 1 << 24  # which are numbered in float32
+_MOST_PAIRS_OF_A_TILE = 1 << 24  # pairs of a tile are numbered in float32
 
 
 def sort_by_depth(depths, radii):
-    """Rows with a radius, by increasing depth (float64), rows of equal depth in their order. -> [V] int32"""
-    with np.errstate(over="ignore"):  # depths beyond float32 sort last, and then by float64
+    """Sort the rows with a radius by increasing depth (float64), ties in row order. -> [V] int32"""
+    with np.errstate(over="ignore"):  # depths beyond float32 sort last, then by float64
         bits = depths.astype(np.float32).view(np.uint32)
     parts = max(1, min(threads(), len(bits) // _WORTH_A_THREAD))
-    # Every part sorts a range of depths; where the ranges end does not change the result.
+    # Each part sorts a range of depths; the bounds do not affect the result.
     bounds = np.zeros(parts + 1, np.int64)
     bounds[-1] = 1 << 32
     if parts > 1:
@@ -54,17 +54,17 @@ def sort_by_depth(depths, radii):
 
 @kernel
 def sort_part(worker, workers, bits, depths, radii, bounds, order, counts):
-    """Write the rows with a radius whose depths lie in this worker's range to their places in ``order``.
+    """Write the rows with a radius whose depths lie in this worker's range, sorted, to their part of ``order``.
 
-    The bits of positive floats are ordered like the floats: a radix sort of the depths in float32, least digit first,
-    over the digits that differ at all; then runs that are equal in float32 are ordered by their float64 depths.
+    The bits of positive floats sort like the floats. A radix sort of the float32 depths, least significant digit first,
+    skips leading digits that are all equal. Runs of equal float32 depths are then sorted by float64 depth.
 
     Args:
-        bits: Of the depths in float32. [n] uint32
+        bits: Bits of the float32 depths. [n] uint32
         depths, radii: See `projection.project`. [n]
-        bounds: Where the ranges of bits begin, and the end of the last. [workers + 1] int64
-        order: The result; the caller cuts it to the sum of ``counts``. [n] int32
-        counts: Takes the number of rows of each worker. [workers] int64
+        bounds: Start of each range of bits, and the end of the last. [workers + 1] int64
+        order: Result; the caller cuts it to the sum of ``counts``. [n] int32
+        counts: Result, number of rows of each worker. [workers] int64
     """
     low, high = bounds[worker], bounds[worker + 1]
     before, count, least, most = 0, 0, high, low
@@ -110,7 +110,7 @@ def sort_part(worker, workers, bits, depths, radii, bounds, order, counts):
 
 @helper
 def _sort_run(order, begin, end, depths):
-    """Order a few rows by depth and then by row: Shell's sort, quick where they are in order already."""
+    """Sort a few rows by depth, then by row. Shell sort, fast on sorted input."""
     gap = 1
     while gap < (end - begin) // 3:
         gap = 3 * gap + 1
@@ -129,7 +129,7 @@ def _sort_run(order, begin, end, depths):
 
 @helper
 def _tile_range(low, high, tiles):
-    """First and one past the last tile that has pixel centres between two coordinates in px, within 0 .. tiles."""
+    """First and one past the last tile with pixel centres between two coordinates in px, within 0 .. tiles."""
     first = math.floor((max(low, 0.0) - 0.5) / TILE)
     last = math.floor((min(high, float(tiles * TILE)) - 0.5) / TILE)
     return max(int(first), 0), min(int(last) + 1, tiles)
@@ -137,7 +137,7 @@ def _tile_range(low, high, tiles):
 
 @helper
 def _box(boxes, i):
-    """Tiles that the bounding box of Gaussian i touches: first and one past the last column, the same of rows."""
+    """Tiles of the bounding box of Gaussian i: first and one past the last column, then the same of rows."""
     packed, mask = np.uint64(boxes[i]), np.uint64(MOST_TILES)
     left, packed = packed & mask, packed >> _BOX_BITS
     right, packed = packed & mask, packed >> _BOX_BITS
@@ -146,11 +146,11 @@ def _box(boxes, i):
 
 @helper
 def _span(geometry, i, row, columns):
-    """First and one past the last column of tiles that the ellipse of Gaussian i touches in a row of tiles."""
+    """First and one past the last tile column that the ellipse of Gaussian i touches in a tile row."""
     x, y = geometry[i, MEAN_X], geometry[i, MEAN_Y]
     extent_x, extent_y = geometry[i, EXTENT_X], geometry[i, EXTENT_Y]
     shift, ratio = geometry[i, L12] / geometry[i, L11], geometry[i, L22] / geometry[i, L11]
-    tip = shift * extent_y * extent_y / extent_x  # dy of the point of the ellipse with the largest dx
+    tip = shift * extent_y * extent_y / extent_x  # dy at the point of the ellipse with the largest dx
     low = max(row * TILE + 0.5 - y, -extent_y)
     high = min(row * TILE + TILE - 0.5 - y, extent_y)
     right = min(max(tip, low), high)
@@ -168,14 +168,14 @@ def count_pairs(worker, workers, order, boxes, geometry, columns, tile_counts, s
     Args:
         order: Rows of the visible Gaussians, near to far. [V]
         boxes, geometry: Projected Gaussians, see `projection.project`. [N], [N, 8]
-        columns: Number of tiles side by side.
-        tile_counts: Takes the number of pairs per tile, one row per worker. [workers, tiles] int64
-        slot_counts: Takes the number of pairs of each Gaussian, from its second entry on. [N + 1] int64, or empty
+        columns: Number of tile columns.
+        tile_counts: Result, number of pairs per tile, one row per worker. [workers, tiles] int64
+        slot_counts: Result, number of pairs of Gaussian i at index i + 1. [N + 1] int64, or empty
     """
     counts, flat_geometry = tile_counts[worker], geometry.reshape(-1)
     counts[:] = 0
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
-        if rank + AHEAD < len(order):  # depth order leads anywhere in memory
+        if rank + AHEAD < len(order):  # depth order accesses memory at random
             coming = np.int64(order[rank + AHEAD])
             prefetch(boxes, coming)
             prefetch(flat_geometry, coming * GEOMETRY)
@@ -196,10 +196,10 @@ def count_pairs(worker, workers, order, boxes, geometry, columns, tile_counts, s
 
 @kernel
 def fill_pairs(worker, workers, order, boxes, geometry, columns, cursors, slot_starts, pair_rows, pair_slots):
-    """Write the pairs that `count_pairs` counted; ``cursors`` says where those of each worker begin in each tile."""
+    """Write the pairs counted by `count_pairs`; ``cursors`` holds the first pair of each worker in each tile."""
     cursor, flat_geometry = cursors[worker], geometry.reshape(-1)
     for rank in range(len(order) * worker // workers, len(order) * (worker + 1) // workers):
-        if rank + AHEAD < len(order):  # depth order leads anywhere in memory
+        if rank + AHEAD < len(order):  # depth order accesses memory at random
             coming = np.int64(order[rank + AHEAD])
             prefetch(boxes, coming)
             prefetch(flat_geometry, coming * GEOMETRY)
@@ -222,13 +222,13 @@ def fill_pairs(worker, workers, order, boxes, geometry, columns, cursors, slot_s
 
 
 def assign_tiles(order, boxes, geometry, width, height, with_slots):
-    """List the pairs of depth-ordered Gaussians and tiles.
+    """List the pairs of depth-sorted Gaussians and tiles.
 
     Args:
         order: Rows of the visible Gaussians, near to far. [V] int32
         boxes, geometry: Projected Gaussians, see `projection.project`. [N], [N, 8]
         width, height: Size of the image, px.
-        with_slots: Whether gradients will be wanted.
+        with_slots: True if gradients are needed.
 
     Returns:
         tile_starts: Pairs of tile t are tile_starts[t] : tile_starts[t + 1]; tiles row by row. [tiles + 1] int64
@@ -261,12 +261,12 @@ def merge_pairs(worker, workers, depths, ranks, spans, rows, other_spans, other_
     """Merge two lists of pairs, tile by tile, both near to far.
 
     Args:
-        depths: Of all rows. [n]
-        ranks: Of two rows at the same depth, that with the lower rank is nearer. [n] int64
+        depths: Depths of all rows. [n]
+        ranks: At equal depth, the row with the lower rank is nearer. [n] int64
         spans, rows: First and one past the last pair of each tile, and the rows of the pairs. [K, 2], [P]
         other_spans, other_rows: The same of the other list.
-        merged_starts: Where those of each tile go. [K + 1]
-        merged_rows: The result.
+        merged_starts: First merged pair of each tile. [K + 1]
+        merged_rows: Result.
     """
     tiles = len(merged_starts) - 1
     for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
