@@ -1,1 +1,1 @@
-"""Give masks with inconsistent ids one numbering, by the Gaussians that each segment shows."""
+"""Association of mask segments across images: one consistent numbering, from the Gaussians that each segment shows."""

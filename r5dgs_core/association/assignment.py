@@ -1,4 +1,4 @@
-"""Give the segments of each image to objects, each object once, by what the other images say.
+"""Assignment of each image's segments to objects, one segment per object, by the votes of the other images.
 
 Notation: S segments of all images, s of one image, K objects.
 """
@@ -12,10 +12,10 @@ from scipy import optimize
 
 from . import leave_one_out, segment_stack
 
-PASSES = 3
-STAY = 1.5  # factor on the score of the object that a segment had before
-LOWEST = 0.3  # share of an object's usual score below which a segment is not it
-PART = 0.6  # share of a segment, relative to what is usual, that lies in an object where it is a part of it
+PASSES = 3  # most rounds of `refine`
+STAY = 1.5  # factor on the score of the previous object
+LOWEST = 0.3  # smallest score, relative to the object's usual IoU
+PART = 0.6  # smallest share of a part inside its object, relative to the usual share
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class Assignment:
     """Objects of segments.
 
     Attributes:
-        labels: Object of each, 0 = background, -1 = none. [S]
-        scores: Leave-one-out IoU with it and that of its run, in shares of what is usual for it, with the bonus of
-            those that stay; 0 where none. [S]
+        labels: Object of each segment, 0 = background, -1 = none. [S]
+        scores: Leave-one-out IoU with the object, relative to its usual IoU, averaged with that of the segment's run,
+            and with a bonus for keeping the object; 0 without an object. [S]
         plain: The same without run and bonus. [S]
-        margins: Score over the sum of it and that of the next best object: 0.5 is a draw. [S]
-        agreement: Mean leave-one-out IoU of the objects' pixels: what to compare assignments by.
-        usual_iou: Median leave-one-out IoU of the segments that had an object before.
+        margins: Score divided by the sum of it and the next best object's score; 0.5 is a tie. [S]
+        agreement: Mean leave-one-out IoU per object pixel; the measure for comparing assignments.
+        usual_iou: Median leave-one-out IoU of the segments with an object in the previous labels.
     """
 
     labels: np.ndarray
@@ -41,12 +41,12 @@ class Assignment:
 
 
 def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
-    """Ask again for every image until nothing changes, `PASSES` times at most.
+    """Repeat `assign` until the labels are stable, at most `PASSES` times.
 
     Args:
         stack: The segments.
-        runs: Run of each, -1 for background. [S]
-        labels: Objects to begin with. [S]
+        runs: Run of each segment, -1 for background. [S]
+        labels: Initial objects. [S]
         count: Number of objects.
     """
     found = assign(stack, runs, labels, count)
@@ -59,7 +59,7 @@ def refine(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
 
 
 def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, count: int) -> Assignment:
-    """Give every segment an object by the votes of ``labels``; arguments as of `refine`."""
+    """Assign each segment to an object by the votes of ``labels``; arguments as in `refine`."""
     found = list(leave_one_out.overlaps(stack, labels, count))
     ious = np.concatenate([overlap.ious for overlap in found])
     shares = np.concatenate([overlap.shares for overlap in found])
@@ -71,7 +71,7 @@ def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
         mine = ious[own[labels[own] == k], k]
         usual[k] = (mine.sum() + 2 * usual[0]) / (len(mine) + 2)
     plain = ious / np.maximum(usual, 1e-6)
-    # The worse segments agree with what the other images say, the more the whole run is asked.
+    # The lower the usual IoU, the more the mean over the run counts.
     scores = usual[0] * plain + (1 - usual[0]) * _run_means(plain, runs, stack.pixels)
     scores[own, labels[own]] *= STAY
     scores[:, 0] = 0.0
@@ -97,7 +97,7 @@ def assign(stack: segment_stack.Stack, runs: np.ndarray, labels: np.ndarray, cou
 
 
 def measure(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Assignment:
-    """How well the images agree with each other on labels as they are; arguments as of `refine`."""
+    """Measure how well the images agree on the given labels; arguments as in `refine`."""
     ious = np.concatenate([overlap.ious for overlap in leave_one_out.overlaps(stack, labels, count)])
     own = np.flatnonzero(labels > 0)
     scores = np.zeros(len(labels))
@@ -115,7 +115,7 @@ def _agreement(stack: segment_stack.Stack, ious: np.ndarray, labels: np.ndarray)
 
 
 def _add_parts(result: np.ndarray, rows: np.ndarray, start: int, overlap: leave_one_out.Overlaps, usual: float) -> None:
-    """Let what is left join an object that lies over it, where the object is better explained by both together."""
+    """Assign leftover segments to an object that covers them, if that raises the object's IoU."""
     for row in sorted(rows[result[rows] < 0], key=lambda r: -overlap.segments[r - start]):
         k = int(overlap.shares[row - start, 1:].argmax()) + 1
         if overlap.shares[row - start, k] < PART * usual:
@@ -132,7 +132,7 @@ def _joint_iou(overlap: leave_one_out.Overlaps, rows: np.ndarray, k: int) -> flo
 
 
 def _run_means(scores: np.ndarray, runs: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Mean over the segments of the same run, weighted by their sizes. [S, K + 1]"""
+    """Mean over the segments of each run, weighted by their sizes. [S, K + 1]"""
     out = np.zeros_like(scores)
     rows = np.flatnonzero(runs >= 0)
     if len(rows):

@@ -1,12 +1,12 @@
-"""Which segments of all images are one object: identities that survive bad tracking.
+"""Association of the segments of all images to objects: identities that survive tracking errors.
 
-Geometry and motion are trained first, so a segment of any image is a bag of Gaussians, and what a tracker must guess
-is an overlap of bags here: between views, between times, across gaps. Runs of segments that tracker and geometry agree
-upon (`tracklets`) are joined to objects (`clustering`), which then claim the segments of each image (`assignment`) by
-what the other images say. Incoming ids count for as much as they are found to be worth.
+Geometry and motion are trained first, so each segment is a weighted bag of Gaussians, and overlaps of bags replace the
+tracker's guesses: between views, between times and across gaps. Runs of segments on which tracker and geometry agree
+(`tracklets`) are joined to objects (`clustering`). Each image's segments are then assigned to objects by the votes of
+the other images (`assignment`). Incoming ids count as much as they prove to be reliable.
 
-Where the outcome explains the images no better than the incoming ids do, these stay; so they do, translated into the
-new numbering, for single segments of which the evidence is thin.
+If the result explains the images no better than the incoming ids, all incoming ids are kept. Single segments with weak
+evidence also keep theirs, translated to the new numbering.
 
 Notation: I images, S segments of an image, N Gaussians, k neighbours, K objects.
 """
@@ -24,30 +24,30 @@ from scipy import optimize, sparse
 from ..data import masks
 from . import assignment, clustering, leave_one_out, segment_stack, supergaussians, tracklets
 
-GAIN = 0.5  # of the usual overlap that a pixel that changes must win on average for anything to change,
-FEW = 4  # and twice that with so few images: little evidence agrees with a wrong outcome by chance
-SHOWN = 0.03  # share of the images that must show an object; 2 to 4 of them whatever the share is
-MOST = 60_000  # Gaussians; more than this are put together to patches of neighbours first
-CERTAIN = 0.25  # share of the objects' pixels: where less of them is certain, nothing is changed
-DOUBTFUL = 0.55  # share of the score of the two best objects below which the better one is in doubt
+GAIN = 0.5  # smallest mean gain per changed pixel, relative to the usual IoU,
+FEW = 4  # doubled at this number of images, as little evidence agrees with a wrong result by chance
+SHOWN = 0.03  # smallest share of the images that show an object, bounded to 2 to 4 images
+MOST = 60_000  # Gaussians; above it, neighbours are first grouped to patches
+CERTAIN = 0.25  # smallest share of object pixels assigned with certainty; below it, all incoming ids are kept
+DOUBTFUL = 0.55  # smallest margin of a certain assignment, see `assignment.Assignment.margins`
 
-_NOBODY = -2  # id of what nobody can name, until all have one
+_NOBODY = -2  # temporary id of segments that get no name
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was done with a segment.
+    """Result of the association for one segment.
 
     Attributes:
         image: Index of the image.
-        segment: Index of the segment in its image, among the ids that it came with.
+        segment: Index of the segment in its image, in the order of the incoming ids.
         old_id: Incoming id.
-        new_id: Outgoing id, `masks.UNKNOWN` where nobody knows.
-        usual_id: Outgoing id that most of what has the incoming id in the same view got.
+        new_id: Outgoing id, or `masks.UNKNOWN`.
+        usual_id: Outgoing id of most pixels with the same incoming id in the same view.
         pixels: Size.
-        score: Overlap with the object as the other images see it, 1 = as good as usual; 0 = none.
-        done: ``kept``: as its view's other segments of this id, or for want of evidence; ``relabelled``: a switch of
-            ids was found; ``unknown``.
+        score: Leave-one-out IoU with the object, relative to the usual IoU; 0 without an object.
+        done: ``kept`` if the outgoing id is the usual one, also for lack of evidence; ``relabelled`` if an id switch
+            was found; ``unknown``.
     """
 
     image: int
@@ -65,14 +65,14 @@ class Association:
     """New ids for the segments of all images.
 
     Attributes:
-        ids: New id of each segment of each image, 0 = background. I times [S] int32
-        rows: One for every segment that is not background.
+        ids: New id of each segment of each image, 0 = background. List of I arrays [S] int32
+        rows: One row per segment, without background.
         objects: Ids of the objects, ascending. [K]
         confident: Share of the objects' pixels that was assigned with certainty.
         agreement: Mean leave-one-out IoU of segments with their objects.
-        agreement_before: The same with the incoming ids as they were.
-        usual_iou: Median of the leave-one-out IoU of segments: 1 for perfect geometry and outlines.
-        fallback: Whether all incoming ids stay.
+        agreement_before: The same with the incoming ids.
+        usual_iou: Median leave-one-out IoU of segments; 1 for perfect geometry and outlines.
+        fallback: True if all incoming ids are kept.
     """
 
     ids: list[np.ndarray]
@@ -86,7 +86,7 @@ class Association:
 
     @functools.cached_property
     def sizes(self) -> dict[int, float]:
-        """Usual size of the segments of each outgoing id, pixels."""
+        """Median size of the segments of each outgoing id, pixels."""
         pixels: dict[int, list[int]] = {}
         for row in self.rows:
             pixels.setdefault(row.new_id, []).append(row.pixels)
@@ -100,13 +100,13 @@ def associate(
     paths: np.ndarray | None = None,
     most: int = MOST,
 ) -> Association:
-    """Find the objects that segments of many images show, and give the segments their ids.
+    """Find the objects that segments of many images show, and number the segments by object.
 
     Args:
-        images: Bags of each image, `segment_stack.from_pixels`.
-        neighbours: Nearest Gaussians of each; without them many Gaussians are thinned rather than put together. [N, k]
-        paths: Places of the Gaussians at some times: those that do not move together are kept apart. [N, T, 3]
-        most: More Gaussians than this are put together to patches first.
+        images: Bags of each image, see `segment_stack.from_pixels`.
+        neighbours: Nearest Gaussians of each Gaussian; if None, surplus Gaussians are dropped, not grouped. [N, k]
+        paths: Positions of the Gaussians at some times; Gaussians that move apart are not grouped. [N, T, 3]
+        most: Number of Gaussians above which neighbours are first grouped to patches.
     """
     if not images:
         raise ValueError("expected at least one image")
@@ -134,10 +134,10 @@ def associate(
 
 
 def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, int]:
-    """Objects to begin with and their number K. [S], 0 = background, -1 = none"""
+    """Initial objects [S], 0 = background, -1 = none, and their number K."""
     of_runs = clustering.cluster(clustering.gather(stack, runs))
     labels = np.where(runs >= 0, of_runs[runs] + 1, 0)
-    # Once more, with Gaussians that show several objects counting less: those that geometry has beside their object.
+    # Repeat with lower weights for Gaussians that show several objects, which geometry has placed outside their object.
     cast = sparse.csc_matrix(leave_one_out.cast(stack, labels, int(labels.max())))
     total = np.asarray(cast.sum(axis=1)).ravel()
     best = sparse.csr_matrix(cast[:, 1:].max(axis=1)).toarray().ravel()
@@ -157,16 +157,16 @@ def _objects(stack: segment_stack.Stack, runs: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _incoming(stack: segment_stack.Stack) -> assignment.Assignment:
-    """How well the incoming ids explain the images."""
+    """Measure how well the incoming ids explain the images."""
     ids, labels = np.unique(np.where(stack.ids > 0, stack.ids, 0), return_inverse=True)
     labels = labels if ids[0] == 0 else labels + 1
     return assignment.measure(stack, labels, int(labels.max()))
 
 
 def _name(stack: segment_stack.Stack, found: assignment.Assignment, sure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """New id of each segment, and the new id that its incoming id usually has in its view. [S], [S]"""
+    """New id of each segment, and the usual new id of its incoming id in its view. [S], [S]"""
     shown = np.flatnonzero(stack.ids > 0)
-    number = int(found.labels.max(initial=0))  # -1 where nothing is an object's and no image shows background
+    number = int(found.labels.max(initial=0))  # -1 if no segment has an object and no image shows background
     old, at = np.unique(stack.ids[shown], return_inverse=True)
     overlap = np.zeros((number + 1, len(old)))
     good = found.labels[shown] > 0
@@ -188,7 +188,7 @@ def _name(stack: segment_stack.Stack, found: assignment.Assignment, sure: np.nda
     np.add.at(tally, (track[rows], found.labels[rows]), stack.pixels[rows])
     tally[:, 0] = 0.0
     usual = np.where(tally.max(axis=1) > 0, names[tally.argmax(axis=1)], -1)
-    for t in np.flatnonzero((usual < 0) & (tracks[1] > 0)):  # of which nothing is certain: a name of its own
+    for t in np.flatnonzero((usual < 0) & (tracks[1] > 0)):  # tracks without certain segments get a new id
         usual[t] = next(fresh)
     ids = np.where(stack.ids > 0, -1, 0)
     ids[sure] = names[found.labels[sure]]
@@ -207,7 +207,7 @@ def _name(stack: segment_stack.Stack, found: assignment.Assignment, sure: np.nda
 
 
 def _compact(ids: np.ndarray, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number anew where ids would not fit 16 bits, and give what is nobody's the value that says so."""
+    """Renumber ids that exceed 16 bits, and replace `_NOBODY` by `masks.UNKNOWN`."""
     used = np.unique(np.concatenate([ids, usual]))
     used = used[used > 0]
     if len(used) and used[-1] >= masks.UNKNOWN:

@@ -1,9 +1,9 @@
-"""Which runs of segments are one object: best pairs first, and what stands side by side in an image stays apart.
+"""Clustering of runs into objects: greedy agglomeration, best pairs first, except runs seen side by side in an image.
 
-How well two views of one object agree depends on how far the geometry is off and on how much of it both see, so no
-fixed threshold tells same from different. What agreement can be had between two views is measured first: the usual
-IoU of runs that are each other's best match. Everything after is relative to that. In the same way the incoming ids
-count as far as they are found to be worth something: where runs of one object usually have one id, and others have not.
+The overlap of two views of one object depends on the accuracy of the geometry and on the commonly visible part, so a
+fixed threshold fails. The usual IoU between two views is measured first, from runs that are mutual best matches; all
+thresholds are relative to it. Incoming ids are weighted the same way: by how often runs of one object share an id,
+compared with other runs.
 
 Notation: T runs, I images, V views.
 """
@@ -17,26 +17,26 @@ from scipy import sparse
 
 from . import segment_stack
 
-SAME = 0.3  # share of the usual agreement at which two groups of runs are one object
-SIDE_BY_SIDE = 0.08  # share of the shorter group's images in which both may be seen apart
-PRIOR = 5.0  # pairs of runs that the usual agreement of all views counts for in that of two views
-PART = 0.6  # share of the usual agreement of an object with itself that lies in a larger one where it is a part of that
-HINT = 4.0  # most that a common id counts for, as a factor on agreement, and that different ids count against
+SAME = 0.3  # smallest affinity to join two groups, relative to the usual IoU
+SIDE_BY_SIDE = 0.08  # largest share of the shorter group's images in which both may appear separately
+PRIOR = 5.0  # prior weight of the usual IoU of all views in that of two views, in pairs of runs
+PART = 0.6  # smallest share of a part inside a larger group, relative to the usual share of a group in itself
+HINT = 4.0  # largest factor on the affinity for equal ids, and largest divisor for different ids
 THIN = 0.1  # share of the smaller run's pixels below which common evidence is weak
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What runs have in common, summed over the pairs of their images.
+    """Overlap of runs, summed over the pairs of their images.
 
     Attributes:
-        common: Weight of Gaussians in both. [T, T]
-        seen: Weight of a run (row) that the other's images (column) see. [T, T]
-        together: Images that show both. [T, T]
-        lengths: Images that show each. [T]
-        pixels: Mean size of each. [T]
-        views: View of each. [T]
-        ids: Incoming id of each. [T]
+        common: Weight of Gaussians in both runs. [T, T]
+        seen: Weight of a run (row) that is visible in the other's images (column). [T, T]
+        together: Number of images that show both. [T, T]
+        lengths: Number of images of each run. [T]
+        pixels: Mean segment size of each run. [T]
+        views: View of each run. [T]
+        ids: Incoming id of each run. [T]
     """
 
     common: np.ndarray
@@ -49,12 +49,12 @@ class Evidence:
 
     @property
     def union(self) -> np.ndarray:
-        """Weight in either that the other's images see. [T, T]"""
+        """Weight in either run that is visible in the other's images. [T, T]"""
         return self.seen + self.seen.T - self.common
 
 
 def gather(stack: segment_stack.Stack, runs: np.ndarray) -> Evidence:
-    """Sum the evidence of segments up to that of their runs."""
+    """Sum the overlaps of segments over their runs."""
     rows = np.flatnonzero(runs >= 0)
     count = int(runs.max(initial=-1)) + 1
     member = sparse.csr_matrix((np.ones(len(rows), np.float32), (runs[rows], rows)), (count, len(runs)))
@@ -79,7 +79,7 @@ def cluster(evidence: Evidence) -> np.ndarray:
     """Join runs to objects.
 
     Returns:
-        Object of each run, numbered by falling number of images times pixels. [T]
+        Object of each run, numbered by descending total number of pixels. [T]
     """
     count = len(evidence.lengths)
     if not count:
@@ -97,7 +97,7 @@ def cluster(evidence: Evidence) -> np.ndarray:
 
 
 def _mutual(evidence: Evidence) -> np.ndarray:
-    """Whether runs of different images are each other's best match in the views of both. [T, T] bool"""
+    """Mask of run pairs that are mutual best matches in each other's view. [T, T] bool"""
     ious = np.where(evidence.together > 0, 0.0, evidence.common / np.maximum(evidence.union, 1e-9))
     views, at = np.unique(evidence.views, return_inverse=True)
     best = np.stack([ious[:, at == v].max(axis=1) for v in range(len(views))], axis=1)  # of each run in each view
@@ -105,7 +105,7 @@ def _mutual(evidence: Evidence) -> np.ndarray:
 
 
 def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
-    """IoU that runs of one object usually have between the views of any two runs. [T, T]"""
+    """Usual IoU of runs of one object between the views of any two runs. [T, T]"""
     views, at = np.unique(evidence.views, return_inverse=True)
     rows, columns = np.nonzero(mutual)
     if not len(rows):
@@ -125,7 +125,7 @@ def _usual(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
 
 
 def _hints(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
-    """What equal and different ids are worth, within a view and between views, as factors. [T, T]"""
+    """Factors on the affinity for equal and different ids, estimated within a view and between views. [T, T]"""
     equal = evidence.ids[:, None] == evidence.ids[None]
     within = evidence.views[:, None] == evidence.views[None]
     weight = np.minimum(evidence.lengths[:, None], evidence.lengths[None]) * (evidence.together == 0)
@@ -145,7 +145,7 @@ def _hints(evidence: Evidence, mutual: np.ndarray) -> np.ndarray:
 
 
 def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """Join the best pair as long as it is good enough and its groups do not stand side by side. [T]"""
+    """Join the best pair of groups until none is good enough; groups seen side by side stay apart. [T]"""
     count = len(common)
     common, expected, together = common.copy(), expected.copy(), evidence.together.copy()
     lengths = evidence.lengths.astype(float)
@@ -179,10 +179,10 @@ def _join(common: np.ndarray, expected: np.ndarray, evidence: Evidence) -> np.nd
 
 
 def _absorb(evidence: Evidence, labels: np.ndarray) -> np.ndarray:
-    """Let parts vote for the whole: groups that lie in a larger one, where that is seen whole more often than apart.
+    """Join groups to a larger group that contains them, if the whole is seen more often without the part than with it.
 
-    Trackers split an object now and then. Two objects that are joined now and then are the other way round: they are
-    seen apart more often.
+    This undoes splits by the tracker. Two objects that a tracker sometimes merges behave the opposite way: they are
+    mostly seen apart.
     """
     groups, at = np.unique(labels, return_inverse=True)
     member = sparse.csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))))

@@ -1,7 +1,7 @@
-"""What the other images say about a segment: leave-one-out overlap with each object.
+"""Leave-one-out overlap of segments with objects, by the votes of the other images.
 
-A Gaussian belongs to an object by the share of its weight that lies in segments of that object. When an image is
-judged its own segments have no vote, and Gaussians that no other image shows are no evidence for or against.
+A Gaussian votes for an object with the share of its weight in segments of that object. Segments of the evaluated image
+have no vote, and Gaussians that no other image shows are no evidence.
 
 Notation: S segments of all images, s of one image, N Gaussians, K objects, 0 = background.
 """
@@ -16,16 +16,16 @@ from scipy import sparse
 
 from . import segment_stack
 
-LEAST = 1e-3  # weight in other images, in pixels, below which a Gaussian is no evidence
+LEAST = 1e-3  # smallest weight of a voting Gaussian in other images, pixels
 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Overlap of segments with objects as the other images see these.
+    """Overlap of an image's segments with the objects, as voted by the other images.
 
     Attributes:
-        common: Weight that segment and object have in common. [s, K + 1]
-        segments: Weight of each segment that other images know. [s]
+        common: Weight in both segment and object. [s, K + 1]
+        segments: Weight of each segment's Gaussians that other images show. [s]
         objects: Weight of each object in the image. [K + 1]
     """
 
@@ -50,7 +50,7 @@ def cast(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> sparse.c
 
     Args:
         stack: The segments.
-        labels: Object of each, 0 = background, -1 = none: it does not vote. [S]
+        labels: Object of each segment, 0 = background, -1 = no vote. [S]
         count: Number of objects, K.
 
     Returns:
@@ -62,7 +62,7 @@ def cast(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> sparse.c
 
 
 def overlaps(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Iterator[Overlaps]:
-    """Leave-one-out overlaps image by image; arguments as of `cast`."""
+    """Yield the leave-one-out overlaps of each image; arguments as in `cast`."""
     ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))
     for start, stop, (seen, shares) in zip(ends, ends[1:], left_out(stack, labels, count), strict=False):
         own = stack.weights[start:stop][:, seen]
@@ -77,11 +77,11 @@ def overlaps(stack: segment_stack.Stack, labels: np.ndarray, count: int) -> Iter
 def left_out(
     stack: segment_stack.Stack, labels: np.ndarray, count: int
 ) -> Iterator[tuple[np.ndarray, sparse.csr_matrix]]:
-    """What the Gaussians of each image show by the votes of all other images; arguments as of `cast`.
+    """Yield the objects of each image's Gaussians by the votes of all other images; arguments as in `cast`.
 
     Yields:
-        Gaussians that the image shows [n], and their shares of background and the objects, 0 where no other image
-        shows the Gaussian [n, K + 1].
+        Gaussians that the image shows [n], and their shares of background and the objects, 0 for Gaussians that no
+        other image shows [n, K + 1].
     """
     votes = cast(stack, labels, count)
     ends = np.searchsorted(stack.images, np.arange(len(stack.views) + 1))

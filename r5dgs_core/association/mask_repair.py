@@ -1,4 +1,4 @@
-"""Masks with one numbering from masks with many: a data set's segments associated by a scene that shows them."""
+"""Repair of a data set's masks: consistent object ids by associating the segments with a trained scene."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from ..scene.scene import Scene
 from . import associate, mending, render_segments, render_votes
 
 NEIGHBOURS = 8
-TIMES = 16  # at most, of which places of the Gaussians are compared
-BACKEND = "associate"  # in masks.json
+TIMES = 16  # most times at which positions of the Gaussians are compared
+BACKEND = "associate"  # name in masks.json
 SEGMENTS, SUMMARY = "segments.csv", "association.json"
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done, and with what.
+    """Repaired masks and their inputs.
 
     Attributes:
         views: Views with masks, in the order of the association's images.
-        incoming: Their masks as they were. Of [H, W]
+        incoming: Original masks. Tuple of [H, W]
         result: New ids of segments.
-        mended: New masks, in which objects without a segment of their own may have taken pixels. Of [H, W] uint16
-        own_ids: Whether the new ids are the folder's own: those of the data set held within single videos.
+        mended: New masks; objects without a segment of their own may have gained pixels. Tuple of [H, W] uint16
+        own_ids: True if the new ids belong to the folder, because those of the data set were valid per video only.
     """
 
     views: tuple[datasets.View, ...]
@@ -48,13 +48,13 @@ class Repair:
 
     @property
     def numbering(self) -> str:
-        """Where the new ids hold, as in `mask_notes`: those that stay hold within their videos, as before."""
+        """Scope of the new ids, as in `mask_notes`; ids that are kept stay valid per video, as before."""
         apart = self.result.fallback and len({view.mask_video for view in self.views}) > 1
         return mask_notes.VIDEO if apart else mask_notes.SCENE
 
     @property
     def filled(self) -> int:
-        """Images in which pixels went to another object than the rest of their segment, or than the background."""
+        """Number of images in which pixels changed beyond the relabelling of segments."""
         count = 0
         for old, new, own in zip(self.incoming, self.mended, self.result.ids, strict=True):
             ids = np.unique(old[old != masks.UNKNOWN])
@@ -72,14 +72,13 @@ def repair(
     """Associate the segments of the training views' masks.
 
     Args:
-        scene: A scene that was trained from the data set, in whatever way it came to its objects; with `none` masks
-            best, so that wrong ones have no part in it.
+        scene: A scene trained from the data set; best without masks (`none`), so that wrong masks have no influence.
         dataset: The data set, with the masks.
         backend: Rasterizer.
         progress: Called with events.
 
     Raises:
-        DatasetError: No training view has a mask, one cannot be read, or none shows an object.
+        DatasetError: No training view has a mask, a mask cannot be read, or no mask shows an object.
     """
     progress = progress or (lambda event: None)
     views = tuple(view for view in dataset.train if view.mask_path is not None)
@@ -114,7 +113,7 @@ def repair(
 
 
 def check_place(folder: Path, views: Sequence[datasets.View]) -> None:
-    """Refuse a folder with masks of these views that somebody else made. Raises DatasetError."""
+    """Raise DatasetError if a folder holds masks of these views that another tool made."""
     if mask_notes.read(folder).backend == BACKEND:
         return
     lost = [view.name for view in views if (folder / f"{view.name}.png").exists()]
@@ -132,22 +131,21 @@ def write(
     made_with: dict[str, Any],
     unmasked: Sequence[datasets.View] = (),
 ) -> dict[str, Any]:
-    """Write the new masks, the list of segments and what was found of the whole; `train --masks` reads the folder.
+    """Write the new masks, the list of segments and a summary; `train --masks` reads the folder.
 
-    Files: the masks by the names of their views; ``segments.csv``, one line for each segment with what became of it,
-    changes first; ``associate.json``, the whole in numbers; ``masks.json``; and ``objects.json`` where the ids are
-    the folder's own.
+    Files: masks named like their views; ``segments.csv``, one line per segment, changed ones first;
+    ``association.json``, the summary; ``masks.json``; and ``objects.json`` if the ids belong to the folder.
 
     Args:
-        done: What `repair` did.
-        folder: The folder; what an earlier call wrote there is replaced.
-        names: Names of ids where they are the folder's own, others are called "object 3"; None where they are those of
+        done: Result of `repair`.
+        folder: The folder; files of an earlier call are replaced.
+        names: Names of the ids if they belong to the folder, with "object 3" as default; None if the ids are those of
             the data set.
-        made_with: For ``masks.json``: what the masks were made from.
-        unmasked: Views of the data set without a mask, which get none.
+        made_with: Inputs of the masks, for ``masks.json``.
+        unmasked: Views of the data set without a mask; their old mask files are removed.
 
     Returns:
-        What ``associate.json`` holds.
+        Content of ``association.json``.
 
     Raises:
         DatasetError: A file cannot be written.
@@ -156,7 +154,7 @@ def write(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         mask_notes.write(notes, folder)
-        # First of all, so that a stop leaves masks missing, and none of two numberings.
+        # Delete first, so that an interruption leaves missing masks instead of two numberings.
         for path in (folder / OBJECTS, *(folder / f"{view.name}.png" for view in (*done.views, *unmasked))):
             path.unlink(missing_ok=True)
     except OSError as error:
@@ -178,7 +176,7 @@ def write(
 
 
 def _videos(done: Repair) -> dict[str, mask_notes.Video]:
-    """The images within which the new ids hold, and the ids in them."""
+    """Groups of images within which the new ids are valid, with their ids."""
     images: dict[str, list[str]] = {}
     found: dict[str, set[int]] = {}
     for view, ids in zip(done.views, done.mended, strict=True):
@@ -192,7 +190,7 @@ def _videos(done: Repair) -> dict[str, mask_notes.Video]:
 
 
 def summary(done: Repair) -> dict[str, Any]:
-    """The whole in numbers; what ``associate.json`` holds."""
+    """Summary of a repair, the content of ``association.json``."""
     result = done.result
     counts = {what: sum(row.done == what for row in result.rows) for what in ("kept", "relabelled", "unknown")}
     return {
@@ -211,7 +209,7 @@ def summary(done: Repair) -> dict[str, Any]:
 
 
 def switches(done: Repair) -> list[associate.Row]:
-    """Segments whose id changed against what their track usually got, or is unknown; the largest first."""
+    """Segments that were relabelled or became unknown, the largest first."""
     changed = [row for row in done.result.rows if row.done != "kept"]
     return sorted(changed, key=lambda row: -row.pixels)
 

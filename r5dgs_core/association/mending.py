@@ -1,7 +1,7 @@
-"""Pixels that a relabelled segment cannot mend: objects that the tracker missed or ran together with others.
+"""Pixel repair beyond relabelling: objects that the tracker missed or merged with others.
 
-The other images' votes are drawn into the image. Outlines stay as they came; only where an object that the votes show
-has no segment of its own may pixels change: inside the one segment, or the background, that most of it lies in.
+The votes of the other images are rendered into the image. Outlines stay, except for objects that the votes show but
+that have no segment: these gain pixels of the one segment, or background, that contains most of them.
 
 Notation: H, W pixels, K objects, N Gaussians.
 """
@@ -15,15 +15,15 @@ import numpy as np
 from ..data import masks
 from . import associate, leave_one_out, segment_stack
 
-TRUSTED = 0.3  # usual overlap of segments with the votes of other images below which outlines of votes are too far off
-WITHIN = 0.5  # share of what the votes show of an object that must lie in one segment for it to take pixels of that
-LEAST = 0.1  # share of the usual size of an object's segments that votes must show for it to take any pixel
+TRUSTED = 0.3  # smallest usual IoU of segments and votes; below it, outlines of votes are too inaccurate
+WITHIN = 0.5  # smallest share of an object's voted pixels inside the segment that it takes pixels from
+LEAST = 0.1  # smallest number of voted pixels, relative to the object's usual segment size
 
 
 def shares(
     images: Sequence[segment_stack.ImageBags], found: associate.Association
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """What the Gaussians of each image show by the votes of all others, to be drawn like colours.
+    """Yield the votes of all other images for each image's Gaussians, to be rendered as channels.
 
     Yields:
         Gaussians that the image shows [n], and their shares of background and the objects [n, K + 1] float32.
@@ -37,12 +37,12 @@ def shares(
 
 
 def mend(mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: associate.Association, image: int) -> np.ndarray:
-    """New ids of an image's pixels.
+    """Return the new ids of an image's pixels.
 
     Args:
         mask: Incoming ids. [H, W]
         ids: Incoming id of each segment, `segment_stack.ImageBags.ids`. [S]
-        drawn: Votes of the other images, `shares` blended like colours. [H, W, K + 1]
+        drawn: Rendered votes of the other images, see `shares`. [H, W, K + 1]
         found: The association.
         image: Index of the image.
 
@@ -53,7 +53,7 @@ def mend(mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: associate.
     if not trusts(found):
         return out
     names = np.concatenate([[0], found.objects])
-    shown = names[drawn.argmax(axis=-1)]  # background where nothing votes
+    shown = names[drawn.argmax(axis=-1)]  # background for pixels without votes
     result = out.copy()
     for name in lacks(found, image):
         where = shown == name
@@ -67,16 +67,16 @@ def mend(mask: np.ndarray, ids: np.ndarray, drawn: np.ndarray, found: associate.
 
 
 def trusts(found: associate.Association) -> bool:
-    """Whether votes are near enough to outlines for pixels to be given away by them."""
+    """Return True if the votes are accurate enough to move pixels."""
     return not found.fallback and found.usual_iou >= TRUSTED
 
 
 def lacks(found: associate.Association, image: int) -> list[int]:
-    """Objects that have no segment in an image."""
+    """Objects without a segment in an image."""
     return found.objects[~np.isin(found.objects, found.ids[image])].tolist()
 
 
 def relabel(mask: np.ndarray, ids: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Put the new ids of segments in place of those that they came with. [H, W] int32"""
+    """Replace the incoming ids of a mask by the new ids of its segments. [H, W] int32"""
     at = np.minimum(np.searchsorted(ids, mask), len(ids) - 1)
     return np.where(ids[at] == mask, new[at], masks.UNKNOWN).astype(np.int32)

@@ -1,4 +1,4 @@
-"""The bags of a data set's masks: each image is drawn as the scene has it, and its Gaussians sorted by segments."""
+"""Weighted bags of Gaussians for the segments of a data set's masks, from rendering the scene in each view."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..render import scene_renderer, segment_weights
 from ..scene.scene import Scene
 from . import segment_stack
 
-LEAST = 0.02  # of a pixel: what a Gaussian has to give a segment to be in its bag
+LEAST = 0.02  # smallest weight of a Gaussian in a segment's bag, pixels
 
 
 def draw(
@@ -27,17 +27,17 @@ def draw(
     backend: str = "auto",
     progress: Callable[[int], None] | None = None,
 ) -> list[segment_stack.ImageBags]:
-    """Draw the scene as each view sees it and sum weights over the segments of its mask.
+    """Render the scene in each view and sum the blending weights over the segments of its mask.
 
     Args:
-        scene: The scene; in the observed time it moves as it was learned, residuals included.
-        views: Views of the scene's world.
-        masks: Incoming ids of each, 0 = background, `masks.UNKNOWN` = left out. Of [H, W]
+        scene: The scene; within the observed time it is played with its learned motion and residuals.
+        views: Views in the scene's world.
+        masks: Incoming ids of each view, 0 = background, `masks.UNKNOWN` = ignored. Sequence of [H, W]
         backend: Rasterizer.
-        progress: Called with the number of views that are done.
+        progress: Called with the number of finished views.
 
     Returns:
-        Bags of the views, in their order; images of one video belong together, as far as their masks were numbered
+        Bags of the views, in their order. Images share ``view`` if they belong to one video and were numbered
         together.
     """
     video_of = {view.name: (video.name, view.mask_video) for video in videos.of(views) for view in video.views}
@@ -72,5 +72,5 @@ def draw(
 
 
 def paths(scene: Scene, times: np.ndarray) -> np.ndarray:
-    """Where each Gaussian is at some times. [S] -> [N, S, 3] float32"""
+    """Positions of each Gaussian at some times. [S] -> [N, S, 3] float32"""
     return np.stack([scene_player.frame(scene, float(t)).means for t in times], axis=1)

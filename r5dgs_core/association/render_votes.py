@@ -1,4 +1,4 @@
-"""What the other images say of a view's pixels, drawn, and the view's mask mended by it."""
+"""Rendering of the other images' votes into a view, to mend the view's mask."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def mend(
     """Mend the masks of views one by one.
 
     Args:
-        scene: The scene that the bags were drawn from.
+        scene: The scene that the bags were rendered from.
         views: Its views.
-        masks: Their incoming ids. Of [H, W]
+        masks: Their incoming ids. Sequence of [H, W]
         images: Their bags.
-        found: What became of them.
+        found: The association.
         backend: Rasterizer.
 
     Yields:
@@ -47,7 +47,7 @@ def mend(
             yield mending.relabel(mask, images[image].ids, found.ids[image])
             continue
         posed = scene_renderer.PosedGaussians(scene_renderer.pose_frame(scene, scene_player.frame(scene, view.t)))
-        shown = torch.from_numpy(seen)  # what the image does not show covers nothing of it either
+        shown = torch.from_numpy(seen)  # Gaussians that the image does not show occlude nothing
         drawn = rasterize_splats(
             posed.means[shown],
             posed.quats[shown],

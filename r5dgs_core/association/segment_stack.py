@@ -1,7 +1,7 @@
 """Segments of masks as weighted bags of Gaussians.
 
-A Gaussian keeps its index at every time and in every view, so what a segment shows can be compared between any two
-images: it is the Gaussians that its pixels show, with the weights they have there.
+A Gaussian keeps its index at all times and in all views. The bag of a segment, the Gaussians that its pixels show with
+their weights, is therefore comparable between any two images.
 
 Notation: N Gaussians, P pixels of an image, k Gaussians kept per pixel, S segments.
 """
@@ -19,14 +19,14 @@ from ..data import masks
 
 @dataclass(frozen=True)
 class ImageBags:
-    """The segments of one image, background among them.
+    """The segments of one image, including background.
 
     Attributes:
         ids: Incoming id of each segment, ascending, 0 = background. [S] int32
-        pixels: Size of each. [S] int64
+        pixels: Size of each segment. [S] int64
         weights: Weight of each Gaussian in each segment, in pixels. [S, N] float32, CSR
-        view: What the ids belong to: the tracker numbered all images of one view together.
-        time: Order of the images of a view.
+        view: Scope of the ids: the tracker numbered all images of one view together.
+        time: Sorting key of the images of a view.
     """
 
     ids: np.ndarray
@@ -39,15 +39,15 @@ class ImageBags:
 def from_pixels(
     mask: np.ndarray, indices: np.ndarray, weights: np.ndarray, count: int, *, view: int, time: float
 ) -> ImageBags:
-    """Reduce the Gaussians of an image's pixels to one bag per segment.
+    """Sum the Gaussians of an image's pixels to one bag per segment.
 
     Args:
-        mask: Incoming ids, 0 = background; pixels that are `masks.UNKNOWN` are left out. [H, W] or [P]
-        indices: Gaussians with most weight in each pixel, -1 for none. [P, k]
+        mask: Incoming ids, 0 = background; pixels that are `masks.UNKNOWN` are ignored. [H, W] or [P]
+        indices: Gaussians with the largest weights in each pixel, -1 for none. [P, k]
         weights: Their blending weights. [P, k]
         count: Number of Gaussians, N.
         view: Group of images with common ids.
-        time: Place in the order of the view's images.
+        time: Sorting key of the image in its view.
     """
     mask = mask.reshape(-1)
     if indices.shape != weights.shape or len(indices) != len(mask):
@@ -56,7 +56,7 @@ def from_pixels(
     known = ids != masks.UNKNOWN
     used = (indices >= 0) & (weights > 0) & known[segment][:, None]
     rows = np.broadcast_to(segment[:, None], indices.shape)[used]
-    # By Gaussian first: each is in few segments, so that equal entries are found in short rows.
+    # By Gaussian first: each is in few segments, so duplicates are summed in short rows.
     by_gaussian = sparse.coo_matrix((weights[used].astype(np.float32), (indices[used], rows)), (count, len(ids)))
     bags = by_gaussian.tocsr().T.tocsr()[np.flatnonzero(known)]
     return ImageBags(ids[known].astype(np.int32), pixels[known], bags, view, time)
@@ -64,18 +64,18 @@ def from_pixels(
 
 @dataclass(frozen=True)
 class Stack:
-    """The segments of all images, one below the other.
+    """The segments of all images, concatenated. I images.
 
     Attributes:
         ids: Incoming ids. [S]
-        images: Image of each, ascending. [S]
+        images: Image of each segment, ascending. [S]
         views: View of each image. [I]
         times: Time of each image. [I]
-        pixels: Size of each. [S]
+        pixels: Size of each segment. [S]
         weights: `ImageBags.weights`. [S, N]
-        shared: Weights over the root of what the image gives the Gaussian: products of rows of different images are
-            common weights, see `stack`. [S, N]
-        seen: Root of what each image gives each Gaussian. [I, N]
+        shared: Weights divided by the square root of the Gaussian's total weight in the image: products of rows of
+            different images are common weights, see `stack`. [S, N]
+        seen: Square root of each Gaussian's total weight in each image. [I, N]
     """
 
     ids: np.ndarray
@@ -89,12 +89,12 @@ class Stack:
 
 
 def stack(bags: Sequence[ImageBags]) -> Stack:
-    """Put the segments of all images one below the other.
+    """Concatenate the segments of all images.
 
-    Two images seldom give a Gaussian the same weight. What they have in common is taken as the geometric mean
-    sqrt(v_i v_j) of their weights v, divided among the segments of either as the Gaussian is: for rows x_s = b_s /
-    sqrt(v_i), the weight that segments s and t have in common is the product x_s . x_t, and that of s which t's image
-    sees at all is x_s . sqrt(v_j).
+    A Gaussian rarely has the same weight in two images. Its common weight is the geometric mean sqrt(v_i v_j) of its
+    total weights v, distributed over the segments of each image like the Gaussian itself. With rows x_s = b_s /
+    sqrt(v_i), the common weight of segments s and t is the product x_s . x_t, and the weight of s that is visible in
+    t's image is x_s . sqrt(v_j).
     """
     count = bags[0].weights.get_shape()[1]
     for k, image in enumerate(bags):

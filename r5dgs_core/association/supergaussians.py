@@ -1,4 +1,4 @@
-"""Neighbouring Gaussians that move together as one, so that many Gaussians cost no more than some.
+"""Patches of neighbouring Gaussians that move together, which bound the cost of association.
 
 Notation: N Gaussians, k neighbours, T times, G patches.
 """
@@ -8,18 +8,18 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-APART = 0.1  # change of the distance of two neighbours over time, as a share of how far they travel, that parts them
-ROUNDS = 12
+APART = 0.1  # largest change of the distance of two neighbours in a patch, as a share of their travel
+ROUNDS = 12  # most rounds of seeding
 
 
 def group(count: int, neighbours: np.ndarray | None, paths: np.ndarray | None, most: int) -> np.ndarray:
-    """Put neighbours together; patches are no larger than a Gaussian and its neighbours.
+    """Group neighbours to patches, each at most a Gaussian and its neighbours.
 
     Args:
         count: Number of Gaussians, N.
-        neighbours: Nearest Gaussians of each; None: each Gaussian stands alone, and a spread of them is kept. [N, k]
-        paths: Places at some times. [N, T, 3]
-        most: Patches wanted; there may be more.
+        neighbours: Nearest Gaussians of each Gaussian; None keeps a random sample of single Gaussians. [N, k]
+        paths: Positions at some times. [N, T, 3]
+        most: Size of the sample without neighbours; the number of patches is not bounded.
 
     Returns:
         Patch of each Gaussian, -1 for those left out. [N]
@@ -36,7 +36,7 @@ def group(count: int, neighbours: np.ndarray | None, paths: np.ndarray | None, m
         free = labels < 0
         if not free.any():
             break
-        # A free Gaussian with the highest priority among its free neighbours begins a patch, and takes these.
+        # A free Gaussian whose priority exceeds that of its free neighbours starts a patch with them.
         around = np.where(free[neighbours] & together, priority[neighbours], -1)
         seeds = np.flatnonzero(free & (priority > around.max(axis=1)))
         labels[seeds] = seeds
@@ -59,7 +59,7 @@ def pool(weights: sparse.csr_matrix, groups: np.ndarray) -> sparse.csr_matrix:
 
 
 def _together(neighbours: np.ndarray, paths: np.ndarray | None) -> np.ndarray:
-    """Whether Gaussians keep their distance to each neighbour. [N, k] bool"""
+    """Mask of the neighbours whose distance stays nearly constant. [N, k] bool"""
     if paths is None or paths.shape[1] < 2:
         return np.ones(neighbours.shape, bool)
     travel = np.linalg.norm(paths - paths[:, :1], axis=-1).max(axis=1)

@@ -1,7 +1,7 @@
-"""Runs of segments that one tracker and the geometry agree to be one object.
+"""Runs of segments (tracklets) on which tracker and geometry agree.
 
-Inside a view an incoming id is followed from image to image as long as the Gaussians say the same. Where they do not,
-the run ends and a new one begins: so a switch of ids costs a cut, not a wrong run.
+Within a view, an incoming id is followed from image to image as long as the Gaussians agree. Otherwise the run ends and
+a new one begins, so an id switch costs a cut instead of a wrong run.
 
 Notation: S segments, T runs (tracklets), I images.
 """
@@ -12,14 +12,14 @@ import numpy as np
 
 from . import segment_stack
 
-FAINTEST = 0.02  # IoU below which two segments have nothing in common
+FAINTEST = 0.02  # smallest IoU of consecutive segments of a run
 
 
 def link(stack: segment_stack.Stack) -> np.ndarray:
     """Number the runs.
 
-    A segment continues the last one of its id in its view where each is the other's best match among the objects of
-    both images. Images between the two may lack the id.
+    A segment continues the last segment with its id in its view if both are mutual best matches among the objects of
+    the two images. Images between them may lack the id.
 
     Returns:
         Run of each segment, -1 for background. [S]
@@ -53,7 +53,7 @@ def link(stack: segment_stack.Stack) -> np.ndarray:
 
 
 def ious(stack: segment_stack.Stack, rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """IoU over what two images both see of segments of one with segments of the other. [s], [t] -> [s, t]"""
+    """IoU of segments of two images over the weight that both images show. [s], [t] -> [s, t]"""
     if not len(rows) or not len(others):
         return np.zeros((len(rows), len(others)))
     a, b = stack.shared[rows], stack.shared[others]
@@ -64,7 +64,7 @@ def ious(stack: segment_stack.Stack, rows: np.ndarray, others: np.ndarray) -> np
 
 
 def _rows_of(stack: segment_stack.Stack) -> list[np.ndarray]:
-    """Segments of each image, background left out."""
+    """Segments of each image, without background."""
     objects = np.flatnonzero(stack.ids > 0)
     ends = np.searchsorted(stack.images[objects], np.arange(len(stack.views) + 1))
     return [objects[a:b] for a, b in zip(ends, ends[1:], strict=False)]
