@@ -1,1 +1,1 @@
-"""Make object masks with SAM2 and write mask folders."""
+"""Object masks: creation with SAM2, reading of existing ones, and mask folders."""

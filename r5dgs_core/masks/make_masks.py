@@ -1,4 +1,4 @@
-"""Making the masks of a data set, video by video: what is done stays done, whatever happens in between."""
+"""Creation of a data set's masks, video by video and resumable."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ..data.annotations import OBJECTS
 from . import videos
 
 Progress = Callable[[dict[str, Any]], None]
-Report = Callable[[float], None]  # called with the share of a video that is done
+Report = Callable[[float], None]  # called with the finished share of a video
 
 
 class MaskBackend(Protocol):
-    """What makes masks.
+    """Source of masks.
 
     Attributes:
-        name: Of the backend.
-        numbering: Where its ids hold, `mask_notes.SCENE` or `mask_notes.VIDEO`.
-        made_with: What the masks depend on; JSON types.
-        own_names: The ``objects.json`` of ids that are not those of the data set, None where there is none.
+        name: Name of the backend.
+        numbering: Scope of its ids, `mask_notes.SCENE` or `mask_notes.VIDEO`.
+        made_with: Inputs and settings that the masks depend on; JSON types.
+        own_names: The ``objects.json`` for ids that differ from the data set's, or None.
     """
 
     name: str
@@ -37,28 +37,28 @@ class MaskBackend(Protocol):
     own_names: Path | None
 
     def label(self, video: videos.Video, room: Path, report: Report) -> Iterator[np.ndarray | None]:
-        """Object ids of each image of a video, in order; None where there is no mask.
+        """Yield the object ids of each image of a video, in order; None for images without a mask.
 
         Args:
             video: The video.
-            room: A folder for what memory should not hold.
-            report: Called now and then.
+            room: Folder for temporary files that are too large for memory.
+            report: Called with the finished share of the video.
         """
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Made:
-    """What `make` did.
+    """Result of `make`.
 
     Attributes:
         folder: The folder of masks.
-        images: Masks in it.
-        videos: Videos that they are of.
-        kept: Of these, videos that were done before.
-        objects: Ids, counted once per numbering.
-        unknown: Share of the pixels written now of which nothing is known.
-        numbering: Where ids hold, `mask_notes.SCENE` or `mask_notes.VIDEO`.
+        images: Number of masks in it.
+        videos: Number of videos with masks.
+        kept: Number of these videos that were finished before.
+        objects: Number of ids, counted per numbering.
+        unknown: Share of unknown pixels among those written now.
+        numbering: Scope of the ids, `mask_notes.SCENE` or `mask_notes.VIDEO`.
     """
 
     folder: Path
@@ -78,23 +78,23 @@ def make(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Made:
-    """Write a mask for each view, ``FOLDER/<view name>.png``, and what is to be known of them (`mask_notes`).
+    """Write a mask for each view, ``FOLDER/<view name>.png``, and their description (`mask_notes`).
 
-    A video that is done is not done again; a run that was stopped loses the video that it was at.
+    Finished videos are skipped. An interrupted run loses only the current video.
 
     Args:
         views: The views.
-        backend: What makes the masks.
-        folder: Folder of masks; made where missing.
-        overwrite: Begin anew where the folder holds other masks.
-        progress: Called with an event now and then.
+        backend: Source of the masks.
+        folder: Folder of masks; created if missing.
+        overwrite: True to replace other masks in the folder.
+        progress: Called with progress events.
 
     Returns:
-        What was done.
+        Summary of the folder.
 
     Raises:
         DatasetError: The folder holds masks that would be lost, or cannot be written.
-        BackendError: The backend cannot go on.
+        BackendError: The backend fails.
     """
     folder = Path(folder)
     notes = _begin(views, backend, folder, overwrite)
@@ -108,7 +108,7 @@ def make(
     def keep(view: datasets.View, ids: np.ndarray | None) -> None:
         path = folder / f"{view.name}.png"
         if ids is None:
-            _remove(path)  # one of other masks would be read with these
+            _remove(path)  # a mask of an earlier set would be read with these
         else:
             masks.write(path, ids)
 
@@ -125,7 +125,7 @@ def make(
 def check(
     views: Sequence[datasets.View], backend: MaskBackend, folder: Path, *, progress: Progress | None = None
 ) -> Made:
-    """Read all masks that stand in a folder and write nothing; see `make`."""
+    """Read all existing masks of a folder without writing; see `make`."""
     count, every = _Count(), videos.of(views)
     found = {
         video.name: masks_of
@@ -136,7 +136,7 @@ def check(
 
 @dataclasses.dataclass
 class _Count:
-    """Pixels of the masks, and those of which nothing is known."""
+    """Number of mask pixels, and of unknown ones."""
 
     pixels: int = 0
     unknown: int = 0
@@ -150,7 +150,7 @@ def _labelled(
     keep: Callable[[datasets.View, np.ndarray | None], None],
     progress: Progress | None,
 ) -> Iterator[tuple[videos.Video, mask_notes.Video]]:
-    """Make the masks of videos one after the other; gives each video when it is done, with what was found."""
+    """Label videos one after the other; yield each finished video with its images and ids."""
     total, done, began = sum(len(video.views) for video in todo), 0, time.monotonic()
     for video in todo:
 
@@ -191,7 +191,7 @@ def _made(notes: mask_notes.MaskNotes, folder: Path, kept: int, count: _Count) -
 
 
 def _write_names(notes: mask_notes.MaskNotes, own_names: Path | None, folder: Path) -> None:
-    """Say that the ids are the folder's own, so that names of the data set's ids are not put on them."""
+    """Write ``objects.json``, so that names of the data set's ids are not applied to the folder's own ids."""
     path = folder / OBJECTS
     ids = sorted({object_id for video in notes.videos.values() for object_id in video.ids})
     made = json.dumps({str(object_id): f"object {object_id}" for object_id in ids}, indent=1) + "\n"
@@ -202,7 +202,7 @@ def _write_names(notes: mask_notes.MaskNotes, own_names: Path | None, folder: Pa
 
 
 def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, overwrite: bool) -> mask_notes.MaskNotes:
-    """Notes to go on with: those of the folder where the same was begun there, else new ones."""
+    """Return the notes to continue: those of the folder if they match the backend, else new ones."""
     fresh = mask_notes.MaskNotes(
         backend=backend.name, numbering=backend.numbering, finished=False, made_with=backend.made_with
     )
@@ -213,7 +213,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
         if notes.backend == fresh.backend and known == wanted:
             return dataclasses.replace(notes, finished=False)
         changed = [key for key in {**wanted, **known} if known.get(key) != wanted.get(key)]
-        other = repr(notes.backend) if notes.backend else "what masks.json does not say"
+        other = repr(notes.backend) if notes.backend else "an unknown backend"
         if notes.backend == backend.name:
             other = f"other settings ({', '.join(changed)})"
         raise errors.DatasetError(
@@ -222,7 +222,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
     lost = [view.name for view in views if (folder / f"{view.name}.png").exists()]
     if lost and not overwrite:
         raise errors.DatasetError(
-            f"{folder}: holds {len(lost)} masks that nobody says how they were made, such as {lost[0]}.png; name "
+            f"{folder}: holds {len(lost)} masks of unknown origin, such as {lost[0]}.png; name "
             "another folder with --out, or give --overwrite"
         )
     try:
@@ -230,7 +230,7 @@ def _begin(views: Sequence[datasets.View], backend: MaskBackend, folder: Path, o
     except OSError as error:
         raise errors.DatasetError(f"{folder}: cannot be made: {error}") from error
     mask_notes.write(fresh, folder)
-    _remove(folder / OBJECTS)  # names of the ids that stood here
+    _remove(folder / OBJECTS)  # names of the replaced ids
     return fresh
 
 
@@ -242,7 +242,7 @@ def _remove(path: Path) -> None:
 
 
 def _is_done(video: videos.Video, notes: mask_notes.MaskNotes, folder: Path) -> bool:
-    """Whether the folder holds masks of all images of a video, none of which joined it or left it since."""
+    """Return True if the folder holds masks of exactly the current images of a video."""
     known = notes.videos.get(video.name)
     if known is None or set(known.images) != {view.name for view in video.views}:
         return False

@@ -1,4 +1,4 @@
-"""Masks that stand in a folder already: anybody's (`Precomputed`), or those of a capture (`Captured`)."""
+"""Mask backends that read existing masks: any folder (`Precomputed`), or a capture from Blender (`Captured`)."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .videos import Video
 
 
 class Precomputed:
-    """Masks that stand in a folder already: ids of 8 or 16 bits, palettes, or one flat colour per object.
+    """Existing masks in a folder: ids of 8 or 16 bits, palettes, or one flat colour per object.
 
-    A mask lies at the path of its image, or under the image's file name in the folder itself.
+    A mask has the path of its image, or the image's file name in the folder itself.
 
     Args:
-        folder: The folder; its ``masks.json`` is obeyed.
-        views: All views that are asked for.
-        unknown: Value that says nothing of a pixel, where ``masks.json`` does not say it.
+        folder: The folder; its ``masks.json`` is applied.
+        views: All requested views.
+        unknown: Value of unknown pixels; None for that of ``masks.json``.
 
     Raises:
-        DatasetError: It holds none of the views' masks, or they cannot be understood.
-        ConfigError: ``unknown`` cannot be a value of theirs.
+        DatasetError: The folder has no mask of the views, or the masks cannot be decoded.
+        ConfigError: ``unknown`` is not a valid value for these masks.
     """
 
     name = "precomputed"
@@ -63,7 +63,7 @@ class Precomputed:
         self.made_with: dict[str, Any] = {"folder": str(self.folder.resolve()), "unknown": self.unknown}
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
-        """See `make_masks.MaskBackend.label`."""
+        """Implement `make_masks.MaskBackend.label`."""
         for k, view in enumerate(video.views):
             path = self._paths[view.name]
             if path is None:
@@ -75,14 +75,14 @@ class Precomputed:
 
 
 class Captured(Precomputed):
-    """The object index that the extension's capture rendered: exact, complete, and every id has a name.
+    """Object index masks rendered by the extension's capture: exact, complete, with a name for every id.
 
     Args:
         root: Folder of the captured data set.
-        views: All views that are asked for.
+        views: All requested views.
 
     Raises:
-        DatasetError: It is no captured data set.
+        DatasetError: The folder is not a captured data set.
     """
 
     name = "blender"
@@ -99,7 +99,7 @@ class Captured(Precomputed):
         self._names = read_objects(Path(root))[0]
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
-        """See `make_masks.MaskBackend.label`."""
+        """Implement `make_masks.MaskBackend.label`."""
         for view, ids in zip(video.views, super().label(video, room, report), strict=True):
             assert ids is not None
             foreign = set(np.unique(ids).tolist()) - set(self._names) - {0, masks.UNKNOWN}

@@ -1,4 +1,4 @@
-"""Masks by SAM2: everything that is seen in the key frames of a video, followed through the whole of it."""
+"""Masks by SAM2: all objects that are visible in the key frames of a video, tracked through the video."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from .videos import Video
 
 @dataclasses.dataclass(frozen=True)
 class TrackSettings:
-    """How SAM2 goes through a video.
+    """Settings for tracking a video with SAM2.
 
     Attributes:
-        key_frames: Images of a video in which everything is looked for.
-        overlap: What is found there and has this IoU with an object that was followed there is that object.
-        objects: Most objects that a video may get.
-        together: Objects that are followed at once; bounds memory.
-        gap: Images in a row in which an object may be lost; where it should be is unknown then, not background.
+        key_frames: Number of images in which all objects are segmented.
+        overlap: IoU from which a segment of a key frame is the same as an object tracked into it.
+        objects: Most objects per video.
+        together: Objects tracked at once; bounds the memory.
+        gap: Longest gap in an object's track, in images, whose likely pixels are marked unknown instead of background.
     """
 
     key_frames: int = 3
@@ -35,12 +35,12 @@ class TrackSettings:
 
 
 class Sam2Masks:
-    """The backend.
+    """Mask backend that uses SAM2.
 
     Args:
         model: The model.
-        segment: What is taken in key frames.
-        track: How videos are gone through.
+        segment: Settings for segmenting key frames.
+        track: Settings for tracking.
     """
 
     name, numbering = "sam2", mask_notes.VIDEO
@@ -63,7 +63,7 @@ class Sam2Masks:
         }
 
     def label(self, video: Video, room: Path, report: Callable[[float], None]) -> Iterator[np.ndarray | None]:
-        """See `make_masks.MaskBackend.label`."""
+        """Implement `make_masks.MaskBackend.label`."""
         camera = video.views[0].camera
         canvas = sam2_tracking.Canvas(len(video.views), camera.height, camera.width, room)
         try:
@@ -96,7 +96,7 @@ class Sam2Masks:
 
 
 def key_frames(count: int, wanted: int) -> list[int]:
-    """Images of a video in which everything is looked for: the middle one, or a spread with both ends."""
+    """Indices of the key frames of a video: the middle image, or an even spread that includes both ends."""
     if wanted == 1:
         return [count // 2]
     return sorted({int(k) for k in np.linspace(0, count - 1, min(wanted, count)).round()})

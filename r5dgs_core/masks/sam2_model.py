@@ -1,7 +1,7 @@
-"""SAM2 out of a folder that the user names, by the classes of transformers and without torchvision.
+"""SAM2 from a local folder, using the classes of transformers, without torchvision.
 
-One folder serves both networks: the one that segments an image (`image`) and the one that follows objects through a
-video (`video`). Nothing is fetched, and no weight is made up: what a folder lacks is an error.
+The folder provides both networks: the image segmenter (`image`) and the video tracker (`video`). Nothing is downloaded,
+and missing weights are an error instead of being initialised at random.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from .. import errors
 from ..language.encoders import encoder_base
 
 KIND = "sam2_video"
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as SAM2 was trained
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet statistics, used to train SAM2
 
 
 class Sam2:
-    """Both networks of a folder.
+    """SAM2 networks of a folder.
 
     Args:
-        folder: A folder of transformers with ``config.json`` of model type ``sam2_video`` and ``.safetensors``.
+        folder: A transformers folder with ``config.json`` of model type ``sam2_video`` and ``.safetensors``.
         device: "cpu" or "cuda", also "cuda:1".
 
     Raises:
@@ -36,8 +36,8 @@ class Sam2:
     Attributes:
         image: `transformers.Sam2Model`.
         video: `transformers.Sam2VideoModel`.
-        size: Side of the square images that it takes, pixels.
-        device: Where it runs.
+        size: Side of the square input images, pixels.
+        device: Device of the networks.
         name: Name of the folder.
         digest: Hash of the weights.
     """
@@ -57,7 +57,7 @@ class Sam2:
         self.digest = encoder_base.digest_of(weights)
 
     def pixels(self, image: np.ndarray) -> Tensor:
-        """An RGB image [H, W, 3] uint8 as the networks take it. [1, 3, S, S]"""
+        """Convert an RGB image [H, W, 3] uint8 to network input. [1, 3, S, S]"""
         tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None].float() / 255
         size = (self.size, self.size)
         tensor = F.interpolate(tensor, size, mode="bilinear", antialias=True, align_corners=False)
@@ -79,7 +79,7 @@ def _device(name: str) -> torch.device:
 
 def _transformers() -> Any:
     try:
-        import safetensors  # noqa: F401  # which transformers imports only as it loads
+        import safetensors  # noqa: F401  # transformers imports it only on loading
         import transformers
 
         _ = transformers.Sam2VideoModel, transformers.Sam2Model
@@ -87,7 +87,7 @@ def _transformers() -> Any:
         raise errors.BackendError(
             f"SAM2 needs transformers 5 or later: pip install 'r5dgs[encoders]' ({error})"
         ) from error
-    except RuntimeError as error:  # transformers imports what else is installed
+    except RuntimeError as error:  # transformers imports other installed packages
         raise errors.BackendError(
             f"transformers cannot be imported ({error}). Remedy: where a torchvision that does not fit torch is "
             "installed, remove it: pip uninstall torchvision; nothing here needs it"
@@ -96,7 +96,7 @@ def _transformers() -> Any:
 
 
 def _check(folder: Path) -> None:
-    """Refuse folders of which it can be said without loading that they hold no SAM2."""
+    """Raise BackendError if a folder cannot hold SAM2, judged without loading the weights."""
     wanted = "expected a folder of SAM2 as transformers saves it, with config.json and model.safetensors"
     if not folder.is_dir():
         raise errors.BackendError(f"{folder}: {wanted}, found {'a file' if folder.exists() else 'nothing'}")
@@ -108,12 +108,12 @@ def _check(folder: Path) -> None:
 
 
 def _load(kind: Any, folder: Path) -> Any:
-    """One network, all of its weights from the folder, ready to be asked."""
+    """Load one network for inference, with all weights from the folder."""
     try:
         model, found = kind.from_pretrained(
             str(folder), local_files_only=True, use_safetensors=True, output_loading_info=True, dtype=torch.float32
         )
-    except Exception as error:  # whatever the library finds wrong with a foreign file
+    except Exception as error:  # the library raises many types for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise errors.BackendError(
             f"{folder}: the model cannot be loaded ({reason[:300]}); is a file damaged or cut off? Get it again"
@@ -124,7 +124,7 @@ def _load(kind: Any, folder: Path) -> Any:
 
 @contextlib.contextmanager
 def _quiet(transformers: Any) -> Iterator[None]:
-    """Without the library's bars, and without its word that one folder serves two networks."""
+    """Silence the library's progress bars and its warning that one folder serves two networks."""
     log = transformers.utils.logging
     level, bars = log.get_verbosity(), log.is_progress_bar_enabled()
     log.set_verbosity_error()

@@ -1,6 +1,6 @@
-"""Everything that SAM2 sees in one image: masks at the points of a grid, the good ones of them, each thing once.
+"""Segmentation of everything in one image with SAM2: prompts on a grid of points, filtered and deduplicated.
 
-Notation: P points, an image of H x W pixels, masks of s x s out of the network (a quarter of its input).
+Notation: P points, an image of H x W pixels, masks of s x s from the network (a quarter of its input).
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from torch import Tensor
 
 from .sam2_model import Sam2
 
-BATCH = 64  # points that are asked at a time
-STABLE_BY = 1.0  # logit by which the threshold is moved to see whether a mask stays the same
-SAME = 0.7  # IoU above which two masks are one
+BATCH = 64  # points per forward pass
+STABLE_BY = 1.0  # shift of the logit threshold in the stability test
+SAME = 0.7  # IoU above which two masks are duplicates
 
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """Which masks are taken.
+    """Criteria for accepting masks.
 
     Attributes:
-        points: Points of the grid per side.
-        score: Least IoU with the truth that the network foretells.
-        stability: Least IoU of the mask at a lower threshold with that at a higher one.
-        min_area: Smaller masks are noise, as a share of the image.
-        max_area: Larger masks are background, as a share of the image.
+        points: Grid points per side.
+        score: Smallest IoU predicted by the network.
+        stability: Smallest IoU of the masks at a lower and a higher threshold.
+        min_area: Smallest area, as a share of the image; smaller masks are noise.
+        max_area: Largest area, as a share of the image; larger masks are background.
     """
 
     points: int = 32
@@ -44,8 +44,8 @@ class Segment:
     """One mask of an image.
 
     Attributes:
-        logits: Above 0 where it is, in the size of the network's answers. [s, s] float32, on the CPU
-        score: Its IoU with the truth, as the network foretells.
+        logits: Above 0 inside the mask, at the network's output size. [s, s] float32, on the CPU
+        score: IoU predicted by the network.
     """
 
     logits: Tensor
@@ -53,7 +53,7 @@ class Segment:
 
     @property
     def mask(self) -> np.ndarray:
-        """Where it is. [s, s] bool"""
+        """Pixels of the segment. [s, s] bool"""
         return self.logits.gt(0).numpy()
 
 
@@ -64,7 +64,7 @@ def find(model: Sam2, image: np.ndarray, settings: SegmentSettings) -> list[Segm
     Args:
         model: The model.
         image: RGB. [H, W, 3] uint8
-        settings: Which masks are taken.
+        settings: Criteria for accepting masks.
 
     Returns:
         The masks, the best first; they may overlap, as parts and wholes do.
@@ -89,30 +89,30 @@ def find(model: Sam2, image: np.ndarray, settings: SegmentSettings) -> list[Segm
 
 
 def new_ones(segments: Sequence[Segment], known: Sequence[np.ndarray], overlap: float) -> list[Segment]:
-    """Segments that are none of the masks that are known in the same image.
+    """Filter out segments that match a known mask in the same image.
 
     Args:
-        segments: What was found.
-        known: Masks of objects. [s, s] bool
-        overlap: A segment whose IoU with one of them is this or more is that object.
+        segments: Found segments.
+        known: Masks of known objects. Sequence of [s, s] bool
+        overlap: IoU from which a segment matches a mask.
     """
     pairs = [(segment, segment.mask) for segment in segments]
     return [segment for segment, mask in pairs if all(iou(mask, other) < overlap for other in known)]
 
 
 def iou(one: np.ndarray, other: np.ndarray) -> float:
-    """Intersection over union of two masks, 0 where both are empty. [..., H, W] bool"""
+    """Intersection over union of two masks, 0 if both are empty. [..., H, W] bool"""
     union = np.count_nonzero(one | other)
     return np.count_nonzero(one & other) / union if union else 0.0
 
 
 def full_size(logits: Tensor, size: Sequence[int]) -> Tensor:
-    """Masks out of the network in the size of an image. [K, s, s] -> [K, H, W]"""
+    """Resize network masks to the size of an image. [K, s, s] -> [K, H, W]"""
     return F.interpolate(logits[:, None].float(), tuple(size), mode="bilinear", align_corners=False)[:, 0]
 
 
 def _is_good(logits: Tensor, settings: SegmentSettings) -> Tensor:
-    """Whether masks keep their area as the threshold moves, and have a sensible one. [K, s, s] -> [K] bool"""
+    """Select masks with a stable area when the threshold moves, within the area limits. [K, s, s] -> [K] bool"""
     strict, loose = ((logits > t).flatten(1).sum(1) for t in (STABLE_BY, -STABLE_BY))
     share = (logits > 0).flatten(1).float().mean(1)
     stable = strict >= settings.stability * loose.clamp(min=1)
@@ -120,7 +120,7 @@ def _is_good(logits: Tensor, settings: SegmentSettings) -> Tensor:
 
 
 def _each_once(masks: Tensor, scores: Tensor) -> list[int]:
-    """Rows of the masks of which no better one is about the same, the best first. [K, s, s] bool, [K]"""
+    """Non-maximum suppression: rows of the masks without a better duplicate, the best first. [K, s, s] bool, [K]"""
     flat = masks.flatten(1)
     areas = flat.sum(1)
     kept: list[int] = []

@@ -1,8 +1,8 @@
-"""SAM2 through a video: objects that are marked in one image are followed to both ends, and painted over each other.
+"""Object tracking through a video with SAM2: objects marked in one image are followed to both ends and painted.
 
-Each object is followed on its own, so masks overlap; a pixel goes to the object that is surest of it.
+Each object is tracked on its own, so masks overlap; a pixel goes to the object with the largest logit.
 
-Notation: M objects, masks of s x s out of the network, images of H x W pixels.
+Notation: M objects, masks of s x s from the network, images of H x W pixels.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from .sam2_model import Sam2
 from .sam2_segments import full_size
 from .videos import Video
 
-HEAVY = ("maskmem_features", "maskmem_pos_enc")  # what the network remembers of an image, a megabyte per object
+HEAVY = ("maskmem_features", "maskmem_pos_enc")  # the network's memory of an image, a megabyte per object
 
 
 class Frames(Mapping):
-    """Images of a video as the network takes them, read when they are asked for; the last one is kept.
+    """Images of a video as network input, read on demand; the last one is cached.
 
     Args:
         model: The model.
@@ -51,20 +51,19 @@ class Frames(Mapping):
 
 @torch.inference_mode()
 def follow(model: Sam2, frames: Frames, key: int, marked: Tensor) -> Iterator[tuple[int, Tensor]]:
-    """Follow objects from one image of a video to its end, then to its beginning.
+    """Track objects from one image of a video to its end, then to its beginning.
 
-    Of the images that lie behind only those are remembered that the network looks back at, so that memory does not
-    grow with the video.
+    Only the past images that the network attends to are remembered, so memory does not grow with the video.
 
     Args:
         model: The model.
         frames: The images.
-        key: Image in which the objects are marked.
-        marked: Their logits there, above 0 where they are. [M, s, s]
+        key: Index of the image in which the objects are marked.
+        marked: Their logits in it, above 0 inside the objects. [M, s, s]
 
     Yields:
-        Index of an image and the objects' logits in it, above 0 where they are [M, s, s]; the marked one first, each
-        image once.
+        Index of an image and the objects' logits in it, above 0 inside the objects [M, s, s]; the marked image first,
+        each image once.
     """
     from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
@@ -85,7 +84,7 @@ def follow(model: Sam2, frames: Frames, key: int, marked: Tensor) -> Iterator[tu
     yield key, model.video(inference_session=state, frame_idx=key).pred_masks[:, 0]
     for step in (1, -1):
         for objects in state.output_dict_per_obj.values():
-            objects["non_cond_frame_outputs"].clear()  # of the other direction
+            objects["non_cond_frame_outputs"].clear()  # outputs of the other direction
         for index in range(key + step, len(frames) if step > 0 else -1, step):
             found = model.video(inference_session=state, frame_idx=index, reverse=step < 0)
             for objects in state.output_dict_per_obj.values():
@@ -94,7 +93,7 @@ def follow(model: Sam2, frames: Frames, key: int, marked: Tensor) -> Iterator[tu
 
 
 def _forget(outputs: dict[int, dict], index: int, step: int, seen_back: int, pointed_back: int) -> None:
-    """Drop what no later image of this direction looks at."""
+    """Drop outputs that no later image of this direction attends to."""
     for name in ("high_res_masks", "pred_masks"):
         outputs[index].pop(name, None)
     if (old := outputs.get(index - step * seen_back)) is not None:
@@ -104,13 +103,13 @@ def _forget(outputs: dict[int, dict], index: int, step: int, seen_back: int, poi
 
 
 class Canvas:
-    """Object ids of a video's images, and how sure of each pixel its object is; on the disk, gone with the process.
+    """Object id and its logit for each pixel of a video, in temporary files.
 
     Args:
-        count: Images.
-        height: Of the images, pixels.
-        width: Of the images, pixels.
-        folder: Where there is room for four bytes per pixel.
+        count: Number of images.
+        height: Height of the images, pixels.
+        width: Width of the images, pixels.
+        folder: Folder with space for four bytes per pixel.
     """
 
     def __init__(self, count: int, height: int, width: int, folder: Path):
@@ -120,26 +119,26 @@ class Canvas:
         self._sure = np.memmap(self._files[1], np.float16, "w+", shape=shape)
 
     def paint(self, index: int, ids: Sequence[int], logits: np.ndarray) -> None:
-        """Give objects the pixels of an image that they are surer of than others were; of equals the first one.
+        """Give each pixel of an image to the object with the largest logit, unless an earlier object's is as large.
 
         Args:
             index: The image.
-            ids: Their ids. (M,)
-            logits: Above 0 where they are. [M, H, W]
+            ids: Ids of the objects. (M,)
+            logits: Above 0 inside the objects. [M, H, W]
         """
         best = logits.argmax(0)
         sure = np.take_along_axis(logits, best[None], 0)[0].astype(np.float16)
-        better = sure > self._sure[index]  # which begins at 0
+        better = sure > self._sure[index]  # initially 0
         self.ids[index][better] = np.asarray(ids, np.uint16)[best[better]]
         self._sure[index][better] = sure[better]
 
     def mark_gaps(self, longest: int) -> None:
-        """Call unknown where an object was before and after images that lack it, unless another one is there.
+        """Mark background pixels as unknown in images that lack an object which was there before and after.
 
-        That it is hidden there by what is no object, or lost from sight, cannot be told from here.
+        The object may be hidden by something that is not an object, or lost by the tracker.
 
         Args:
-            longest: Longer gaps stay as they are: the object may have gone and come back. Images.
+            longest: Number of images of the longest gap to mark; in longer gaps the object may have left.
         """
         last: dict[int, int] = {}
         for index in range(len(self.ids)):
@@ -155,7 +154,7 @@ class Canvas:
                     self.ids[between][place & (self.ids[between] == 0)] = masks.UNKNOWN
 
     def close(self) -> None:
-        """Give the room back."""
+        """Delete the temporary files."""
         del self.ids, self._sure
         for file in self._files:
             file.close()

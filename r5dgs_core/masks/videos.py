@@ -1,4 +1,4 @@
-"""The images of a data set as videos: what one camera saw, in the order of time."""
+"""Grouping of a data set's images into videos: the images of one camera in temporal order."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from ..data import dataset as datasets
 from ..data import images
 
-STEP_DEG = 15.0  # a camera that turns further between two images begins another video
-STEP = 0.3  # and one that goes further, as a share of its distance from what all cameras look at
+STEP_DEG = 15.0  # largest turn of a camera between two images of a video, degrees
+STEP = 0.3  # largest step of a camera between them, as a share of its distance from the common focus
 
 
 @dataclass(frozen=True)
 class Video:
-    """Images in the order of time, all of one size.
+    """Images of one size in temporal order.
 
     Attributes:
-        name: Name of the camera, or a made one.
+        name: Name of the camera, or a generated one.
         views: Its images.
     """
 
@@ -27,25 +27,25 @@ class Video:
     views: tuple[datasets.View, ...]
 
     def image(self, index: int) -> np.ndarray:
-        """One image as RGB. [H, W, 3] uint8"""
+        """Load one image as RGB. [H, W, 3] uint8"""
         return images.to_uint8(datasets.load_image(self.views[index]))
 
 
 def of(views: Sequence[datasets.View]) -> list[Video]:
-    """Sort views into videos.
+    """Group views into videos.
 
-    Images of one named or standing camera are a video. Where every image has a camera of its own, as those of one
-    camera in motion do, images that follow each other in time are one as long as the camera hardly moves in between.
+    The images of a named or static camera form a video. If every image has its own camera, as with one moving camera,
+    consecutive images form a video as long as the camera moves little between them.
 
     Args:
         views: The views.
 
     Returns:
-        The videos by first appearance; each view is in one of them.
+        The videos by first appearance; each view is in exactly one.
     """
     groups: dict[tuple, list[datasets.View]] = {}
     for view in views:
-        name = view.camera.name.split("@")[0]  # name@1, name@2, ... are one camera in motion
+        name = view.camera.name.split("@")[0]  # name@1, name@2, ... are one moving camera
         groups.setdefault((name, view.camera.width, view.camera.height), []).append(view)
     if len(groups) == len(views) > 1:
         return _chained(views)
@@ -63,10 +63,10 @@ def _order(view: datasets.View) -> tuple[float, str]:
 
 
 def _chained(views: Sequence[datasets.View]) -> list[Video]:
-    """Videos of images that follow each other in time and place."""
+    """Split images by time and place into videos of a moving camera."""
     centers = np.array([view.camera.center for view in views])
     axes = np.array([view.camera.T_cam_world[2, :3] for view in views])
-    # The point that is nearest to all optical axes; the least norm where they are parallel.
+    # The point nearest to all optical axes; the minimum-norm solution if they are parallel.
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     focus = np.linalg.lstsq(projectors.sum(0), np.einsum("vij,vj->i", projectors, centers), rcond=None)[0]
     chains: list[list[datasets.View]] = []
@@ -79,7 +79,7 @@ def _chained(views: Sequence[datasets.View]) -> list[Video]:
 
 
 def _near(one: datasets.View, other: datasets.View, focus: np.ndarray) -> bool:
-    """Whether two images may follow each other in a video."""
+    """Return True if two images can be consecutive in a video."""
     a, b = one.camera, other.camera
     if (a.width, a.height) != (b.width, b.height):
         return False

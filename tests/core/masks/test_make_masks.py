@@ -106,7 +106,7 @@ def test_a_mask_that_was_deleted_is_made_again(views, tmp_path):
 
 
 def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views, tmp_path, tiny):
-    with pytest.raises(errors.DatasetError, match="holds 36 masks that nobody says how they were made.*--overwrite"):
+    with pytest.raises(errors.DatasetError, match="holds 36 masks of unknown origin.*--overwrite"):
         make_masks.make(views, Numbered(), tiny.root / "object_mask")
     make_masks.make(views, Numbered(), tmp_path)
     with pytest.raises(errors.DatasetError, match=r"other settings \(kind\).*--out.*--overwrite"):
@@ -118,7 +118,7 @@ def test_masks_of_others_and_of_other_settings_are_not_overwritten_unasked(views
     with pytest.raises(errors.DatasetError, match=r"other settings \(numbering\)"):
         make_masks.make(views, together, tmp_path)
     mask_notes.write(mask_notes.MaskNotes(unknown=255), tmp_path)  # by hand, as docs/user/masks.md says
-    with pytest.raises(errors.DatasetError, match="were made with what masks.json does not say; name another folder"):
+    with pytest.raises(errors.DatasetError, match="were made with an unknown backend; name another folder"):
         make_masks.make(views, Numbered(), tmp_path)
 
 
