@@ -1,7 +1,7 @@
-"""The pictures by which an encoder gets to know an object: where it is seen well, cut out of renderings of the scene.
+"""Best views of an object for an image encoder: crops of renderings in which the object is well visible.
 
-Renderings need no data set, and a crop has as many pixels as the encoder wants. What is seen of an object is counted in
-small pictures from the scene's own cameras at observed times.
+Renderings need no data set, and crops have the encoder's resolution. Visible pixels are counted in small pictures from
+the scene's own cameras at observed times.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from ..render import highlight, scene_renderer, viewpoints
 from ..scene.cameras import Camera
 from ..scene.scene import Scene
 
-VIEWS = 6  # of an object at most
+VIEWS = 6  # most views per object
 _LOOK = 256  # longer side of the small pictures, pixels
-_CAMERAS = 8  # that are tried
-_TIMES = 4
-_TRIED = 10  # standpoints at which an object is drawn alone, to see how much of it is hidden
-_LEAST_PIXELS = 12  # of a small picture: fewer are no view
-_WANTED_SIDE = 32  # pixels of the camera's own picture: a smaller object counts less
-_CUT = 0.3  # worth of a view in which the border cuts the object
-_AGAIN = 0.4  # worth of one more view from the same camera
-_SAME_TIME = 0.8  # worth of one more view at the same time
-_MARGIN = 0.15  # around the object, on each side, of the larger of its width and height
-_GRAY = 0.5
+_CAMERAS = 8  # most cameras to try
+_TIMES = 4  # number of times to try
+_TRIED = 10  # most views per object that are also rendered without occluders
+_LEAST_PIXELS = 12  # smallest visible area in a small picture
+_WANTED_SIDE = 32  # object size in the camera's picture, pixels; smaller objects get a lower score
+_CUT = 0.3  # factor on the score of an object cut by the border
+_AGAIN = 0.4  # factor on the score for each chosen view of the same camera
+_SAME_TIME = 0.8  # factor on the score for each chosen view at the same time
+_MARGIN = 0.15  # margin around the object on each side, as a share of its larger side
+_GRAY = 0.5  # background of isolated crops
 
 
 @dataclasses.dataclass(frozen=True)
 class Sighting:
-    """An object as one camera sees it.
+    """An object in the picture of one camera.
 
     Attributes:
         camera: The scene's camera.
         t: Scene time.
         box: Square around the object: left, top, right, bottom in pixels of the camera.
-        worth: Visible pixels, less what is hidden, cut or tiny.
+        worth: Score: visible pixels, reduced for objects that are occluded, cut or tiny.
     """
 
     camera: Camera
@@ -54,16 +54,16 @@ def find(
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[int, list[Sighting]]:
-    """The best views of objects, spread over cameras and times.
+    """Find the best views of objects, spread over cameras and times.
 
     Args:
         scene: The scene.
         object_ids: The objects.
         backend: Rasterizer.
-        progress: Told of pictures looked at, and their number.
+        progress: Called with the number of finished pictures and their total.
 
     Returns:
-        At most `VIEWS` of each object, the best first; none for one that no camera sees.
+        At most `VIEWS` per object, the best first; an empty list for objects that no camera sees.
     """
     seen: dict[int, list[tuple[Sighting, np.ndarray]]] = {object_id: [] for object_id in object_ids}
     places = _standpoints(scene)
@@ -91,7 +91,7 @@ def find(
 def crops(
     scene: Scene, object_id: int, sighting: Sighting, size: int = 256, *, backend: str = "auto"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures of an object: alone on gray, and as it stands in the scene. Each [size, size, 3], sRGB in [0, 1]"""
+    """Render two crops of an object: isolated on gray, and in the scene. Each [size, size, 3], sRGB in [0, 1]"""
     camera = _cut(sighting.camera, sighting.box, size)
     alone = highlight.isolate(scene, [object_id], camera, sighting.t, backend=backend)
     alpha = alone[..., 3:]
@@ -121,14 +121,14 @@ def _sighting(at: viewpoints.Standpoint, small: Camera, mask: np.ndarray) -> Sig
 
 
 def _unhidden(scene: Scene, object_id: int, sighting: Sighting, mask: np.ndarray, backend: str) -> float:
-    """Share of an object's pixels that nothing hides."""
+    """Share of an object's pixels that are not occluded."""
     small = viewpoints.sized(sighting.camera, _LOOK)
     alone = highlight.isolate(scene, [object_id], small, sighting.t, backend=backend)[..., 3] > 0.5
     return float((mask & alone).sum() / max(alone.sum(), 1))
 
 
 def _spread(sightings: list[Sighting]) -> list[Sighting]:
-    """The best ones; each that is taken makes others of its camera and time worth less."""
+    """Choose the best views greedily; each chosen view lowers the scores of others of its camera and time."""
     left, taken = list(sightings), []
     while left and len(taken) < VIEWS:
         worths = [
@@ -145,7 +145,7 @@ def _spread(sightings: list[Sighting]) -> list[Sighting]:
 
 
 def _cut(camera: Camera, box: tuple[float, float, float, float], size: int) -> Camera:
-    """A camera whose picture is a square of another's, with its own number of pixels."""
+    """Return a camera for a square of another camera's picture, at its own resolution."""
     left, top, right, _ = box
     scale = size / max(right - left, 1e-6)
     to_square = np.array([[scale, 0, -scale * left], [0, scale, -scale * top], [0, 0, 1.0]])

@@ -1,8 +1,8 @@
-"""Making the lookup table of a scene: what each object looks like or is called, as an encoder sees it.
+"""Construction of a scene's lookup table: an embedding of each object, from its appearance or its names.
 
-Every object but the background gets an embedding. One that sees gets it from pictures of the object
-(`best_views`), a sentence model from its name, aliases and caption. Beside them go words with their embeddings, so that
-these are found without the encoder, and thresholds (`calibration`).
+Every object except the background gets an embedding. Image encoders embed pictures of the object (`best_views`),
+sentence models its name, aliases and caption. The table also stores words with their embeddings, which are found
+without the encoder, and match thresholds (`calibration`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .encoders import encoder_base
 
 _NUMBERED = re.compile(r"^(?:object|obj|id|segment|instance|mask)?[\s_#.-]*\d+$", re.IGNORECASE)
 
-Progress = Callable[[str, int, int], None]  # told what is done, how much of it, and of how much
+Progress = Callable[[str, int, int], None]  # called with the stage, the number of finished items, and their total
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Made:
 
 @dataclass(frozen=True)
 class _Views:
-    """Of one object: its V embeddings [V, D] and where they come from, thresholds not yet known."""
+    """Embeddings of one object [V, D] and their sources; thresholds are not set yet."""
 
     embeddings: np.ndarray
     sources: tuple[View, ...]
@@ -55,20 +55,20 @@ def make(
     backend: str = "auto",
     progress: Progress | None = None,
 ) -> Made:
-    """Give a scene a lookup table, in place of one that it has.
+    """Add a lookup table to a scene, replacing an existing one.
 
     Args:
         scene: The scene.
-        encoder: The encoder; queries have to come from the same one.
-        words: Words to store beside the objects' names and the common nouns.
+        encoder: The encoder; queries must use the same one.
+        words: Words to store besides the objects' names and the common nouns.
         backend: Rasterizer.
-        progress: Told of "views" and "objects" done, and their number.
+        progress: Called for the stages "views" and "objects".
 
     Returns:
-        The scene with its table, and what there is to say.
+        The scene with its table, and notes for the user.
 
     Raises:
-        BackendError: No object has anything to embed.
+        BackendError: No object can be embedded.
     """
     items = [item for item in scene.objects if item.id > 0 and item.count]
     empty = [item.name for item in scene.objects if item.id > 0 and not item.count]
@@ -90,7 +90,7 @@ def make(
 def _from_words(
     items: Sequence[SceneObject], encoder: encoder_base.Encoder, progress: Progress | None
 ) -> tuple[dict[int, _Views], list[str]]:
-    """What objects are called, each phrase an embedding."""
+    """Embed the names, aliases and captions of objects, one embedding per phrase."""
     found, nameless = {}, []
     for done, item in enumerate(items):
         phrases = [word for word in (item.name, *item.aliases, item.caption) if word.strip()]
@@ -112,7 +112,7 @@ def _from_words(
 def _from_pictures(
     scene: Scene, items: Sequence[SceneObject], encoder: encoder_base.Encoder, backend: str, progress: Progress | None
 ) -> tuple[dict[int, _Views], list[str]]:
-    """How objects look, each view an embedding: the mean of the object alone and in its place."""
+    """Embed pictures of objects, one embedding per view: the mean of the isolated object and the object in place."""
     looked = None if progress is None else functools.partial(progress, "views")
     sightings = best_views.find(scene, [item.id for item in items], backend=backend, progress=looked)
     found, unseen = {}, []
@@ -136,13 +136,13 @@ def _from_pictures(
 def _vocabulary(
     items: Sequence[SceneObject], words: Sequence[str], encoder: encoder_base.Encoder, nouns: np.ndarray
 ) -> tuple[tuple[str, ...], np.ndarray]:
-    """The words to store, each once, names first, and their embeddings."""
+    """Words to store, without duplicates, names first, and their embeddings."""
     named = [word for item in items for word in (item.name, *item.aliases)]
     known = {tuple(english.words_of(noun)): row for row, noun in enumerate(common_nouns.words())}
     chosen: dict[tuple[str, ...], str] = {}
     for word in (*named, *words, *common_nouns.words()):
         said = object_search.wishes(word)
-        if len(said) == 1:  # what a query would cut is never looked up
+        if len(said) == 1:  # queries are split, so a phrase of several parts is never looked up
             chosen.setdefault(tuple(said[0]), word.strip())
     fresh = [word for said, word in chosen.items() if said not in known]
     rows = dict(zip(fresh, encoder_base.embed_phrases(encoder, fresh), strict=True))
@@ -158,7 +158,7 @@ def _assembled(
     vocabulary: tuple[str, ...],
     words: np.ndarray,
 ) -> Scene:
-    """The scene with everything in the rows of its objects."""
+    """Write embeddings, thresholds and words to the scene, in the rows of its objects."""
     rows = {item.id: row for row, item in enumerate(scene.objects)}
     most = max(len(own.sources) for own in found.values())
     shape = (len(scene.objects), encoder.card.dimension)
@@ -203,5 +203,5 @@ def _assembled(
 
 
 def _packed(array: np.ndarray) -> np.ndarray:
-    """Rounded to half precision, which a zip packs into two thirds; 1e-3 of a cosine is nothing."""
+    """Round to half precision, which compresses to two thirds; the error of 1e-3 in a cosine is negligible."""
     return array.astype(np.float16).astype(np.float32)

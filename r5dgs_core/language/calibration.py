@@ -1,11 +1,12 @@
-"""From which cosine on a phrase means an object: found with common nouns, most of which name something else.
+"""Calibration of match thresholds: the cosine from which a phrase matches an object, estimated from common nouns.
 
-Cosines of one encoder crowd together, and those of one object lie higher than those of another, so a cosine is counted
-in standard deviations above the mean of the nouns' cosines with the same embedding. The limit in these units is such
-that nouns which name something else pass it only as often as is allowed.
+Cosines of one encoder lie close together, and their level differs between objects. A cosine is therefore standardized
+by the mean and standard deviation of the nouns' cosines with the same embedding. The limit in these units is a quantile
+of the nouns that name something else, so that false alarms stay below a given rate.
 
-Sentence models take their limit from the nouns alone: each stands for an object in turn, so the scene has no part in
-it. For models that see, it comes from the scene's own objects, as pictures and words of such models never come near.
+For sentence models, the limit comes from the nouns alone: each takes the role of an object, so the scene has no
+influence. For image encoders, it comes from the scene's own objects, because embeddings of pictures and words lie far
+apart.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ import numpy as np
 
 from . import common_nouns
 
-FALSE_ALARMS = 0.1  # of prompts for things that a scene does not hold, those that may find something
-_MOST_EACH = 0.02  # of them, for one object
-_LIKELY_TRUE = 0.03  # share of the nouns that may name an object of which nobody says what it is
-_MARGIN = 2.0  # how far below the best cosine others match, in standard deviations: 1.5 to 2.5 find as much
+FALSE_ALARMS = 0.1  # accepted share of prompts for absent things that match something
+_MOST_EACH = 0.02  # the same for a single object
+_LIKELY_TRUE = 0.03  # share of the nouns that may be true for an object without a known name
+_MARGIN = 2.0  # distance of further matches below the best cosine, in standard deviations; 1.5 to 2.5 work as well
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What nouns say about embeddings.
+    """Thresholds estimated from the cosines of nouns.
 
     Attributes:
-        limit: From how many standard deviations above the mean on a phrase is a match.
-        thresholds: The same as a cosine, for each embedding. [R]
-        margin: How far below the best cosine of a query others match.
+        limit: Smallest match, in standard deviations above the mean.
+        thresholds: Smallest cosine of a match, for each embedding. [R]
+        margin: Accepted distance of further matches below a query's best cosine.
     """
 
     limit: float
@@ -44,7 +45,7 @@ def for_words(rows: np.ndarray, nouns: np.ndarray, objects: int) -> Calibration:
     Args:
         rows: The embeddings, unit. [R, D]
         nouns: Embeddings of `common_nouns.words()`, unit. [W, D]
-        objects: Objects of the scene that have an embedding.
+        objects: Number of objects with an embedding.
     """
     words, things = common_nouns.words(), common_nouns.things()
     places = [words.index(thing) for thing in things]
@@ -58,7 +59,7 @@ def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[s
     Args:
         rows: The objects' embeddings, unit. [R, D]
         nouns: Embeddings of `common_nouns.words()`, unit. [W, D]
-        names: What is known of each object's name; a name that is no common noun says nothing. [R]
+        names: Known names of each object; names that are not common nouns are ignored. [R]
     """
     words = common_nouns.words()
     above = standardize(rows, nouns)
@@ -73,7 +74,7 @@ def for_pictures(rows: np.ndarray, nouns: np.ndarray, names: Sequence[Sequence[s
 
 
 def standardize(rows: np.ndarray, nouns: np.ndarray) -> np.ndarray:
-    """How far each noun's cosine with an embedding lies above the mean of all nouns', in standard deviations. [R, W]"""
+    """Standardize the nouns' cosines with each embedding: standard deviations above the nouns' mean. [R, W]"""
     cosines = np.asarray(rows, np.float64) @ np.asarray(nouns, np.float64).T
     return (cosines - cosines.mean(-1, keepdims=True)) / np.maximum(cosines.std(-1, keepdims=True), 1e-9)
 

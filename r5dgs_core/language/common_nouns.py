@@ -1,7 +1,7 @@
-"""Common nouns and what they are kinds of.
+"""Taxonomy of common nouns.
 
-They are the words that a lookup table answers without an encoder, and those that it is calibrated with, as any scene
-holds few of them. One line for each kind of thing, ``kind < broader kind: members``; "_" joins the parts of a word.
+A lookup table answers these words without an encoder, and is calibrated with them, as any scene contains few of them.
+Format: one line per kind, ``kind < broader kind: members``; "_" joins the parts of a word.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ street_furniture: lamp_post fire_hydrant mailbox trash_can
 
 @functools.cache
 def broader() -> dict[str, frozenset[str]]:
-    """Each noun with all kinds of things that it is: "lemon" -> {"citrus", "fruit", "food"}."""
+    """Map each noun to all its hypernyms: "lemon" -> {"citrus", "fruit", "food"}."""
     kinds, parents = [], {}
     for line in _KINDS.strip().splitlines():
         head, members = line.split(":")
@@ -128,19 +128,19 @@ def broader() -> dict[str, frozenset[str]]:
 
 
 def words() -> tuple[str, ...]:
-    """All nouns, kinds among them, in alphabetical order."""
+    """All nouns, including kinds, in alphabetical order."""
     return tuple(broader())
 
 
 def things() -> tuple[str, ...]:
-    """The nouns that no other noun is a kind of."""
+    """Nouns without hyponyms: no other noun is a kind of them."""
     kinds = {kind for above in broader().values() for kind in above}
     return tuple(word for word in words() if word not in kinds)
 
 
 @functools.cache
 def relations() -> np.ndarray:
-    """Whether each two of `words` are the same, one a kind of the other, or both of one kind. [W, W] bool"""
+    """Mask of the pairs of `words` that are equal, kind and member, or members of one kind. [W, W] bool"""
     rows = {word: row for row, word in enumerate(words())}
     above = np.eye(len(rows), dtype=np.float32)
     for word, kinds in broader().items():
@@ -149,7 +149,7 @@ def relations() -> np.ndarray:
 
 
 def known(phrase: str) -> str | None:
-    """The noun that a phrase says: itself, or its last words, as "blue crate" is a crate; None for none."""
+    """Return the noun of a phrase: the phrase or its last words, e.g. "crate" for "blue crate"; None if unknown."""
     nouns = _by_words()
     said = english.words_of(phrase)
     return next((nouns[tuple(said[k:])] for k in range(len(said)) if tuple(said[k:]) in nouns), None)

@@ -1,4 +1,4 @@
-"""Words to objects of a scene, with an encoder for words that the scene does not store."""
+"""Search for a scene's objects by text, with an encoder for words that the scene does not store."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .encoders import encoder_base
 def find(
     scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
 ) -> list[Match]:
-    """Objects that a text names or means, best first; none where nothing does.
+    """Find the objects that a text names or describes, best first; returns an empty list without matches.
 
     Args:
-        scene: The scene; with a lookup table, words are also compared by meaning.
+        scene: The scene; with a lookup table, words are also compared by embedding.
         text: One or several things: "red mug", "mugs and lemon".
-        encoder: For words that the scene does not store: the one that made its table. Names, aliases and stored words
-            need none.
-        threshold: Least score of a match.
+        encoder: Encoder for words that the scene does not store: the one that made its table. Names, aliases and stored
+            words work without it.
+        threshold: Smallest score of a match.
 
     Raises:
-        BackendError: The encoder is another one, or the scene has no table for it.
+        BackendError: The encoder did not make the scene's table, or the scene has no table.
     """
     return object_search.search(scene, text, threshold, _embed(scene, encoder))
 
@@ -31,13 +31,13 @@ def find(
 def unanswered(
     scene: Scene, text: str, encoder: encoder_base.Encoder | None = None, threshold: float = object_search.THRESHOLD
 ) -> list[str]:
-    """Phrases of a text that no object matches; arguments as of `find`."""
+    """Phrases of a text that no object matches; arguments as in `find`."""
     meanings = object_search.Meanings.of(scene)
     return object_search.unanswered(object_search.labels_of(scene), text, threshold, meanings, _embed(scene, encoder))
 
 
 def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
-    """Raise `BackendError` where an encoder is not the one that made a table."""
+    """Raise `BackendError` if an encoder is not the one that made a table."""
     if stored.digest != asked.digest or stored.kind != asked.kind:
         raise errors.BackendError(
             f"{place}: its lookup table was made by {_said(stored)}, and cannot be asked with {_said(asked)}; give "
@@ -46,7 +46,7 @@ def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
 
 
 def unknown(scene: Scene, text: str) -> list[str]:
-    """Phrases of a text that only an encoder can answer: no name says them, and no stored word does."""
+    """Phrases of a text that need an encoder, because they are neither names nor stored words."""
     return object_search.unknown(object_search.labels_of(scene), text, object_search.Meanings.of(scene))
 
 

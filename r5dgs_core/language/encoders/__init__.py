@@ -1,1 +1,1 @@
-"""Text and image encoders that are read from a local folder."""
+"""Text and image encoders, loaded from local folders."""

@@ -1,4 +1,4 @@
-"""CLIP and SigLIP by transformers, without torchvision: words and pictures in one space."""
+"""CLIP and SigLIP encoders by transformers, without torchvision: text and images in one embedding space."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _BATCH = 16
 
 
 class ClipEncoder:
-    """A CLIP or SigLIP model of a folder.
+    """CLIP or SigLIP model of a folder.
 
     Args:
-        folder: With config.json, model.safetensors, a tokenizer and preprocessor_config.json.
+        folder: Folder with config.json, model.safetensors, a tokenizer and preprocessor_config.json.
         kind: "clip" or "siglip".
     """
 
@@ -40,13 +40,13 @@ class ClipEncoder:
             self._model, info = AutoModel.from_pretrained(
                 str(folder), **encoder_base.LOADING, use_safetensors=True, output_loading_info=True
             )
-        except Exception as error:  # whatever a damaged folder makes of it
+        except Exception as error:  # a damaged folder raises many types
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         encoder_base.check_loaded(folder, info)
         encoder_base.check_words(folder, self._tokenizer)
         self._model.eval()
         self._longest = int(self._model.config.text_config.max_position_embeddings)
-        # SigLIP was trained on texts of one length, and looks at their padding.
+        # SigLIP was trained on texts of one length and attends to padding.
         self._padding: Any = "max_length" if kind == "siglip" else True
         self._inputs = ("input_ids",) if kind == "siglip" else ("input_ids", "attention_mask")
         dimension = self._texts(["object"]).shape[1]
@@ -54,11 +54,11 @@ class ClipEncoder:
         self.card = EncoderCard(kind, folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """See `encoder_base.Encoder`."""
+        """Implement `encoder_base.Encoder`."""
         return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """See `encoder_base.Encoder`."""
+        """Implement `encoder_base.Encoder`."""
         return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:
@@ -69,7 +69,7 @@ class ClipEncoder:
             return _pooled(self._model.get_text_features(**{name: tokens[name] for name in self._inputs}))
 
     def _images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        from ...data import images  # here, as OpenImageIO is not needed for words
+        from ...data import images  # imported here, as text needs no OpenImageIO
 
         pixels = self._processor(images=[images.to_uint8(each) for each in pictures], return_tensors="pt")
         with self._torch.no_grad():
@@ -77,5 +77,5 @@ class ClipEncoder:
 
 
 def _pooled(features: Any) -> np.ndarray:
-    """Rows of what transformers returns: an output with ``pooler_output``, a tensor before its version 5."""
+    """Features returned by transformers: the field ``pooler_output``, or the tensor itself before version 5."""
     return getattr(features, "pooler_output", features).float().numpy()

@@ -1,7 +1,7 @@
-"""Encoders of words and pictures, behind one small protocol; `registry` opens them.
+"""Protocol and helpers of text and image encoders; `registry` opens them.
 
-Weights are read from a folder that the user names and from nowhere else. A folder that is damaged or incomplete is an
-error: nothing is filled in with random numbers.
+Weights are only read from a folder that the user names. A damaged or incomplete folder is an error: missing weights are
+never initialised at random.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ import numpy as np
 from ... import errors, strict_json
 from ...scene.lookup_table import EncoderCard
 
-CANONICAL = ("object", "things", "stuff", "texture")  # LERF's
-SCALE = 10.0  # LERF's
-LOADING = {"local_files_only": True, "trust_remote_code": False}  # Python in a folder is neither run nor asked about
+CANONICAL = ("object", "things", "stuff", "texture")  # phrases of LERF
+SCALE = 10.0  # of LERF
+LOADING = {"local_files_only": True, "trust_remote_code": False}  # neither run a folder's code nor prompt for it
 _ARTICLE = re.compile(r"^(?:an?|the)\s+", re.IGNORECASE)
 
 
 class Encoder(Protocol):
-    """Turns phrases, and pictures where it sees, into unit vectors of one space.
+    """Encoder of phrases, and of images if it supports them, to unit vectors of one space.
 
     Attributes:
-        card: What it is.
+        card: Description of the encoder.
     """
 
     card: EncoderCard
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """Texts as they are, without templates. [n, D] float32, unit"""
+        """Embed texts verbatim, without templates. [n, D] float32, unit"""
         ...
 
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """Pictures [H, W, 3], sRGB in [0, 1]. [n, D] float32, unit. Raises `BackendError` where it cannot see."""
+        """Embed images [H, W, 3], sRGB in [0, 1]. [n, D] float32, unit. Raises `BackendError` for text encoders."""
         ...
 
 
 def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
-    """Embeddings of phrases, each the mean over the encoder's templates. [n, D] float32, unit"""
+    """Embed phrases, each as the mean over the encoder's templates. [n, D] float32, unit"""
     if not phrases:
         return np.zeros((0, encoder.card.dimension), np.float32)
     bare = [_ARTICLE.sub("", phrase.strip()) or phrase for phrase in phrases]
@@ -56,20 +56,20 @@ def embed_phrases(encoder: Encoder, phrases: Sequence[str]) -> np.ndarray:
 def in_batches(
     items: Sequence[Any], size: int, embed: Callable[[Sequence[Any]], np.ndarray], dimension: int
 ) -> np.ndarray:
-    """Unit embeddings of items, so many at once. [n, D] float32"""
+    """Embed items in batches of ``size``. [n, D] float32, unit"""
     parts = [embed(items[start : start + size]) for start in range(0, len(items), size)]
     return unit(np.concatenate([np.zeros((0, dimension), np.float32), *parts]))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors of length 1, float32; zero stays zero. [..., D]"""
+    """Normalise vectors to length 1, float32; zero stays zero. [..., D]"""
     wide = np.asarray(vectors, np.float64)
     norms = np.linalg.norm(wide, axis=-1, keepdims=True)
     return np.divide(wide, norms, out=np.zeros_like(wide), where=norms > 0).astype(np.float32)
 
 
 def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
-    """A JSON object of a model's folder. Raises `BackendError`."""
+    """Read a JSON object of a model's folder. Raises `BackendError`."""
     if not path.is_file():
         raise errors.BackendError(
             f"{path}: expected in the folder of {of}, found {what_is(path)}; download or copy the model again"
@@ -81,7 +81,7 @@ def read_json(path: Path, of: str = "an encoder") -> dict[str, Any]:
 
 
 def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
-    """The files of a model's weights, each opened once to see that it is whole. Raises `BackendError`."""
+    """Return the weight files of a model, after checking that each can be opened. Raises `BackendError`."""
     try:
         import safetensors
     except ImportError as error:
@@ -96,7 +96,7 @@ def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
         try:
             with safetensors.safe_open(str(path), framework="np") as archive:
                 archive.keys()
-        except Exception as error:  # safetensors has a class of its own, and others for what the system says
+        except Exception as error:  # safetensors has its own type; the system raises others
             raise errors.BackendError(
                 f"{path}: expected safetensors, found a damaged or cut file ({error}); copy the model again"
             ) from error
@@ -104,7 +104,7 @@ def weights_of(folder: Path, pattern: str = "model*.safetensors") -> list[Path]:
 
 
 def digest_of(paths: Sequence[Path]) -> str:
-    """SHA-256 of files, one after the other."""
+    """SHA-256 of the concatenated contents of files."""
     found = hashlib.sha256()
     for path in paths:
         with open(path, "rb") as stream:
@@ -114,7 +114,7 @@ def digest_of(paths: Sequence[Path]) -> str:
 
 
 def quieten() -> None:
-    """Let transformers say nothing by itself: what matters is checked and said here."""
+    """Silence transformers; this package checks and reports the relevant problems itself."""
     from transformers.utils import logging
 
     logging.disable_progress_bar()
@@ -122,19 +122,19 @@ def quieten() -> None:
 
 
 def missing_package(error: ImportError) -> errors.BackendError:
-    """What to say where an optional package is missing."""
+    """Error for a missing optional package."""
     return errors.BackendError(
         f"encoder: cannot import {error.name or error}; install what encoders need: pip install 'r5dgs[encoders]'"
     )
 
 
 def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ()) -> None:
-    """Raise `BackendError` where weights were missing and would be random.
+    """Raise `BackendError` if weights were missing or had wrong shapes, as they would be random.
 
     Args:
-        folder: For the message.
-        info: What transformers says about loading.
-        unused: Beginnings of names that do not matter.
+        folder: Folder, for the message.
+        info: Loading info of transformers.
+        unused: Prefixes of names to ignore.
     """
     absent = sorted(str(name) for name in info.get("missing_keys", ()) if not str(name).startswith(tuple(unused)))
     wrong = sorted(str(each[0] if isinstance(each, tuple) else each) for each in info.get("mismatched_keys", ()))
@@ -147,8 +147,8 @@ def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ())
 
 
 def check_words(folder: Path, tokenizer: Any) -> None:
-    """Raise `BackendError` where all words are one: without its files transformers makes a tokenizer of no words."""
-    one, other = tokenizer(["lemon", "apple"])["input_ids"]  # as long as each other: each letter may be unknown
+    """Raise `BackendError` if all words have the same tokens: without its files, the tokenizer is empty."""
+    one, other = tokenizer(["lemon", "apple"])["input_ids"]  # of equal length, as each letter may be unknown
     if list(one) == list(other):
         raise errors.BackendError(
             f"{folder}: the tokenizer knows no words, its vocabulary is missing; copy the model again, tokenizer.json "
@@ -157,5 +157,5 @@ def check_words(folder: Path, tokenizer: Any) -> None:
 
 
 def what_is(path: Path) -> str:
-    """What is at a path, for messages: "a file", "a folder" or "nothing"."""
+    """Describe a path for messages: "a file", "a folder" or "nothing"."""
     return "a file" if path.is_file() else "a folder" if path.is_dir() else "nothing"

@@ -1,4 +1,4 @@
-"""Folders of open_clip, such as Meta's Perception Encoder; needs the package open_clip, and so torchvision."""
+"""open_clip encoders, such as Meta's Perception Encoder. Needs the packages open_clip and torchvision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BATCH = 16
 
 
 class OpenClipEncoder:
-    """A model of a folder with open_clip_config.json and open_clip_model.safetensors.
+    """Model of a folder with open_clip_config.json and open_clip_model.safetensors.
 
     Args:
         folder: The folder.
@@ -27,7 +27,7 @@ class OpenClipEncoder:
         try:
             import open_clip
             import torch
-        except (ImportError, RuntimeError) as error:  # a torchvision for another torch is a RuntimeError
+        except (ImportError, RuntimeError) as error:  # a torchvision for another torch raises RuntimeError
             name = getattr(error, "name", None) or error
             raise errors.BackendError(
                 f"{folder}: open_clip cannot be imported ({name}); install it with a torchvision that fits this torch: "
@@ -40,18 +40,18 @@ class OpenClipEncoder:
             self._model, self._preprocess = open_clip.create_model_from_pretrained(where)
             self._tokenizer = open_clip.get_tokenizer(where)
             dimension = int(config["model_cfg"]["embed_dim"])
-        except Exception as error:  # whatever a damaged folder makes of it
+        except Exception as error:  # a damaged folder raises many types
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         self._model.eval()
         digest = encoder_base.digest_of(paths)
         self.card = EncoderCard("open_clip", folder.name, digest, dimension, TEMPLATES, encoder_base.SCALE)
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """See `encoder_base.Encoder`."""
+        """Implement `encoder_base.Encoder`."""
         return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """See `encoder_base.Encoder`."""
+        """Implement `encoder_base.Encoder`."""
         return encoder_base.in_batches(pictures, _BATCH, self._images, self.card.dimension)
 
     def _texts(self, texts: Sequence[str]) -> np.ndarray:

