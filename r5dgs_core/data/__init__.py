@@ -1,1 +1,1 @@
-"""Data sets on disk: images, cameras, masks, object names and ground truth."""
+"""Reading of data sets: images, cameras, masks, object names and ground truth."""

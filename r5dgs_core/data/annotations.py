@@ -1,4 +1,4 @@
-"""What a data set says about its objects: their names (``objects.json``) and true poses (``ground_truth.json``)."""
+"""Annotations of a data set's objects: names (``objects.json``) and true poses (``ground_truth.json``)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class GroundTruth:
         object_ids: Ids, in the order of ``matrices``. (M,)
         names: Names, in the same order. (M,)
         matrices: Object to world. [M, T, 4, 4]
-        t_max: Last observed time as the capture says it.
+        t_max: Last observed time according to the capture.
     """
 
     times: np.ndarray
@@ -32,7 +32,7 @@ class GroundTruth:
     t_max: float
 
     def moved(self, shift: np.ndarray) -> GroundTruth:
-        """The poses with all objects moved by a vector. [3]"""
+        """Translate all poses by a vector [3]."""
         matrices = self.matrices.copy()
         matrices[..., :3, 3] += shift
         return replace(self, matrices=matrices)
@@ -42,7 +42,7 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
     """Read ``objects.json``: ``{"1": "mug"}`` or ``{"1": {"name": "mug", "aliases": ["cup"]}}``.
 
     Returns:
-        Name of each id, and its other words; empty without the file.
+        Name and aliases of each id; empty without the file.
     """
     path = root / OBJECTS
     names: dict[int, str] = {}
@@ -78,7 +78,7 @@ def read_objects(root: Path) -> tuple[dict[int, str], dict[int, tuple[str, ...]]
 
 
 def read_ground_truth(root: Path) -> GroundTruth | None:
-    """Read ``ground_truth.json``; None without the file."""
+    """Read ``ground_truth.json``; returns None without the file."""
     path = root / "ground_truth.json"
     if not path.exists():
         return None

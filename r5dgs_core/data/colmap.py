@@ -1,13 +1,12 @@
-"""A folder of images with a COLMAP reconstruction beside it, static or with a time per image.
+"""Images with a COLMAP reconstruction, static or with a time per image.
 
-Layouts, with ``sparse/0/{cameras,images,points3D}.{bin,txt}`` (or ``sparse/``) in all of them:
+All layouts contain ``sparse/0/{cameras,images,points3D}.{bin,txt}`` (or ``sparse/``):
 
-- ``images/NAME``: every image is registered. With ``times.json`` each has a time, without it all are of time 0.
-- ``images/CAMERA/FRAME``: cameras that stand still, each registered once: one of its frames, or an image ``CAMERA``
-  beside the folders. Times are those of ``times.json``, or the numbers at the end of the frames' names, spread over
-  [0, 1].
+- ``images/NAME``: every image is registered. Times come from ``times.json``; without it, all images have time 0.
+- ``images/CAMERA/FRAME``: static cameras, each registered once, by one of its frames or by an image ``CAMERA`` beside
+  the folders. Times come from ``times.json``, or from the numbers at the end of the frames' names, mapped to [0, 1].
 
-``times.json`` maps images to times; beside "times" it may hold "t_max" (later views are the test) and
+``times.json`` maps images to times; beside "times" it may hold "t_max" (later views are the test split) and
 "frames_per_unit".
 """
 
@@ -29,22 +28,22 @@ from . import colmap_model, images, transforms
 from .colmap_model import Registered
 from .transforms import Entry
 
-MIN_REGISTERED = 0.5  # share of the images; fewer are a failed reconstruction
-HELD_OUT = 8  # every eighth camera is held out, as 3D Gaussian Splatting does
+MIN_REGISTERED = 0.5  # smallest share of registered images; fewer mean a failed reconstruction
+HELD_OUT = 8  # every eighth camera is held out, as in 3D Gaussian Splatting
 IMAGES = "images"
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Found:
-    """What `read` found.
+    """Result of `read`.
 
     Attributes:
         entries: Frames of each split; file paths are relative to the folder ``images``.
         header: Keys as at the top of a camera file.
         points: Points of the reconstruction, world. [P, 3] float64 or None
         colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
-        files: The files that say all that.
+        files: The files that were read.
     """
 
     entries: dict[str, list[Entry]]
@@ -56,7 +55,7 @@ class Found:
 
 @dataclass(frozen=True)
 class _Frame:
-    """An image, whose pose it has, and when it was taken."""
+    """An image with the registered image that gives its pose, its camera and its time."""
 
     name: str
     pose: Registered
@@ -67,9 +66,9 @@ class _Frame:
 def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Guard = findings.STRICT) -> Found:
     """Read cameras, times and points of a data set.
 
-    Every eighth camera (by name, from the first one on) is held out where there are at least eight, within the span of
-    times that the others observe: what it took outside is left out, and a camera that took nothing inside is trained
-    on. Views later than "t_max" of ``times.json`` are the test.
+    If there are at least eight cameras, every eighth (by name, from the first) is held out, within the times that the
+    other cameras observe: its other images are dropped, and a camera without images in that span is trained on. Views
+    later than "t_max" of ``times.json`` are the test split.
 
     Args:
         root: Folder of the data set.
@@ -78,8 +77,7 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
         guard: Entered around each image that may lack a pose or a time.
 
     Raises:
-        DatasetError: Something is missing or damaged, or too few images are registered; distorted lenses are not
-            supported.
+        DatasetError: A file is missing or damaged, too few images are registered, or a lens is distorted.
     """
     sparse = input_paths.reconstruction(root)
     if sparse is None:
@@ -112,7 +110,7 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
 
 
 def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Time of each image, and the other keys of ``times.json``."""
+    """Read the time of each image, and the other keys of ``times.json``."""
     content = strict_json.read(path, errors.DatasetError)
     if not isinstance(content, dict):
         raise errors.DatasetError(f"{path}: expected image names and times, found {type(content).__name__}", code="D16")
@@ -130,7 +128,7 @@ def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:
 def _check_registered(
     root: Path, frames: list[_Frame], registered: tuple[Registered, ...], min_registered: float
 ) -> None:
-    """Refuse a data set if most of its images have no pose, or if there are videos among them."""
+    """Raise DatasetError if too many images have no pose, or if there are videos among them."""
     placed = {frame.name for frame in frames} | {image.name for image in registered}
     kinds = (*images.SUFFIXES, *images.UNREADABLE_SUFFIXES, *images.VIDEO_SUFFIXES)
     present = {
@@ -160,7 +158,7 @@ def _check_registered(
 def _timed(
     root: Path, registered: tuple[Registered, ...], times: dict[str, float], path: Path, guard: findings.Guard
 ) -> list[_Frame]:
-    """The images that ``times.json`` lists."""
+    """Frames that ``times.json`` lists, with the pose of their image or of their static camera."""
     own = {image.name: image for image in registered}
     standing = _standing(registered)
     frames = []
@@ -182,7 +180,7 @@ def _timed(
 
 
 def _check_kind(root: Path, name: str, place: str) -> None:
-    """Raise the error for an image that is missing or of a kind that is not read; others pass."""
+    """Raise DatasetError if an image is missing or of an unsupported kind."""
     path = root / IMAGES / name
     if not path.is_file():
         raise errors.DatasetError(f"{place}: the image is missing, expected {path}", code="D10")
@@ -191,9 +189,9 @@ def _check_kind(root: Path, name: str, place: str) -> None:
 
 
 def _videos(root: Path, registered: tuple[Registered, ...], guard: findings.Guard) -> tuple[list[_Frame], int]:
-    """The frames of cameras that stand still, none where no camera has more than one, and the last of their numbers.
+    """Frames of static cameras, and the span of their frame numbers; no frames if each camera has at most one.
 
-    The first number is 0.
+    Times are (number - first) / span.
     """
     found: list[tuple[str, Registered, str]] = []
     moving = False
@@ -228,7 +226,7 @@ def _videos(root: Path, registered: tuple[Registered, ...], guard: findings.Guar
 
 
 def _standing(registered: tuple[Registered, ...]) -> dict[str, Registered]:
-    """Cameras that are registered once: a folder with one registered image, or an image called like a folder."""
+    """Cameras that are registered once: a folder with one registered image, or an image named like a folder."""
     inside: dict[str, list[Registered]] = {}
     for image in registered:
         inside.setdefault(image.name.rpartition("/")[0], []).append(image)
@@ -237,7 +235,7 @@ def _standing(registered: tuple[Registered, ...]) -> dict[str, Registered]:
 
 
 def _names(root: Path, camera: str) -> Iterator[str]:
-    """Images in the folder of a camera."""
+    """Yield the images in the folder of a camera."""
     place = root / IMAGES / camera
     for path in sorted(place.iterdir()) if place.is_dir() else []:
         if path.suffix.lower() in images.SUFFIXES and path.is_file() and not path.name.startswith("."):
@@ -249,10 +247,10 @@ def _count(root: Path, camera: str) -> int:
 
 
 def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
-    """Frames of each split; no camera of "val" is in "train".
+    """Assign frames to splits; no camera of "val" is in "train".
 
-    Held-out cameras of which nothing lies within the times of the others are trained on; of the rest, frames outside
-    those times are left out.
+    Held-out cameras without frames within the times of the others are trained on. Frames of the remaining held-out
+    cameras outside those times are dropped.
     """
     names = sorted({frame.camera for frame in frames})
     held = set(names[::HELD_OUT]) if len(names) >= HELD_OUT else set()
@@ -274,7 +272,7 @@ def _split(frames: list[_Frame], t_max: float) -> dict[str, list[_Frame]]:
 
 
 def _span(frames: list[_Frame], held: set[str]) -> tuple[float, float]:
-    """First and last time of the cameras that are not held out, with a little to spare; empty without such frames."""
+    """First and last time of the cameras that are not held out, with a small tolerance; (inf, -inf) without frames."""
     seen = [frame.t for frame in frames if frame.camera not in held]
     return min(seen, default=math.inf) - 1e-9, max(seen, default=-math.inf) + 1e-9
 
@@ -293,6 +291,6 @@ def _entry(sparse: Path, frame: _Frame) -> Entry:
 
 
 def _stem(name: str) -> str:
-    """The name without the suffix."""
+    """Name without the suffix."""
     head, dot, _ = name.rpartition(".")
     return head if dot and "/" not in name[len(head) :] else name

@@ -1,7 +1,7 @@
-"""The files of a COLMAP reconstruction: `cameras`, `images` and `points3D`, binary or text.
+"""Files of a COLMAP reconstruction: `cameras`, `images` and `points3D`, binary or text.
 
-Poses are world to camera with OpenCV axes, quaternions wxyz, pixel centres at +0.5, which is what this package uses.
-Binary files are little endian; see "Output Format" in COLMAP's documentation.
+Poses are world to camera with OpenCV axes, quaternions wxyz, pixel centres at +0.5, as in this package. Binary files
+are little endian; see "Output Format" in COLMAP's documentation.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MODELS = {
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 _REMEDY = "run 'colmap image_undistorter' and use the folder that it writes"
-LONGEST_NAME = 255  # bytes of a file or folder name; the limit of common file systems
+LONGEST_NAME = 255  # bytes in a file or folder name; the limit of common file systems
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Registered:
-    """An image that COLMAP placed.
+    """An image registered by COLMAP.
 
     Attributes:
         name: Path in the folder of images, "/" between folders.
@@ -64,12 +64,12 @@ class Registered:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What the files hold.
+    """Content of a reconstruction.
 
     Attributes:
-        images: By name.
-        points: World. [P, 3] float64, or None without the file.
-        colors: sRGB in [0, 1]. [P, 3] float32, or None without the file.
+        images: Registered images, sorted by name.
+        points: Points, world. [P, 3] float64, or None without the file.
+        colors: Colours of the points, sRGB in [0, 1]. [P, 3] float32, or None without the file.
         files: The files that were read.
     """
 
@@ -80,7 +80,7 @@ class Reconstruction:
 
 
 def read(folder: Path) -> Reconstruction:
-    """Read a reconstruction, each file binary where there is a binary one.
+    """Read a reconstruction, preferring binary files to text files.
 
     Raises:
         DatasetError: A file is missing or damaged, or a lens is distorted.
@@ -137,7 +137,7 @@ def _lens(place: str, model: str, width: int, height: int, numbers: list[float])
 
 
 class _Bytes:
-    """A file's bytes, read on."""
+    """Sequential reader of a binary file."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.at = path, 0
@@ -147,7 +147,7 @@ class _Bytes:
             raise errors.DatasetError(f"{path}: cannot be read ({error})") from error
 
     def take(self, layout: str) -> tuple:
-        """The next numbers of a layout of `struct`, little endian."""
+        """Read the numbers of a layout of `struct`, little endian."""
         end = self.at + struct.calcsize("<" + layout)
         if end > len(self.data):
             raise self.short()
@@ -156,7 +156,7 @@ class _Bytes:
         return values
 
     def word(self) -> str:
-        """Text up to the next zero byte."""
+        """Read text up to the next zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.short()
@@ -164,13 +164,13 @@ class _Bytes:
         return text.decode("utf-8", "replace")
 
     def skip(self, count: int) -> None:
-        """Pass over bytes."""
+        """Skip bytes."""
         self.at += count
         if self.at > len(self.data):
             raise self.short()
 
     def short(self) -> errors.DatasetError:
-        """The error of a file that ends too soon."""
+        """Return the error for a truncated file."""
         return errors.DatasetError(f"{self.path}: the file ends at byte {len(self.data)}; is it truncated?")
 
 
@@ -202,7 +202,7 @@ def _binary_points(path: Path) -> Iterator[tuple]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Number and text of the lines that are no comments; empty ones too."""
+    """Yield number and text of the lines that are not comments, including empty ones."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -227,7 +227,7 @@ def _text_lenses(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, int, tuple, tuple]]:
-    points_follow = False  # lines come in pairs, of which the second one, of 2D points, may be empty
+    points_follow = False  # lines come in pairs; the second, with 2D points, may be empty
     for number, line in _lines(path):
         if points_follow:
             points_follow = False

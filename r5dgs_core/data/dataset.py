@@ -1,8 +1,8 @@
-"""A data set on disk: views with camera, time and mask, object names, and poses where they are known.
+"""Data sets on disk: views with camera, time and mask, object names, and true poses if known.
 
 Layout: ``transforms_{train,val,test}.json`` (`transforms`), images beside them, ``object_mask/<view name>.png``
-(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time). Without
-camera files, images with a COLMAP reconstruction are read the same (`colmap`).
+(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time). Images with
+a COLMAP reconstruction instead of camera files give the same result (`colmap`).
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class View:
         t: Scene time.
         split: "train", "val" or "test".
         image_path: The image file.
-        mask_path: The object id image, None where there is none.
-        mask_colors: Object id of each packed colour where masks are coded by colour.
-        mask_unknown: Value in the mask's file that says nothing of a pixel.
-        mask_video: Video within which the mask's ids hold, "" where they are those of the scene.
+        mask_path: The object id image, or None.
+        mask_colors: Object id of each packed colour, if masks are coded by colour.
+        mask_unknown: Value of unknown pixels in the mask file.
+        mask_video: Video within which the mask's ids are valid; "" if they are valid in the whole scene.
     """
 
     name: str
@@ -57,27 +57,27 @@ class View:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What `read` found.
+    """Result of `read`.
 
     Attributes:
         root: Folder of the data set.
         name: Name of that folder.
-        train: Views to learn from.
+        train: Training views.
         val: Held-out views within the observed time.
         test: Views of later times.
-        object_names: Name of each object id that has one.
-        object_aliases: Other words for it.
-        ground_truth: True poses, where the data set has them.
+        object_names: Names by object id.
+        object_aliases: Aliases by object id.
+        ground_truth: True poses, or None.
         world_convention: Key of ``cameras.WORLD_TO_BLENDER``.
         frames_per_unit: Blender frames per unit of scene time.
-        has_alpha: Whether images have pixels that are not opaque (looked for in three training images).
+        has_alpha: True if images have transparent pixels (checked for three training images).
         digest: Hash of the camera files and of names, sizes and ends of the images, for provenance.
-        points: Points of the world that a reconstruction (COLMAP) gives. [P, 3] float64 or None
+        points: Points of a COLMAP reconstruction, world. [P, 3] float64 or None
         point_colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
-        mask_folder: Folder of the training views' masks; None where they are passed over.
-        own_ids: Whether the ids in it are its own, not those of the data set.
-        origin: Point of the world of the files from which all positions here are measured; zero unless the cameras
-            stand so far from the world's that float32 would lose detail (`origin`). [3] float64
+        mask_folder: Folder of the training views' masks; None if masks are ignored.
+        own_ids: True if the folder defines its own ids, different from the data set's.
+        origin: Point of the files' world that all positions are relative to; zero unless the cameras are so far from
+            the files' origin that float32 would lose detail (`origin`). [3] float64
     """
 
     root: Path
@@ -99,14 +99,14 @@ class Dataset:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def views(self, split: str) -> tuple[View, ...]:
-        """The views of "train", "val" or "test"."""
+        """Return the views of "train", "val" or "test"."""
         if split not in SPLITS:
             raise ValueError(f"split must be one of {SPLITS}, got {split!r}")
         return getattr(self, split)
 
     @property
     def cameras(self) -> tuple[cameras.Camera, ...]:
-        """The distinct cameras of all splits, by first appearance."""
+        """Distinct cameras of all splits, by first appearance."""
         found: dict[str, cameras.Camera] = {}
         for split in SPLITS:
             for view in self.views(split):
@@ -124,7 +124,7 @@ class Dataset:
         return float(self.times[-1])
 
     def relative_to(self, origin: np.ndarray) -> Dataset:
-        """The same data set with positions measured from another point of the world of the files. [3]"""
+        """Return the data set with positions relative to another point of the files' world [3]."""
         shift = self.origin - origin
         if not shift.any():
             return self
@@ -141,10 +141,10 @@ class Dataset:
         )
 
     def require_one_numbering(self) -> None:
-        """Refuse masks of the training views that cannot be trained with.
+        """Check that the ids of the training masks are consistent.
 
         Raises:
-            DatasetError: Ids hold within a video only, and there are several.
+            DatasetError: Ids are valid per video only, and there are several videos.
         """
         videos = sorted({view.mask_video for view in self.train if view.mask_path is not None})
         if len(videos) > 1:
@@ -162,21 +162,21 @@ def read(
     min_registered: float = colmap.MIN_REGISTERED,
     guard: findings.Guard = findings.STRICT,
 ) -> Dataset:
-    """Read and check a data set; images and masks are looked at, not loaded.
+    """Read and check a data set; images and masks are inspected but not loaded.
 
     Args:
         root: Folder with ``transforms_train.json``, or with images and a COLMAP reconstruction (`colmap`).
-        train_masks: Folder of the training views' masks, within ``root`` or anywhere; ``none`` passes all of them over.
-            The other splits keep those of the data set: they are what a run is measured by. An ``objects.json`` in
-            the folder says that its ids are its own; true poses, which go by the data set's, are then left out.
+        train_masks: Folder of the training views' masks, relative to ``root`` or absolute; ``none`` ignores masks.
+            The other splits keep the data set's masks, as they serve evaluation. An ``objects.json`` in the folder
+            marks its ids as its own; the true poses, which use the data set's ids, are then ignored.
         min_registered: Smallest share of the images in ``images`` that a COLMAP reconstruction must have registered.
-        guard: Entered around each frame, image and file, for callers that read on after a fault (`findings`).
+        guard: Entered around each frame, image and file, for callers that continue after an error (`findings`).
 
     Returns:
         The data set. A split without camera file is empty.
 
     Raises:
-        DatasetError: A file is missing or cannot be used; the message names it and says what to do.
+        DatasetError: A file is missing or invalid; the message names it and the remedy.
     """
     root = Path(root)
     with findings.coded("D01"):
@@ -250,7 +250,7 @@ def read(
             )
     ground_truth = None
     with guard(), findings.coded("D21"):
-        if not own_ids:  # poses go by the ids of the data set's own masks
+        if not own_ids:  # poses use the ids of the data set's own masks
             ground_truth = read_ground_truth(root)
     if ground_truth is not None:
         ground_truth = ground_truth.moved(-origin)
@@ -281,7 +281,7 @@ def read(
 
 
 def load_rgba(view: View) -> np.ndarray:
-    """Load the image of a view, straight alpha, 1 where the file has none. [H, W, 4] float32"""
+    """Load the image of a view, straight alpha, 1 if the file has none. [H, W, 4] float32"""
     pixels = images.to_rgba(images.read(view.image_path))
     if pixels.shape[:2] != (view.camera.height, view.camera.width):
         raise errors.DatasetError(
@@ -292,15 +292,15 @@ def load_rgba(view: View) -> np.ndarray:
 
 
 def load_image(view: View, background: np.ndarray | None = None) -> np.ndarray:
-    """Load the image of a view composited on a background colour (sRGB [3], white where None). [H, W, 3] float32"""
+    """Load the image of a view composited on a colour (sRGB [3], white if None). [H, W, 3] float32"""
     return images.composite(load_rgba(view), background)
 
 
 def load_mask(view: View) -> np.ndarray | None:
-    """Load the object ids of a view, in the size of its image; None where it has no mask.
+    """Load the object ids of a view, at the size of its image; returns None without a mask.
 
     Returns:
-        Object ids, 0 = background, `masks.UNKNOWN` where the mask says nothing. [H, W] int32
+        Object ids, 0 = background, `masks.UNKNOWN` for unknown pixels. [H, W] int32
     """
     if view.mask_path is None:
         return None
@@ -309,13 +309,13 @@ def load_mask(view: View) -> np.ndarray | None:
 
 
 class _CameraNames:
-    """Gives views of equal camera one name: the file's, or cam0, cam1, ...; a camera that moves gets @1, @2, ...
+    """Names for distinct cameras: that of the file, or cam0, cam1, ...; poses of a moving camera get @1, @2, ...
 
-    Cameras are equal where they agree to a millionth: of the image's size, of a radian, and of the distance between
-    cameras, so that neither the unit of the world nor its origin matters.
+    Cameras are equal if they agree to 1e-6 of the image width, of a radian, and of the distance between cameras, so
+    neither the unit nor the origin of the world matters.
 
     Args:
-        entries: All views of the data set; a made name is none of those that they give.
+        entries: All views of the data set; generated names differ from theirs.
         rounding: Error of the cameras' positions, world units.
     """
 
@@ -331,7 +331,7 @@ class _CameraNames:
     def name(self, given: str, camera: cameras.Camera) -> str:
         lens, turn = camera.intrinsics.ravel() / camera.width, camera.T_cam_world[:3, :3].ravel()
         numbers = np.round(np.concatenate([lens / 1e-6, turn / 1e-6, camera.center / self.step]))
-        key = (given, camera.width, camera.height, (numbers + 0.0).tobytes())  # one zero: -0.0 has other bytes
+        key = (given, camera.width, camera.height, (numbers + 0.0).tobytes())  # turns -0.0 into 0.0
         if key not in self.by_key:
             count = self.uses.get(given, 0)
             name = given
@@ -347,11 +347,11 @@ class _CameraNames:
 
 
 def _mask_folder(root: Path, name: str) -> Path | None:
-    """Where the training views' masks are; None for none of them. The data set's own folder has one name, however it
-    is called: masks that are coded by colour are numbered together there."""
+    """Folder of the training views' masks, or None. The data set's own folder is always returned under the same path,
+    because its colour-coded masks are numbered together with those of the other splits."""
     if name == NO_MASKS:
         return None
-    folder = root / name  # an absolute path stays one
+    folder = root / name  # an absolute path replaces the root
     if folder.resolve() == (root / MASKS).resolve():
         return root / MASKS
     if name != MASKS and not folder.is_dir():
@@ -407,7 +407,7 @@ def _find_image(root: Path, entry: transforms.Entry) -> Path:
 
 
 def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
-    """Number the colours once over all these splits, if masks are coded by colour."""
+    """Number the colours of all masks of the splits together, if masks are coded by colour."""
     paths = [view.mask_path for some in views.values() for view in some if view.mask_path is not None]
     colors = masks.color_table(paths)
     if not colors:
@@ -417,7 +417,7 @@ def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[V
 
 
 def _attach_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hasher: Any) -> dict[str, tuple[View, ...]]:
-    """The views with what the folder of their masks says of these (`mask_notes`)."""
+    """Apply the mask folder's ``masks.json`` to the views (`mask_notes`)."""
     if folder is None or not (folder / mask_notes.FILE).exists():
         return views
     notes = mask_notes.read(folder)
@@ -431,12 +431,12 @@ def _attach_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hashe
             return view
         return replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone))
 
-    hasher.update(f"{notes.numbering} {notes.unknown}".encode() * len(views))  # for each split
+    hasher.update(f"{notes.numbering} {notes.unknown}".encode() * len(views))  # once per split
     return {split: tuple(map(told, some)) for split, some in views.items()}
 
 
 def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:
-    """Blender frames per unit of time: as the file says, from frame numbers, from duration and rate, or 60."""
+    """Blender frames per unit of time: from the file, from frame numbers, from duration and rate, or 60."""
     hints = {}
     for key in ("frames_per_unit", "fps", "duration"):
         if header.get(key) is not None:

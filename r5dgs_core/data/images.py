@@ -1,7 +1,7 @@
-"""Reading and writing image files through OpenImageIO.
+"""Reading and writing of images with OpenImageIO.
 
-In memory a colour is display-referred sRGB, float32 in [0, 1], alpha is straight. Files of floats (EXR) are linear by
-convention and go through the sRGB curve on reading.
+In memory, colours are display-referred sRGB, float32 in [0, 1], with straight alpha. Float files (EXR) are linear by
+convention and are converted to sRGB on reading.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from .. import atomic_files, errors
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".webp", ".tif", ".tiff")
 COMPRESSION_LEVEL = 6
-# What an image may declare before it is decoded; a PNG of one colour has about 1000 pixels per byte.
+# Limits for sizes declared in headers, checked before decoding; a PNG of one colour has about 1000 pixels per byte.
 _MOST_PIXELS, _MOST_CHANNELS = 1 << 28, 64
 _PIXELS, _PIXELS_PER_BYTE = 1 << 24, 4096
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
@@ -23,7 +23,7 @@ UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef"
 
 
 def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
-    """Return the error for a file that is there but of a kind that is not read.
+    """Return the error for an existing file of an unsupported kind.
 
     Args:
         path: The file.
@@ -38,7 +38,7 @@ def unreadable_kind(path: Path, place: str = "") -> errors.DatasetError:
 
 
 def size(path: Path) -> tuple[int, int, int]:
-    """Width, height and number of channels of an image file, from its header alone."""
+    """Read width, height and number of channels of an image file from its header."""
     source = _open(path)
     spec = source.spec()
     width, height, channels = spec.width, spec.height, spec.nchannels
@@ -50,7 +50,7 @@ def read(path: Path) -> np.ndarray:
     """Read an image as display-referred colour.
 
     Args:
-        path: An 8- or 16-bit file (taken as sRGB) or a float file (taken as linear and brought to sRGB).
+        path: An 8- or 16-bit file, interpreted as sRGB, or a float file, converted from linear to sRGB.
 
     Returns:
         Straight-alpha pixels, float32, 8-bit value v as v / 255. Channels as in the file. [H, W, C]
@@ -72,7 +72,7 @@ def read(path: Path) -> np.ndarray:
 
 
 def read_raw(path: Path) -> np.ndarray:
-    """Read the stored numbers: uint8, uint16 or float32, alpha not multiplied in. [H, W, C]"""
+    """Read the stored numbers: uint8, uint16 or float32, not premultiplied by alpha. [H, W, C]"""
     source = _open(path)
     spec = source.spec()
     name = str(spec.format)
@@ -80,7 +80,7 @@ def read_raw(path: Path) -> np.ndarray:
     pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
     try:
         problem = " ".join(source.geterror().split())
-    except UnicodeError:  # the library's message quotes bytes of the file
+    except UnicodeError:  # the library's message contains raw bytes of the file
         problem = "damaged"
     source.close()
     if pixels is None or problem:
@@ -99,12 +99,12 @@ def read_png(path: Path) -> np.ndarray:
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write a PNG by a temporary name and a rename, so that the file is whole or absent.
+    """Write a PNG atomically.
 
     Args:
-        path: File to write; its folder is made where missing.
-        pixels: uint8 or uint16 as they are; floats are sRGB in [0, 1] and become 8 bit, rounded. Gray, gray with
-            alpha, RGB or RGBA, straight alpha. [H, W] or [H, W, C]
+        path: File to write; its folder is created if missing.
+        pixels: uint8 or uint16, written unchanged; floats are sRGB in [0, 1] and are rounded to 8 bits. Gray, gray
+            with alpha, RGB or RGBA, straight alpha. [H, W] or [H, W, C]
     """
     pixels = np.asarray(pixels)
     if pixels.ndim == 2:
@@ -131,7 +131,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
             if target is None:
                 raise errors.DatasetError(f"{path}: cannot write the image ({oiio.geterror().strip()})")
             good = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
-            problem = target.geterror()  # a full disk is told here alone
+            problem = target.geterror()  # a full disk is reported only here
             if not good or problem or not target.close():
                 problem = " ".join(problem.split()) or "no reason given"
                 raise errors.DatasetError(f"{path}: cannot write the image ({problem}); is there room?")
@@ -140,18 +140,18 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def to_uint8(pixels: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] to 8 bits: clipped, rounded to the nearest."""
+    """Convert colours in [0, 1] to 8 bits, clipped and rounded to nearest."""
     return np.rint(np.clip(np.nan_to_num(pixels), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer curve (IEC 61966-2-1), negative values clipped to 0."""
+    """Apply the sRGB transfer curve (IEC 61966-2-1); negative values are clipped to 0."""
     linear = np.maximum(linear, 0.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1.0 / 2.4) - 0.055)
 
 
 def to_rgba(pixels: np.ndarray) -> np.ndarray:
-    """Gray, gray with alpha, RGB or RGBA to RGBA, float32. [H, W, C] -> [H, W, 4]"""
+    """Convert gray, gray with alpha, RGB or RGBA to RGBA, float32. [H, W, C] -> [H, W, 4]"""
     channels = pixels.shape[2]
     alpha = pixels[..., -1:] if channels in (2, 4) else np.ones_like(pixels[..., :1])
     color = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
@@ -159,11 +159,11 @@ def to_rgba(pixels: np.ndarray) -> np.ndarray:
 
 
 def composite(rgba: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
-    """Put straight-alpha colours on a background.
+    """Composite straight-alpha colours on a background.
 
     Args:
         rgba: Pixels. [H, W, 4]
-        background: Colour behind them, sRGB; white where None. [3]
+        background: Background colour, sRGB; white if None. [3]
 
     Returns:
         Pixels, float32. [H, W, 3]
@@ -178,11 +178,11 @@ def _open(path: Path):
     if not path.is_file():
         raise errors.DatasetError(f"{path}: the image is missing", code="D10")
     hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)  # else the reader multiplies the colours by alpha
+    hints.attribute("oiio:UnassociatedAlpha", 1)  # otherwise the reader premultiplies colours by alpha
     try:
         source = oiio.ImageInput.open(str(path), hints)
         reason = "" if source is not None else oiio.geterror().strip() or "unknown format"
-    except UnicodeError:  # the library's message quotes bytes of the file
+    except UnicodeError:  # the library's message contains raw bytes of the file
         source, reason = None, "damaged"
     if source is None:
         raise errors.DatasetError(
@@ -198,7 +198,7 @@ def _open(path: Path):
 
 
 def check_size(path: Path, width: int, height: int, channels: int) -> None:
-    """Raise `DatasetError` if an image has no pixels, or more than a file of its size can hold."""
+    """Raise `DatasetError` if an image declares no pixels, or more than a file of its size can hold."""
     size = Path(path).stat().st_size
     most = min(_MOST_PIXELS, _PIXELS + _PIXELS_PER_BYTE * size)
     if min(width, height, channels) < 1 or width * height > most or channels > _MOST_CHANNELS:

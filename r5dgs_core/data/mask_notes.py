@@ -1,9 +1,9 @@
-"""What a folder of masks says of itself: ``masks.json`` beside the masks, which a folder may also lack.
+"""Description of a mask folder, the optional ``masks.json`` beside the masks.
 
     {"format_version": 1, "backend": "sam2", "numbering": "video", "unknown": 65535, "finished": true,
      "videos": {"cam0": {"images": ["train/r_0000", ...], "ids": [1, 2, 5]}, ...}, "made_with": {...}}
 
-Without the file ids are those of the scene, and 65535 is unknown.
+Without the file, ids are valid in the whole scene and 65535 is unknown.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ UNKNOWN_VALUES = (255, masks.UNKNOWN)
 
 @dataclass(frozen=True)
 class Video:
-    """Masks of one video, images of which share a numbering.
+    """Masks of one video, which share a numbering.
 
     Attributes:
-        images: Names of its views, in the order of time.
+        images: Names of its views, in temporal order.
         ids: Ids that occur in it, without 0 and unknown.
     """
 
@@ -39,15 +39,15 @@ class Video:
 
 @dataclass(frozen=True)
 class MaskNotes:
-    """What ``masks.json`` says.
+    """Content of ``masks.json``.
 
     Attributes:
-        backend: What made the masks, "" where nobody says.
-        numbering: "scene": an id is one object in all masks; "video": it is one within a video.
-        unknown: Value in the files of pixels of which nothing is known: 65535, or 255 in masks of 8 bits.
-        finished: Whether all masks that were asked for are there.
+        backend: Tool that made the masks, "" if unknown.
+        numbering: "scene" if an id is one object in all masks, "video" if it is one within a video.
+        unknown: Value of unknown pixels in the files: 65535, or 255 in masks of 8 bits.
+        finished: True if all requested masks exist.
         videos: The videos by name.
-        made_with: Settings of the backend; masks that others made are not gone on with.
+        made_with: Settings of the backend; a run with other settings does not resume.
     """
 
     backend: str = ""
@@ -58,17 +58,17 @@ class MaskNotes:
     made_with: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def video_of(self) -> dict[str, str]:
-        """Name of the video of each view, where ids hold within a video; empty where they hold everywhere."""
+        """Video of each view, if ids are valid per video; otherwise empty."""
         if self.numbering == SCENE:
             return {}
         return {image: name for name, video in self.videos.items() for image in video.images}
 
 
 def read(folder: Path) -> MaskNotes:
-    """Read ``masks.json`` of a folder of masks; what holds without it where there is none.
+    """Read ``masks.json`` of a mask folder; returns the defaults if it is missing.
 
     Raises:
-        DatasetError: It is damaged or of another version.
+        DatasetError: The file is damaged or of another version.
     """
     path = Path(folder) / FILE
     if not path.exists():
@@ -104,10 +104,10 @@ def read(folder: Path) -> MaskNotes:
 
 
 def write(notes: MaskNotes, folder: Path) -> Path:
-    """Write ``masks.json`` into a folder of masks, whole or not at all; returns its path.
+    """Write ``masks.json`` into a mask folder atomically; returns its path.
 
     Raises:
-        DatasetError: It cannot be written.
+        DatasetError: The file cannot be written.
     """
     path = Path(folder) / FILE
     content = {"format_version": FORMAT_VERSION, **dataclasses.asdict(notes)}

@@ -1,7 +1,6 @@
 """Object id images: 8 or 16 bit, palette, or one colour per object.
 
-Id 0 is the background, 1 to `MAX_ID` are objects, and `UNKNOWN` says nothing of a pixel: no loss and no count looks
-at it.
+Id 0 is the background, 1 to `MAX_ID` are objects. Pixels with `UNKNOWN` are ignored by losses and metrics.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from .. import errors, findings
 from . import images
 
 UNKNOWN = 65535
-MAX_ID = UNKNOWN - 1  # what 16 bits hold beside it
+MAX_ID = UNKNOWN - 1  # largest id in 16 bits
 MAX_COLORS = 4096
-MAX_BLENDED = 16  # colours in single pixels that objects far away may have
-_GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # colour types of PNG
+MAX_BLENDED = 16  # accepted number of colours that fill no 2 x 2 pixels, as of distant objects
+_GRAY, _PALETTE, _GRAY_ALPHA = 0, 3, 4  # PNG colour types
 _ONE_CHANNEL = (_GRAY, _PALETTE, _GRAY_ALPHA)
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -28,17 +27,17 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 def read(path: Path, colors: Mapping[int, int] | None = None, unknown: int = UNKNOWN) -> np.ndarray:
     """Read an object id image.
 
-    Without ``colors`` the image holds ids: one channel as they are, a palette image as palette indices, three equal
-    channels as one. With ``colors`` it holds one colour per object, in whatever form the file keeps them (gray and
-    palette files too, as image tools write them where they lose nothing). Pixels with alpha 0 are background.
+    Without ``colors`` the image holds ids: one channel, palette indices, or three equal channels. With ``colors`` it
+    holds one colour per object, in any PNG form (also gray and palette, which image tools choose if lossless). Pixels
+    with alpha 0 are background.
 
     Args:
         path: A PNG file.
-        colors: Object id of each packed colour (R << 16 | G << 8 | B); what `color_table` found in all masks.
-        unknown: Value of the file that says nothing of a pixel; with ``colors`` there is none.
+        colors: Object id of each packed colour (R << 16 | G << 8 | B), from `color_table` of all masks.
+        unknown: Value of unknown pixels in the file; ignored with ``colors``.
 
     Returns:
-        Object ids, 0 = background, `UNKNOWN` where nothing is known. [H, W] int32
+        Object ids, 0 = background, `UNKNOWN` for unknown pixels. [H, W] int32
     """
     path = Path(path)
     if colors:
@@ -49,14 +48,14 @@ def read(path: Path, colors: Mapping[int, int] | None = None, unknown: int = UNK
 
 
 def write(path: Path, ids: np.ndarray) -> None:
-    """Write an object id image, of 8 bits where that is enough, else 16; whole or not at all.
+    """Write an object id image atomically, with 8 bits if sufficient, else 16.
 
     Args:
-        path: A PNG file; its folder is made where missing.
+        path: A PNG file; its folder is created if missing.
         ids: Object ids, 0 to `MAX_ID`, and `UNKNOWN`. [H, W] integers
 
     Raises:
-        DatasetError: There is an id that 16 bits cannot hold, or the file cannot be written.
+        DatasetError: An id exceeds 16 bits, or the file cannot be written.
     """
     low, high = int(ids.min(initial=0)), int(ids.max(initial=0))
     if low < 0 or high > UNKNOWN:
@@ -85,20 +84,20 @@ def _read_gray(path: Path) -> np.ndarray:
 
 
 def color_table(paths: Iterable[Path]) -> dict[int, int]:
-    """Decide for all masks of a data set at once whether they are coded by colour, and number the colours.
+    """Detect if the masks of a data set are coded by colour, and number the colours.
 
-    They are as soon as one of them shows a colour that is not gray; then black is 0 and the others, grays and white
-    among them, are 1, 2, ... by packed value. Otherwise all of them hold ids.
+    They are if one of them contains a colour that is not gray. Black is then 0, and all others, including grays and
+    white, are 1, 2, ... by packed value.
 
     Returns:
-        Object id of each packed colour; empty where no mask of ``paths`` is coded by colour.
+        Object id of each packed colour; empty if no mask is coded by colour.
 
     Raises:
-        DatasetError: What colours mean is open: they are blended ones, or masks of one channel and of colours are mixed
-            and do not share their colours.
+        DatasetError: The coding is ambiguous: colours are blended, or masks of one channel and of colours are mixed and
+            do not share their colours.
     """
     found: set[int] = set()
-    flat: set[int] = set()  # colours that fill a square of four pixels somewhere
+    flat: set[int] = set()  # colours that fill 2 x 2 pixels somewhere
     gray, colored = [], Path()
     for path in map(Path, paths):
         header = _png_header(path)
@@ -140,13 +139,13 @@ def _collect(path: Path, pixels: np.ndarray, found: set[int], flat: set[int]) ->
 
 
 def resize(ids: np.ndarray, width: int, height: int, where: str) -> np.ndarray:
-    """Bring an id image to another size of the same shape by its nearest pixels.
+    """Resize an id image to another size of the same aspect ratio, by nearest pixels.
 
     Args:
         ids: Object ids. [h, w]
-        width: Wanted width in pixels.
-        height: Wanted height in pixels.
-        where: Name for the error.
+        width: New width in pixels.
+        height: New height in pixels.
+        where: Name of the mask, for errors.
 
     Returns:
         Object ids. [height, width]
@@ -154,7 +153,7 @@ def resize(ids: np.ndarray, width: int, height: int, where: str) -> np.ndarray:
     h, w = ids.shape
     if (h, w) == (height, width):
         return ids
-    if abs(w * height - h * width) > max(w, width):  # more than a pixel off the same aspect ratio
+    if abs(w * height - h * width) > max(w, width):  # aspect ratio differs by more than a pixel
         raise errors.DatasetError(
             f"{where}: the mask is {w}x{h}, its image {width}x{height}: not the same shape; "
             "write masks in the size of the images",
@@ -170,7 +169,7 @@ def _is_gray(pixels: np.ndarray) -> bool:
 
 
 def _pack(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """Colours R << 16 | G << 8 | B; gray is a colour of three equal channels, transparent pixels are black. [H, W]"""
+    """Pack colours as R << 16 | G << 8 | B; gray has three equal channels, transparent pixels are black. [H, W]"""
     if pixels.dtype != np.uint8:
         raise errors.DatasetError(
             f"{path}: expected 8 bits per channel, as masks of this data set are coded by colour, found {pixels.dtype}",
@@ -199,13 +198,13 @@ def _colors_to_ids(path: Path, pixels: np.ndarray, colors: Mapping[int, int]) ->
 
 
 def _holds_indices(path: Path) -> bool:
-    """Whether image libraries would expand the stored numbers: a palette, or gray of fewer than 8 bits."""
+    """Return True if image libraries would expand the stored numbers: palettes, or gray below 8 bits."""
     header = _png_header(path)
     return header is not None and (header[3] == _PALETTE or (header[3] == _GRAY and header[2] < 8))
 
 
 def _png_header(path: Path) -> tuple[int, int, int, int, int] | None:
-    """Width, height, bit depth, colour type, interlace of a PNG; None for another format."""
+    """Read width, height, bit depth, colour type and interlace of a PNG; returns None for other formats."""
     try:
         with path.open("rb") as file:
             head = file.read(33)

@@ -1,7 +1,7 @@
-"""The origin of a data set: the point of its world from which everything is measured after reading.
+"""Origin of a data set: the point of its world that all positions are relative to after reading.
 
-float32 has 24 bits: at a distance of 5e6 it resolves half a unit. If cameras stand that far from the world's origin,
-compared with their distance from each other, positions are taken relative to a point among them, in float64.
+float32 has 24 bits: at a distance of 5e6 it resolves half a unit. If the cameras are that far from the files' origin,
+compared with their spread, positions are taken relative to a point among them, in float64.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from .. import errors
 from ..scene import cameras
 
-FAR = 256.0  # distance from the world's origin, in spreads of the cameras, up to which that is the origin
-SMALLEST, LARGEST = 1e-25, 1e13  # units between cameras; scenes hold coordinates up to `cameras.FARTHEST`
-RESOLUTION = 1e-6  # of the spread; float64 has to resolve that where the cameras are
-LONE = 4.0  # spread of cameras that all stand at one place, as `train.normalization` takes it
+FAR = 256.0  # largest distance of the cameras from the files' origin, in spreads, that needs no new origin
+SMALLEST, LARGEST = 1e-25, 1e13  # accepted units between cameras; scenes hold coordinates up to `cameras.FARTHEST`
+RESOLUTION = 1e-6  # required float64 resolution at the cameras, as a share of the spread
+LONE = 4.0  # assumed spread if all cameras coincide, as in `train.normalization`
 
 
 def find(
@@ -26,14 +26,14 @@ def find(
     """Find the point that positions are taken relative to.
 
     Args:
-        centers: Positions of the cameras in the world of the files, float64.
-        place: Names the data set in errors.
+        centers: Positions of the cameras in the files' world, float64.
+        place: Name of the data set, for errors.
 
     Returns:
-        The origin: zero for cameras near the world's, else a point among them with few decimal digits. float64
+        The origin: zero for cameras near the files' origin, else a point among them with few decimal digits. float64
 
     Raises:
-        DatasetError: The cameras are so far away that float64 cannot tell where they stand.
+        DatasetError: The cameras are so far away that float64 cannot resolve their positions.
     """
     largest = float(np.abs(centers).max())
     if largest > cameras.FARTHEST:
@@ -60,4 +60,4 @@ def find(
             "files where they are made, before they are rounded"
         )
     digits = -math.floor(math.log10(spread))
-    return np.array([round(float(value), digits) for value in middle]) + 0.0  # one zero: -0.0 has other bytes
+    return np.array([round(float(value), digits) for value in middle]) + 0.0  # turns -0.0 into 0.0

@@ -1,8 +1,8 @@
-"""The camera files `transforms_{train,val,test}.json`, in D-NeRF's flat layout and NVFi's nested one.
+"""Camera files `transforms_{train,val,test}.json`, in D-NeRF's flat layout and NVFi's nested one.
 
 Flat: ``camera_angle_x`` and ``frames`` of ``file_path``, ``time``, ``transform_matrix``. Nested: ``data`` maps a camera
 to one ``transform_matrix`` and its ``frames`` of ``file_path`` and ``time``. Matrices are camera to world with OpenGL
-axes (y up, looking along -z). Where no time is given a frame has index / (n - 1).
+axes (y up, -z forward). Frames without times are spread evenly: index / (n - 1).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Entry:
         file_path: Path of the image relative to the data set, "/" between folders, as written.
         t: Scene time.
         matrix: Camera to world, OpenGL axes. [4, 4]
-        camera: Name of the camera, "" where the file gives none.
-        lens: The keys about intrinsics that hold for this frame.
-        frame: Frame number where the file gives one.
+        camera: Name of the camera, "" if the file gives none.
+        lens: Keys about intrinsics that apply to this frame.
+        frame: Frame number, or None.
     """
 
     place: str
@@ -43,7 +43,7 @@ class Entry:
     frame: float | None
 
     def moved(self, shift: np.ndarray) -> Entry:
-        """The frame with its camera moved by a vector. [3]"""
+        """Translate the frame's camera by a vector [3]."""
         matrix = self.matrix.copy()
         matrix[:3, 3] += shift
         return replace(self, matrix=matrix)
@@ -81,10 +81,10 @@ def read(path: Path, guard: findings.Guard = findings.STRICT) -> tuple[list[Entr
 
 
 def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
-    """Camera matrix of a frame for the size that its image has.
+    """Return the camera matrix of a frame for the actual size of its image.
 
-    Honours ``fl_x fl_y cx cy`` (pixels of an image of ``w`` x ``h``, where given), else ``camera_angle_x`` and
-    ``camera_angle_y`` (radians); square pixels and a centred principal point where the file is silent.
+    Uses ``fl_x fl_y cx cy`` (pixels of an image of ``w`` x ``h``, if given), else ``camera_angle_x`` and
+    ``camera_angle_y`` (radians). Defaults are square pixels and a centred principal point.
 
     Args:
         entry: The frame.
@@ -131,7 +131,7 @@ def intrinsics(entry: Entry, width: int, height: int) -> np.ndarray:
 
 
 def view_name(file_path: str) -> str:
-    """Name of a view from its path: without "./", drive, "..", and image suffix."""
+    """Derive the name of a view from its path: without "./", drive, "..", and image suffix."""
     parts = [part for part in PurePosixPath(file_path.replace("\\", "/")).parts if part not in (".", "..", "/")]
     name = "/".join(parts)
     head, _, suffix = name.rpartition(".")
@@ -218,7 +218,7 @@ def _lens_keys(source: dict) -> dict[str, Any]:
 
 
 def finite(place: str, key: str, value: Any) -> float:
-    """The value of a key as a float; DatasetError naming place and key where it is none or not finite."""
+    """Return the value of a key as a float; DatasetError naming place and key if it is not a finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise errors.DatasetError(f"{place}: '{key}' must be a finite number, found {value!r}", code="D03")
     return float(value)
