@@ -1,7 +1,7 @@
 """`r5dgs check`: all faults of a data set, scene file, run folder, PLY file or configuration.
 
-The rules are those of the readers, which here go on after a fault (`findings.Collector`), and warnings about what is
-read but probably not meant.
+The rules are those of the readers, which continue after a fault here (`findings.Collector`). Warnings cover valid input
+that is probably a mistake.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def check(path: Path) -> list[Finding]:
         path: A data set, run folder, scene file, PLY file or TOML configuration.
 
     Raises:
-        ConfigError: There is nothing at the path, or nothing that can be checked.
+        ConfigError: The path does not exist, or its kind cannot be checked.
     """
     path = Path(path)
     try:

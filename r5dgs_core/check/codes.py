@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..findings import ERROR, WARNING, Code
 
-# D: data sets. S: scene files. R: run folders. P: PLY files. C: configurations. Numbers are never used again.
+# D: data sets. S: scene files. R: run folders. P: PLY files. C: configurations. Never reuse a number.
 CODES: dict[str, Code] = {
     "D00": Code(ERROR, "another fault of a data set", "follow the message"),
     "D01": Code(ERROR, "no data set in a known layout", "choose the folder with transforms_train.json or sparse"),

@@ -1,4 +1,4 @@
-"""Faults of a data set: those of the reader, damaged images and masks, and what looks like a mistake."""
+"""Faults of a data set: errors of the reader, damaged images and masks, and likely mistakes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from .codes import CODES
 
 FEWEST_CAMERAS, FEWEST_IMAGES = 3, 3
 LEAST_SPACE = 1 << 30  # bytes
-_PARALLEL = 1e-6  # of the axes of all cameras: they meet nowhere
-_LISTED = 5  # names in one finding
+_PARALLEL = 1e-6  # smallest eigenvalue per camera below which all optical axes are parallel
+_LISTED = 5  # names per finding
 
 
 def check(root: Path, train_masks: str = dataset.MASKS, min_registered: float = colmap.MIN_REGISTERED) -> list[Finding]:
@@ -107,7 +107,7 @@ def _check_cameras(found: Dataset, collect: Collector) -> None:
     total = across.sum(0)
     if np.linalg.eigvalsh(total)[0] < _PARALLEL * len(cameras):
         return
-    middle = np.linalg.solve(total, (across @ centers[:, :, None])[..., 0].sum(0))  # nearest to all optical axes
+    middle = np.linalg.solve(total, (across @ centers[:, :, None])[..., 0].sum(0))  # point nearest to all optical axes
     away = [
         camera.name for camera, depth in zip(cameras, ((middle - centers) * axes).sum(-1), strict=True) if depth < 0
     ]

@@ -1,4 +1,4 @@
-"""Faults of a run folder: run.json, checkpoints, evaluation, the scenes in it, and its data set."""
+"""Faults of a run folder: run.json, checkpoints, evaluation, its scene files and its data set."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def check(folder: Path) -> list[Finding]:
 
 
 def _check_checkpoints(folder: Path, collect: Collector) -> int | None:
-    """Read all generations of the checkpoint; returns the step of the newest whole one."""
+    """Read all generations of the checkpoint; returns the step of the newest valid one."""
     from ..train import checkpoint
 
     if checkpoint.newest_file(folder) is None:

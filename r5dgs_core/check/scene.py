@@ -1,4 +1,4 @@
-"""Faults of a scene file: those of the reader, and what looks like a mistake."""
+"""Faults of a scene file: errors of the reader, and likely mistakes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..scene.scene import Scene
 from ..terminal import printable
 from .codes import CODES
 
-LAST_FRAME = 1_048_574  # of Blender
-_AHEAD = 1 / 3  # of the observed span: as far as Blender extrapolates by default
-_SEEN = 1 / 255  # least opacity that is drawn
-_FEW_SEEN = 0.05
-_MOST_STEPS = 1 << 16  # of integration, for a look at a motion
+LAST_FRAME = 1_048_574  # Blender's last frame
+_AHEAD = 1 / 3  # extrapolated share of the observed span; Blender's default in the add-on
+_SEEN = 1 / 255  # lowest opacity that is drawn
+_FEW_SEEN = 0.05  # share of visible Gaussians below which S16 is reported
+_MOST_STEPS = 1 << 16  # integration steps per motion
 
 
 def check(path: Path) -> list[Finding]:
@@ -26,7 +26,7 @@ def check(path: Path) -> list[Finding]:
     scene: Scene | None = None
     with collect():
         scene = scene_file.read(path, collect)
-    if scene is None or collect.findings:  # warnings need numbers that can be relied on
+    if scene is None or collect.findings:  # warnings rely on valid numbers
         return collect.findings
     if len(scene.means) == 0:
         collect.add("S02", f"{path}: expected Gaussians, found none")

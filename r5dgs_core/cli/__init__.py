@@ -1,1 +1,1 @@
-"""The command line `r5dgs`: arguments and functions of each command."""
+"""Command line ``r5dgs``: arguments and functions of every command."""

@@ -1,4 +1,4 @@
-"""What ``r5dgs associate`` does: one numbering for masks that a tracker numbered wrongly, or video by video."""
+"""The command ``r5dgs associate``: make mask ids consistent across images and videos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from . import runs
 if TYPE_CHECKING:
     from ..association.mask_repair import Repair
 
-SHOWN = 12  # changes that are printed
+SHOWN = 12  # printed changes
 
 
 @folder_lock.writes("out", "target")
@@ -24,26 +24,26 @@ def run_associate(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> Path:
-    """Write masks with the ids that geometry and motion give to the segments of the incoming ones.
+    """Renumber mask segments by the geometry and motion of a trained scene.
 
     Args:
-        target: A run folder, or a ``.r5dgs`` file with ``data`` and ``out``: what shows which segments are one object.
-        data: The data set; by default that of the run.
-        masks: Folder of the incoming masks; by default those that the run was trained with, or ``DATA/object_mask``
-            where it was trained without.
+        target: Run folder, or ``.r5dgs`` file with ``data`` and ``out``. Its Gaussians link segments across images.
+        data: Data set; that of the run if None.
+        masks: Folder of the incoming masks; those of the run if None, or ``DATA/object_mask`` if it was trained without
+            masks.
         out: Folder to write; ``RUN/object_mask`` if None.
         threads: Threads of the kernels; see `runs.use_threads`.
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        The folder.
+        The written folder.
 
     Raises:
-        ConfigError, DatasetError, CheckpointError, SceneFileError: As their messages say.
+        ConfigError, DatasetError, CheckpointError, SceneFileError: An input cannot be used.
     """
     runs.check_target(target, data)
     if target.is_file() and (data is None or out is None):
-        raise errors.UsageError(f"associate {target}: a scene file needs the data set and a folder, --data and --out")
+        raise errors.UsageError(f"associate {target}: a scene file requires the options --data and --out")
     if out is not None:
         input_paths.check_output_folder("--out", out)
     from ..association import mask_repair
@@ -76,7 +76,7 @@ def run_associate(
 
 
 def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> None:
-    """What was done, in words, and what to do next."""
+    """Print a summary of the changes and the next step."""
     from ..association import mask_repair
 
     counted = ("segments", "images", "relabelled", "unknown", "kept")
@@ -86,13 +86,13 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
         f"{len(summary['objects'])} objects"
     )
     if summary["mended"]:
-        print(f"in {summary['mended']} images objects that had no segment got pixels, as the other images show them")
+        print(f"in {summary['mended']} images, objects without a segment were filled in from the other images")
     print(
         f"segments agree with what other images show of their objects to {summary['agreement']:.2f} (IoU); "
         f"with the incoming ids to {summary['agreement_before']:.2f}"
     )
     if summary["fallback"]:
-        print("the incoming ids stay: too little is certain, or nothing would be better")
+        print("the incoming ids stay: the evidence is too weak, or new ids would not agree better")
     changed = mask_repair.switches(done)
     for row in changed[:SHOWN]:
         said = "unknown here" if row.done == "unknown" else f"object {row.new_id} here"
@@ -105,4 +105,4 @@ def _tell(done: Repair, summary: dict[str, Any], folder: Path, root: Path) -> No
     if done.numbering == "scene":
         print(f"Next: r5dgs train {root} --masks {folder} --out RUN")
     else:
-        print("ids still hold within single videos, which is nothing to train with: try a run of more steps or images")
+        print("ids are valid within single videos only and cannot be trained with: try a longer run, or more images")

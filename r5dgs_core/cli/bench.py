@@ -1,4 +1,4 @@
-"""The command ``r5dgs bench``: check its arguments, then train and measure."""
+"""The command ``r5dgs bench``: check the arguments, then train and measure."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def run_bench(
     """Train variants on scenes and write the paper's tables (see `bench.benchmark.run_bench`).
 
     Args:
-        scenes: Data sets.
-        out: Folder of the runs and the tables.
-        variants: Of `bench.variants.VARIANTS`; the default ones if None.
-        modes: Playback modes; one of each base if None.
-        threads: Threads of the kernels; see `runs.use_threads`.
-        remeasure: Bake and measure finished runs again.
-        progress_kind: How progress is shown (`progress.make`).
-        **options: Other fields of `bench.cases.Plan`.
+    scenes: Data sets.
+    out: Output folder for runs and tables.
+    variants: Names from `bench.variants.VARIANTS`; the default variants if None.
+    modes: Playback modes; one per base if None.
+    threads: Threads of the kernels; see `runs.use_threads`.
+    remeasure: Bake and measure finished runs again.
+    progress_kind: Form of progress output (`progress.make`).
+    **options: Other fields of `bench.cases.Plan`.
 
     Returns:
         The content of ``bench.json`` (docs/user/bench.md).

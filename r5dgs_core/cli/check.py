@@ -1,4 +1,4 @@
-"""``r5dgs check``: print all faults of a file or folder."""
+"""The command ``r5dgs check``: print all faults of a file or folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..terminal import printable
 
 
 def run_check(path: Path, *, as_json: bool = False) -> bool:
-    """Print all faults and their number; returns False if one of them is an error."""
+    """Print all faults and their counts; returns False if any fault is an error."""
     found = check(path)
     failed = sum(finding.severity == ERROR for finding in found)
     if as_json:

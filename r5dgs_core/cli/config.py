@@ -1,4 +1,4 @@
-"""The command ``r5dgs config``: all training keys, and the user's settings."""
+"""The command ``r5dgs config``: print the training keys or the user's settings."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def run_config(target: Path | None, *, as_json: bool = False) -> configs.Config:
     """Print every training key with its meaning, unit, default and value in force.
 
     Args:
-        target: A run folder, a TOML file, or None for the defaults.
-        as_json: Print JSON.
+    target: Run folder, TOML file, or None for the defaults.
+    as_json: Print JSON instead of text.
 
     Returns:
         The configuration.
 
     Raises:
-        CheckpointError, ConfigError: The run or the file cannot be read.
+        CheckpointError, ConfigError: The run or file cannot be read.
     """
     config = _of_run(target) if target is not None and target.is_dir() else configs.load(target)
     keys = config_keys.keys(config)
@@ -56,15 +56,15 @@ def run_user_config(arguments: list[str], *, as_json: bool = False) -> dict[str,
     """Print the user's settings, or change one of them.
 
     Args:
-        arguments: Nothing, or "set", key and value; an empty value removes the key.
-        as_json: Print JSON.
+        arguments: Empty, or "set", key and value; an empty value removes the key.
+        as_json: Print JSON instead of text.
 
     Returns:
         The settings.
 
     Raises:
-        UsageError: The arguments are others.
-        ConfigError: The settings cannot be read or written.
+        UsageError: The arguments have another form.
+        ConfigError: The settings file cannot be read or written.
     """
     if arguments:
         if len(arguments) != 3 or arguments[0] != "set":
@@ -74,7 +74,7 @@ def run_user_config(arguments: list[str], *, as_json: bool = False) -> dict[str,
     if as_json:
         print(json.dumps({"path": str(place), "settings": settings}, indent=1))
         return settings
-    print(f"{place}{'' if place.exists() else ' (not there yet)'}")
+    print(f"{place}{'' if place.exists() else ' (does not exist yet)'}")
     for key, meaning in user_settings.MEANINGS.items():
         print(f"{key} = {_toml(settings[key]) if key in settings else '(not set)'}")
         print(textwrap.fill(meaning, WIDTH, initial_indent="    # ", subsequent_indent="    # "))

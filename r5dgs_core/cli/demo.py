@@ -1,4 +1,4 @@
-"""``r5dgs demo``: from the bundled images to a scene file, a contact sheet and a table, in one command."""
+"""The command ``r5dgs demo``: train, bake and evaluate the bundled data set."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ..time_left import Phase
 from . import runs
 
 NAME = "tabletop"
-# Mean PSNR of a healthy run, dB; test lies past t_max. Rounding differs between processors, and moves val as another
-# seed does: seeds 0, 1 and 2 gave 39.6, 42.1 and 42.6 dB on one machine.
+# Mean PSNR of a normal run, dB; the test split lies past t_max. Rounding differences between processors change val as
+# much as another seed does: seeds 0, 1 and 2 gave 39.6, 42.1 and 42.6 dB on one machine.
 EXPECTED = {"val": 40.0, "test": 37.0}
-TOLERANCE = 1.0  # dB below it at which `.ci/run` fails
-AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # what follows training; costs as measured
+TOLERANCE = 1.0  # dB; `.ci/run` fails if PSNR is lower than `EXPECTED` by more than this
+AFTER = (Phase("bake", 1, 150), Phase("evaluate", 60, 4))  # phases after training, with measured costs
 
 
 def bundled_data() -> Path:
-    """Folder of the bundled data set: beside the sources, or inside the installed package.
+    """Return the folder of the bundled data set, beside the sources or inside the installed package.
 
     Raises:
-        DatasetError: It is in neither place.
+        DatasetError: It is missing in both places.
     """
     here = Path(__file__).resolve().parents[1]
     for candidate in (here / "examples" / NAME, here.parent / "examples" / NAME):
@@ -43,10 +43,10 @@ def run_demo(
     threads: int | None = None,
     progress_kind: str,
 ) -> dict[str, Any]:
-    """Train, bake and measure the bundled data set.
+    """Train, bake and evaluate the bundled data set.
 
-    Writes into ``out``: the run, ``demo.r5dgs``, ``evaluation.json`` and ``contact_sheet.png``; prints the table. Where
-    ``out`` holds a demo already, it begins again, unless it is to ``resume``; any other run takes ``overwrite``.
+    Writes the run, ``demo.r5dgs``, ``evaluation.json`` and ``contact_sheet.png`` into ``out``, and prints the table. A
+    previous demo in ``out`` is replaced unless ``resume`` is given; any other run requires ``overwrite``.
 
     Returns:
         The evaluation.
@@ -104,12 +104,12 @@ def run_demo(
 
 
 def expectation() -> str:
-    """Return the line with the PSNR of a healthy run."""
+    """Return the line with the PSNR of a normal run."""
     return f"expected about {EXPECTED['val']:g} / {EXPECTED['test']:g} dB (val / test)"
 
 
 def shortfalls(evaluation: dict[str, Any]) -> list[str]:
-    """Return a line for each split of an evaluation that lies more than `TOLERANCE` below `EXPECTED`."""
+    """Return one line per split whose PSNR is more than `TOLERANCE` below `EXPECTED`."""
     found = {split: evaluation["splits"][split]["rigid"]["psnr"] for split in EXPECTED}
     return [
         f"{split}: PSNR {found[split]:.2f} dB, expected about {wanted:g} dB"
@@ -119,7 +119,7 @@ def shortfalls(evaluation: dict[str, Any]) -> list[str]:
 
 
 def _is_demo(run_file: Path) -> bool:
-    """Whether a run was trained on the bundled data set, of this or an earlier version."""
+    """Return True if the run was trained on the bundled data set, of this or an earlier version."""
     try:
         return Path(strict_json.read(run_file, errors.CheckpointError)["dataset"]).name == NAME
     except (errors.CheckpointError, KeyError, TypeError):

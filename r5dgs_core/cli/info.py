@@ -1,4 +1,4 @@
-"""The command ``r5dgs info``: a summary of a scene file."""
+"""The command ``r5dgs info``: print a summary of a scene file."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ def run_info(path: Path, *, with_needs: bool = False, as_json: bool = False) -> 
     """Print a summary of a scene file.
 
     Args:
-        path: The scene file.
-        with_needs: Print the table of what the scene needs, too.
-        as_json: Print all data of the scene as JSON instead.
+    path: The scene file.
+    with_needs: Also print the table of the scene's needs.
+    as_json: Print all data of the scene as JSON instead.
     """
     input_paths.check_scene(path)
     from ..playback import scene_info

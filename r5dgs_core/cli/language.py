@@ -1,5 +1,4 @@
-"""What ``r5dgs lookup``, ``query`` and ``name`` do: functions ``run_<name>`` that can be called without the command
-line."""
+"""The commands ``r5dgs lookup``, ``query`` and ``name``, as functions that Python code can call."""
 
 from __future__ import annotations
 
@@ -32,19 +31,19 @@ def run_lookup(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> Scene:
-    """Make the lookup table of a scene file and write it into the file.
+    """Compute the lookup table of a scene file and write it into the file.
 
     Args:
         path: The scene file.
-        encoder: Folder of the encoder, or "text"; that of the user's settings if None.
-        out: Where to write instead of ``path``.
-        captions: JSON by object id or name: a caption, or an object of ``name aliases caption``.
-        words: Text file of words to store, one a line.
+        encoder: Folder of the encoder, or "text"; the encoder of the user's settings if None.
+        out: Scene file to write instead of ``path``.
+        captions: JSON file that maps object ids or names to a caption, or to an object with ``name aliases caption``.
+        words: Text file of additional words to store, one per line.
         threads: Threads of the kernels; see `runs.use_threads`.
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        The scene with its table.
+        The scene with its lookup table.
     """
     if out is not None:
         input_paths.check_scene_output(out)
@@ -86,7 +85,7 @@ def run_lookup(
             f"{target}: {count} objects and {len(made.scene.vocabulary)} words by {opened.card.kind} {opened.card.name}"
         )
         if not opened.card.sees:
-            print("the encoder knows words and cannot look at pixels: objects are found by what they are called")
+            print("this encoder reads text only: objects are found by their names, not by their appearance")
         for note in made.notes:
             print(note)
     return made.scene
@@ -95,15 +94,15 @@ def run_lookup(
 def run_query(
     path: Path, text: str, *, encoder: str | None = None, threshold: float | None = None, as_json: bool = False
 ) -> tuple[Scene, list[Match]]:
-    """Say which objects of a scene file a text names or means.
+    """Find the objects of a scene file that a text describes, and print them.
 
     Args:
         path: The scene file.
-        text: One or several things.
-        encoder: Folder of the encoder that made the scene's table, or "text", for what names and stored words leave
-            unanswered; any other is refused, even if nothing is left. None uses that of the user's settings if the
-            scene's table was made with it.
-        threshold: Least score of a match, the usual one where None.
+        text: One or more things to find.
+        encoder: Folder of the encoder that made the scene's lookup table, or "text". It embeds phrases that neither
+            names nor stored words answer. Another encoder is refused even if no phrase is left. If None, the encoder
+            of the user's settings is used if it made the table.
+        threshold: Minimum score of a match; the default threshold if None.
         as_json: Print JSON instead of a table.
 
     Returns:
@@ -158,16 +157,17 @@ def run_query(
 def run_name(
     path: Path, which: str, name: str | None, *, aliases: Sequence[str] = (), caption: str | None = None
 ) -> Scene:
-    """Name an object of a scene file, and say what else it is called.
+    """Change the name, aliases or caption of an object in a scene file.
 
     Args:
-        path: The scene file; it is replaced whole or not at all.
-        which: Id of the object, or its name.
-        name: Its new name, None to keep it.
-        aliases: Words to add to those that find it.
-        caption: A sentence about it, None to keep what there is.
+        path: The scene file; the write is atomic.
+        which: Id or name of the object.
+        name: New name; None keeps the old one.
+        aliases: Words to add to its aliases.
+        caption: New caption; None keeps the old one.
 
     Returns:
+        The scene as written.
         The scene as it was written.
     """
     if name is None and not aliases and caption is None:
@@ -185,20 +185,20 @@ def run_name(
     fresh = named.object(item.id)
     print(f"{path}: object {fresh.id} is {fresh.name!r}" + (f", also {', '.join(fresh.aliases)}" * bool(fresh.aliases)))
     if named.lookup is not None and not named.lookup.encoder.sees:
-        print("its lookup table knows the old words; make it again: r5dgs lookup SCENE --encoder ...")
+        print("its lookup table still holds the old words; rebuild it: r5dgs lookup SCENE --encoder ...")
     return named
 
 
 def described(scene: Scene, captions: dict[str, Any], place: str) -> Scene:
-    """A scene with other names, aliases and captions.
+    """Return the scene with changed names, aliases and captions.
 
     Args:
         scene: The scene.
-        captions: By id or name of an object: its caption, or an object of ``name aliases caption``.
-        place: Where they come from, for messages.
+        captions: Maps the id or name of an object to a caption, or to a dict with ``name aliases caption``.
+        place: Origin of ``captions``, for messages.
 
     Raises:
-        ConfigError: An object is not there, a name is taken or empty, or a value has another type.
+        ConfigError: An object is missing, a name is taken or empty, or a value has the wrong type.
     """
     changed = {item.id: item for item in scene.objects}
     for which, value in captions.items():
@@ -226,7 +226,7 @@ def described(scene: Scene, captions: dict[str, Any], place: str) -> Scene:
 
 
 def nothing(scene: Scene, text: str, unknown: Sequence[str] = ()) -> str:
-    """A sentence for a text that finds nothing; ``unknown`` are its phrases that an encoder might have known."""
+    """Return the message for a text without matches; ``unknown`` are the phrases that need an encoder."""
     from ..search import object_search
 
     said = object_search.explain_nothing(
@@ -236,12 +236,12 @@ def nothing(scene: Scene, text: str, unknown: Sequence[str] = ()) -> str:
         return said
     asked = " and ".join(repr(phrase) for phrase in unknown)
     if scene.lookup is None:
-        return f"{said}\nthe scene has no lookup table: by names alone; make one: r5dgs lookup SCENE --encoder DIR"
+        return f"{said}\nthe scene has no lookup table, only names count; make one: r5dgs lookup SCENE --encoder DIR"
     return f"{said}\n{asked} is not among the stored words; give the table's encoder for others: --encoder DIR"
 
 
 def _user_encoder(card: EncoderCard) -> Any:
-    """Open the encoder of the user's settings if the table was made with it; else None."""
+    """Open the encoder of the user's settings; returns None if it did not make the table."""
     found = user_settings.read().get("encoder")
     if found is None:
         return None
@@ -258,7 +258,7 @@ def _user_encoder(card: EncoderCard) -> Any:
 
 
 def _encoder_for(scene: Scene, encoder: str | None, unknown: Sequence[str], path: Path) -> Any:
-    """The encoder where one is given and needed, checked against the table's even where it is not."""
+    """Open ``encoder`` and check that it made the table; returns None if no phrase needs it."""
     if encoder is None:
         return None
     from ..language import query
@@ -282,12 +282,12 @@ def _show(scene: Scene, found: Sequence[Match]) -> None:
     for match in found:
         numbers = ("-" if value is None else f"{value:.2f}" for value in (match.cosine, match.relevancy))
         cells = (str(match.object_id), names[match.object_id], f"{match.score:.2f}", *numbers, match.why)
-        table.add_row(*map(Text, cells))  # without markup: names may hold brackets
+        table.add_row(*map(Text, cells))  # as plain text, because names may contain markup brackets
     terminal.console().print(table)
 
 
 def _object(scene: Scene, which: str, place: str) -> SceneObject:
-    """The object with an id, or else with a name: a name may be the number of another object."""
+    """Return the object with an id, or else with a name; ids win because a name may be the number of another object."""
     for known in ({str(item.id): item for item in scene.objects}, {item.name: item for item in scene.objects}):
         if which in known:
             return known[which]

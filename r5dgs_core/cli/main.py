@@ -1,7 +1,7 @@
 """The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, check, objects,
 lookup, query, name, config, warm-up.
 
-`parser` has the arguments, `runs` and its neighbours do the work, `exit_status` has the exit statuses.
+Modules: `parser` defines the arguments, `runs` and its neighbours run the commands, `exit_status` maps errors.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _explain(error: BaseException, args: argparse.Namespace) -> ExitStatus:
-    """Print what an exception means to the user; returns the exit status."""
+    """Print the error for the user; returns the exit status."""
     status = exit_status.of(error)
-    if isinstance(error, BrokenPipeError):  # nobody reads our output any longer; the rest of it goes nowhere
+    if isinstance(error, BrokenPipeError):  # the reader of our output is gone; discard the rest
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     elif status == ExitStatus.DEFECT:
         traceback.print_exception(error)

@@ -1,4 +1,4 @@
-"""What ``r5dgs masks`` does: masks for the training images of a data set, or a check of those that stand."""
+"""The command ``r5dgs masks``: make masks for the training images of a data set, or check existing ones."""
 
 from __future__ import annotations
 
@@ -30,31 +30,30 @@ def run_masks(
     overwrite: bool = False,
     progress_kind: str = "none",
 ) -> Made:
-    """Write masks of the training images, or, where they would be read and written in one place, check them.
+    """Write masks of the training images; if source and output are the same folder, check them instead.
 
     Args:
         data: The data set.
-        backend: What makes them, of `BACKENDS`.
-        model: Folder of SAM2.
-        source: Folder of masks (``precomputed``) or of a captured data set (``blender``); the data set's own where
-            None.
-        out: Folder to write; ``DATA/object_mask`` where None.
-        key_frames: Images of each video in which ``sam2`` looks for everything.
-        points: Points per side that it asks at.
-        score: Least quality that it foretells for what is taken.
-        stability: Least stability of what is taken.
-        max_area: Larger masks are background, as a share of the image.
-        device: Where it runs, cpu or cuda.
-        unknown: Value of the source that says nothing of a pixel.
-        overwrite: Begin anew where there are other masks.
-        progress_kind: How progress is shown (`progress.make`).
+        backend: Source of the masks, from `BACKENDS`.
+        model: Folder of the SAM2 weights.
+        source: Folder of masks (``precomputed``) or of a captured data set (``blender``); the data set itself if None.
+        out: Folder to write; ``DATA/object_mask`` if None.
+        key_frames: Images per video in which ``sam2`` searches for all objects.
+        points: Side length of SAM2's grid of point prompts.
+        score: Minimum quality that SAM2 predicts for a mask.
+        stability: Minimum stability score of a mask.
+        max_area: Maximum area of an object, as a share of the image; larger masks are background.
+        device: Device that runs SAM2, "cpu" or "cuda".
+        unknown: Source value of pixels whose object is unknown.
+        overwrite: Replace existing masks.
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        What was done.
+        Summary of the written or checked masks.
 
     Raises:
-        ConfigError, DatasetError, BackendError: As their messages say.
-        Interrupted: Ctrl-C; what is done is kept.
+        ConfigError, DatasetError, BackendError: An input cannot be used.
+        Interrupted: Ctrl-C; finished videos are kept.
     """
     tuned = {"points": points, "score": score, "stability": stability, "max_area": max_area}
     tuned = {name: value for name, value in tuned.items() if value is not None}
@@ -90,9 +89,9 @@ def run_masks(
         in_place = maker.folder.resolve() == folder.resolve()
         if in_place and unknown is not None and unknown != mask_notes.read(folder).unknown:
             raise errors.ConfigError(
-                f"--unknown {unknown}: nothing would be written here, and training would not know it. Remedy: name a "
-                f'folder with --out, or say it in {folder / mask_notes.FILE}: {{"format_version": 1, "unknown": '
-                f"{unknown}}}"
+                f"--unknown {unknown}: nothing would be written here, so training would not know this value. Remedy: "
+                f"write to another folder with --out, or record it in {folder / mask_notes.FILE}: "
+                f'{{"format_version": 1, "unknown": {unknown}}}'
             )
     with make(progress_kind) as progress:
         if in_place:
@@ -102,7 +101,7 @@ def run_masks(
                 made = make_masks.make(views, maker, folder, overwrite=overwrite, progress=progress)
             except KeyboardInterrupt as stop:
                 raise errors.Interrupted(
-                    f"stopped; videos that are done stay in {folder}, the same command goes on after them"
+                    f"stopped; finished videos are kept in {folder}, run the same command again to continue"
                 ) from stop
         if progress_kind == "json":
             progress({"event": "masked", "path": str(folder), "images": made.images, "objects": made.objects})
@@ -124,7 +123,7 @@ def _check(
     unknown: int | None,
     tuned: dict[str, int | float | None],
 ) -> None:
-    """Refuse options that do not belong together, and values that cannot be meant."""
+    """Raise UsageError for options that do not fit the backend, and for values out of range."""
     if backend not in BACKENDS:
         raise errors.UsageError(f"--backend {backend}: expected one of {', '.join(BACKENDS)}")
     if backend == "sam2":
@@ -151,7 +150,7 @@ def _check(
 
 
 def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
-    """What was done, and what to do next."""
+    """Return the summary of the masks and the next step."""
     from ..data import dataset as datasets
     from ..data import mask_notes
 
@@ -160,13 +159,13 @@ def _summary(made: Made, wanted: int, in_place: bool, root: Path) -> str:
     if made.kept:
         lines[0] += f"; {made.kept} of {made.videos} videos were done before"
     if made.unknown:
-        lines.append(f"nothing is known of {100 * made.unknown:.1f} % of the pixels")
+        lines.append(f"{100 * made.unknown:.1f} % of the pixels are unknown")
     if in_place:
-        lines.append("they can be read, and nothing was written")
+        lines.append("all masks can be read; nothing was written")
     if made.numbering == mask_notes.VIDEO and made.videos > 1:
         own = "" if made.folder == root / datasets.MASKS else f" --masks {made.folder}"
         lines.append(
-            f"ids hold within each of {made.videos} videos only. Next: r5dgs train {root} --masks none --out RUN, "
+            f"ids are valid within each of {made.videos} videos only. Next: r5dgs train {root} --masks none --out RUN, "
             f"then r5dgs associate RUN{own}"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What ``r5dgs objects`` and ``r5dgs query --render`` do: which id is what, and pictures of some objects."""
+"""The commands ``r5dgs objects`` and ``r5dgs query --render``: tables and pictures of objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..scene.scene import Scene
     from ..search.object_search import Match
 
-SIZES = (16, 8192)  # of pictures, pixels along the longer side
+SIZES = (16, 8192)  # smallest and largest picture, pixels along the longer side
 
 
 def run_objects(
@@ -30,21 +30,21 @@ def run_objects(
     threads: int | None = None,
     as_json: bool = False,
 ) -> dict[str, Any]:
-    """Print the table of a scene's objects, and draw a picture that names them.
+    """Print the table of a scene's objects, and optionally draw a picture labelled with them.
 
     Args:
-        target: A run folder, or a `.r5dgs` file.
-        data: The data set: pixels are counted in its views and compared with its masks. By default a run's own.
+        target: Run folder or ``.r5dgs`` file.
+        data: Data set whose views are used to count pixels and whose masks are compared; that of the run if None.
         legend: PNG file of the picture, or None.
-        camera: Name or number of the picture's camera; the one that sees most objects where None.
-        t: Scene time of the picture; of first, middle and last observed time the one with most to see where None.
-        mode: Way to move past t_max.
+        camera: Name or number of the picture's camera; the one that sees most objects if None.
+        t: Scene time of the picture; if None, the best of the first, middle and last observed time.
+        mode: Playback mode past t_max.
         size: Pixels of the picture along its longer side.
         threads: Threads of the kernels; see `runs.use_threads`.
         as_json: Print JSON instead of the table.
 
     Returns:
-        What ``--json`` prints (`evaluation.object_table.to_json`).
+        The content printed by ``--json`` (`evaluation.object_table.to_json`).
     """
     check_picture("--legend", legend, camera, t, size)
     runs.check_mode(mode)
@@ -88,22 +88,22 @@ def run_query(
     threads: int | None = None,
     **picture: Any,
 ) -> list[Match]:
-    """Say which objects of a scene file a text names or means, and draw them.
+    """Find the objects of a scene file that a text describes, print them and optionally draw them.
 
     Args:
         path: The scene file.
-        text: One or several things.
-        options: What else `language.run_query` takes.
+        text: One or more things to find.
+        options: Further arguments of `language.run_query`.
         render: PNG file of the picture, or None.
-        context: Show the rest of the scene in it, dimmed.
+        context: Show the rest of the scene dimmed.
         threads: Threads of the kernels; see `runs.use_threads`.
         **picture: ``camera``, ``t``, ``mode`` and ``size`` of `render_objects`.
 
     Returns:
-        The matches, best first; where there are none, no picture is made.
+        The matches, best first. No picture is drawn if there are none.
     """
     if render is None and context:
-        raise errors.UsageError("--context: is for the picture; name it, too: --render FILE.png")
+        raise errors.UsageError("--context: requires a picture; add --render FILE.png")
     check_picture("--render", render, picture.get("camera"), picture.get("t"), picture.get("size"))
     runs.check_mode(picture.get("mode", "rigid"))
     scene, found = language.run_query(path, text, **options)
@@ -131,19 +131,19 @@ def render_objects(
 
     Args:
         scene: The scene.
-        object_ids: The objects, at least one.
+        object_ids: Ids of the objects, at least one.
         out: PNG file.
-        camera: Name or number of the camera; the one that sees them best where None.
-        t: Scene time, past t_max too; the best of first, middle and last observed time where None.
-        mode: Way to move past t_max.
-        size: Pixels along the longer side, the camera's own where None.
-        context: Show the rest of the scene, dimmed; else the objects alone, on transparency.
+        camera: Name or number of the camera; the one that sees the objects best if None.
+        t: Scene time, may exceed t_max; if None, the best of the first, middle and last observed time.
+        mode: Playback mode past t_max.
+        size: Pixels along the longer side; those of the camera if None.
+        context: Show the rest of the scene dimmed instead of a transparent background.
 
     Returns:
-        Where the picture was taken from, and when.
+        Camera and time of the picture.
 
     Raises:
-        ConfigError: There is no such camera or mode, or nothing that could be drawn.
+        ConfigError: The camera or mode does not exist, or the objects have no Gaussians.
     """
     from ..data import images
     from ..render import highlight, viewpoints
@@ -163,12 +163,12 @@ def render_objects(
 def check_picture(
     option: str, path: Path | None, camera: str | None = None, t: float | None = None, size: int | None = None
 ) -> None:
-    """Refuse what no picture can be written for, before any work. Raises ConfigError."""
+    """Raise UsageError or ConfigError for options that no picture can be written with, before any work."""
     if path is None:
         given = {"--camera": camera, "--time": t, "--size": size}
         lone = next((name for name, value in given.items() if value is not None), None)
         if lone is not None:
-            raise errors.UsageError(f"{lone}: is for the picture; name it, too: {option} FILE.png")
+            raise errors.UsageError(f"{lone}: requires a picture; add {option} FILE.png")
         return
     if path.suffix.lower() != ".png":
         raise errors.UsageError(f"{option} {path}: expected a name that ends in .png")

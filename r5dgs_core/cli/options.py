@@ -1,4 +1,4 @@
-"""Options that several sub-commands of ``r5dgs`` share, and converters of their values."""
+"""Options shared by several commands of ``r5dgs``, and converters of their values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..playback import modes
 
-_KEYS = {  # options that stand for one key of the configuration
+_KEYS = {  # options that set one key of the configuration
     "iterations": "train.iterations",
     "seed": "train.seed",
     "max_gaussians": "densify.max_gaussians",
@@ -18,24 +18,24 @@ _KEYS = {  # options that stand for one key of the configuration
 
 def add_training(p: argparse.ArgumentParser) -> None:
     """Add the options of commands that train one run."""
-    p.add_argument("--seed", type=at_least(0), metavar="N", help="seed of all random draws; train.seed (default: 0)")
+    p.add_argument("--seed", type=at_least(0), metavar="N", help="random seed; same as train.seed (default: 0)")
     add_settings(p)
     again = p.add_mutually_exclusive_group()
-    again.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
-    again.add_argument("--overwrite", action="store_true", help="replace the run that the folder holds")
+    again.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+    again.add_argument("--overwrite", action="store_true", help="replace an existing run in the output folder")
 
 
 def add_settings(p: argparse.ArgumentParser) -> None:
     """Add the options that configure training."""
-    named = "fast (a first look), cpu or paper (the deformation field); --config and --set override it"
+    named = "named settings: fast (a first look), cpu or paper (deformation field); --config and --set override them"
     p.add_argument("--preset", metavar="NAME", help=named)
-    p.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; 'r5dgs config' lists all keys")
+    config = "TOML configuration file; 'r5dgs config' lists all keys"
+    p.add_argument("--config", type=Path, metavar="FILE", help=config)
     add_overrides(p, "SECTION.KEY=VALUE", "override a key")
-    steps = "optimisation steps; train.iterations (default: 6000)"
+    steps = "optimisation steps; same as train.iterations (default: 6000)"
     p.add_argument("--iterations", type=at_least(1), metavar="N", help=steps)
-    p.add_argument(
-        "--max-gaussians", type=at_least(0), metavar="N", help="cap from the first step on; densify.max_gaussians"
-    )
+    cap = "maximum number of Gaussians, from the first step on; same as densify.max_gaussians"
+    p.add_argument("--max-gaussians", type=at_least(0), metavar="N", help=cap)
     add_threads(p)
     add_progress(p)
 
@@ -47,28 +47,28 @@ def add_overrides(p: argparse.ArgumentParser, form: str, meaning: str) -> None:
 
 def add_threads(p: argparse.ArgumentParser) -> None:
     """Add ``--threads``."""
-    shown = "threads of the kernels (default: NUMBA_NUM_THREADS, or all cores); results do not depend on it"
+    shown = "kernel threads (default: NUMBA_NUM_THREADS, or all cores); the number does not affect results"
     p.add_argument("--threads", type=at_least(1), metavar="N", help=shown)
 
 
 def add_progress(p: argparse.ArgumentParser) -> None:
     """Add ``--progress``."""
-    shown = "how progress is shown (default: auto, bars in a terminal and lines elsewhere)"
+    shown = "progress output (default: auto, which is bars in a terminal and plain lines elsewhere)"
     p.add_argument("--progress", choices=("auto", "json", "none"), default="auto", help=shown)
 
 
 def add_picture(p: argparse.ArgumentParser) -> None:
     """Add the options of a picture of the scene."""
-    p.add_argument("--camera", metavar="N", help="name or number of the picture's camera (default: the best)")
-    p.add_argument("--time", type=float, metavar="T", help="scene time of the picture, past t_max too")
-    kinds = f"playback mode (default: rigid), of {', '.join(modes.every())}"
+    p.add_argument("--camera", metavar="N", help="name or number of the camera (default: the best view)")
+    p.add_argument("--time", type=float, metavar="T", help="scene time of the picture; may exceed t_max")
+    kinds = f"playback mode, one of {', '.join(modes.every())} (default: rigid)"
     p.add_argument("--mode", default="rigid", metavar="MODE", help=kinds)
-    p.add_argument("--size", type=int, metavar="PIXELS", help="longer side of the picture")
+    p.add_argument("--size", type=int, metavar="PIXELS", help="pixels along the longer side of the picture")
     add_threads(p)
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return a converter of arguments to integers that are not smaller than ``least``."""
+    """Return a converter of arguments to integers of at least ``least``."""
 
     def integer(text: str) -> int:
         if not (text.strip().isdecimal() and least <= int(text) < 2**31):
@@ -99,7 +99,7 @@ def _number(text: str, good: Callable[[float], bool], expected: str) -> float:
 
 
 def overrides(args: argparse.Namespace) -> Sequence[str]:
-    """Return ``section.key=value`` of ``--set`` and of the options that stand for one key; the latter win."""
+    """Return ``section.key=value`` of ``--set`` and of the options that set one key; the latter win."""
     found = list(getattr(args, "set", []))
     for option, key in _KEYS.items():
         value = getattr(args, option, None)

@@ -1,4 +1,4 @@
-"""What the sub-commands of ``r5dgs`` do: functions ``run_<name>`` that can be called without the command line."""
+"""Functions ``run_<name>`` of most ``r5dgs`` commands, which Python code can call without the command line."""
 
 from __future__ import annotations
 
@@ -49,18 +49,19 @@ def training_settings(
     """Return the configuration of a new run; a resumed run keeps its own.
 
     Raises:
-        ConfigError: A key or value cannot be used, or the run that is resumed has its own configuration.
+        UsageError: A run is resumed with options that change its configuration.
+        ConfigError: A key or value is invalid.
     """
     if resume and (config_path or overrides or preset) and (Path(folder) / input_paths.RUN_FILE).exists():
         raise errors.UsageError(
-            "--resume goes on with the run's own configuration; leave out --preset, --config, --set, --iterations, "
+            "--resume continues with the configuration of the run; leave out --preset, --config, --set, --iterations, "
             "--seed and --max-gaussians"
         )
     return configs.load(config_path, tuple(overrides), preset)
 
 
 def use_threads(count: int | None) -> None:
-    """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or the usable cores."""
+    """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or else all usable cores."""
     if count is not None:
         from ..raster.cpu import compilation
 
@@ -78,7 +79,7 @@ def run_bake(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> None:
-    """Turn a run into a scene file (see `bake.bake.run_bake`) and print a summary, on demand with the needs table."""
+    """Convert a run to a scene file (see `bake.bake.run_bake`) and print a summary, with the needs table if asked."""
     input_paths.check_scene_output(out)
     configs.require_needs(overrides)
     input_paths.check_run(run_folder)
@@ -104,13 +105,13 @@ def run_bake(
 
 @folder_lock.writes("out")
 def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **options: Any) -> None:
-    """Turn a run folder that another program trained into a scene file (see `importing.importer.import_run`).
+    """Convert a run folder of another program to a scene file (see `importing.importer.import_run`).
 
     Args:
-        run_folder: The folder.
-        out: The scene file to write.
-        progress_kind: How progress is shown (`progress.make`).
-        **options: The fields of `importing.importer.Options`.
+        run_folder: Run folder of the other program.
+        out: Scene file to write.
+        progress_kind: Form of progress output (`progress.make`).
+        **options: Fields of `importing.importer.Options`.
     """
     input_paths.check_scene_output(out)
     input_paths.check_foreign_run(run_folder)
@@ -146,25 +147,25 @@ def run_evaluate(
     threads: int | None = None,
     progress_kind: str = "none",
 ) -> dict[str, Any]:
-    """Measure a run or scene file on its data set's held-out views; writes ``evaluation.json`` beside it.
+    """Measure a run or scene file on the held-out views of its data set, and write ``evaluation.json`` beside it.
 
     Args:
-        target: A run folder, or a `.r5dgs` file.
-        data: The data set; by default the one a run was trained on.
+        target: Run folder or ``.r5dgs`` file.
+        data: Data set; the one that the run was trained on if None.
         modes: Playback modes.
-        json_path: Where the result goes instead.
+        json_path: File to write instead.
         threads: Threads of the kernels; see `use_threads`.
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        The evaluation, in the shape of ``evaluation.json``.
+        The evaluation, in the form of ``evaluation.json``.
     """
     for mode in modes:
         check_mode(mode)
     check_target(target, data)
     input_paths.check_output("--json", json_path)
     if data is None and not target.is_dir():
-        raise errors.UsageError(f"{target}: name the data set to compare with: r5dgs evaluate {target} --data DIR")
+        raise errors.UsageError(f"{target}: a scene file requires a data set: r5dgs evaluate {target} --data DIR")
 
     from ..evaluation import evaluate, evaluation_table
     from ..progress import make
@@ -195,15 +196,15 @@ def run_evaluate(
 
 
 def run_stability(json_path: Path | None = None, *, threads: int | None = None, progress_kind: str = "none") -> bool:
-    """Run the stiff, extreme and degenerate cases on this installation and print what came of them.
+    """Run the stiff, extreme and degenerate cases on this installation and print the results.
 
     Args:
-        json_path: Where the rows go as JSON, or None.
+        json_path: JSON file of the results, or None.
         threads: Threads of the kernels; see `use_threads`.
-        progress_kind: How progress is shown (`progress.make`); "json" prints no table.
+        progress_kind: Form of progress output (`progress.make`); "json" prints no table.
 
     Returns:
-        Whether all cases passed.
+        True if all cases passed.
     """
     input_paths.check_output("--json", json_path)
 
@@ -229,7 +230,7 @@ def run_stability(json_path: Path | None = None, *, threads: int | None = None, 
 
 
 def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]:
-    """The scene of a run folder or a scene file, and the data set: of a file only where it is named."""
+    """Return the scene of a run folder or scene file, and its data set; for a file, only if ``data`` is given."""
     from ..bake import bake
     from ..data import dataset as datasets
     from ..scene import scene_file
@@ -244,19 +245,19 @@ def open_target(target: Path, data: Path | None) -> tuple[Scene, Dataset | None]
         dataset = None if data is None else datasets.read(data, min_registered=0.0)
         trained_on = scene.provenance.get("dataset_digest")
     if dataset is not None and trained_on is not None and trained_on != dataset.digest:
-        log.warning("%s: %s was trained on other data than this; it is used all the same", dataset.root, target)
+        log.warning("%s: differs from the data that %s was trained on; it is used anyway", dataset.root, target)
     return scene, None if dataset is None else dataset.relative_to(scene.origin)
 
 
 def check_target(target: Path, data: Path | None) -> None:
-    """Raise R5dgsError if a target is neither a run folder nor a file, or if ``data`` is no data set."""
+    """Raise R5dgsError if the target is neither a run folder nor a file, or if ``data`` is not a data set."""
     input_paths.check_target(target)
     if data is not None:
         input_paths.check_dataset(data)
 
 
 def check_mode(mode: str, scene: Scene | None = None, place: object = "") -> None:
-    """Raise `ConfigError` if a playback mode is unknown, or if the scene at ``place`` has no data for it."""
+    """Raise UsageError for an unknown playback mode, or ConfigError if the scene at ``place`` has no data for it."""
     try:
         scene_modes.split(mode)
     except ValueError:
@@ -284,18 +285,18 @@ def run_report(
     """Measure error against run time of a run or scene file (see `error_vs_time.report`) and write it to a folder.
 
     Args:
-        target: A run folder, or a `.r5dgs` file.
-        data: The data set; by default the one a run was trained on, none for a file.
+        target: Run folder or ``.r5dgs`` file.
+        data: Data set; if None, the one that a run was trained on, and none for a file.
         out: Folder of ``report.json``, ``.csv``, ``.md`` and ``.png``.
-        tasks: What to measure, all where None.
-        splits: Splits whose images are compared, "test" where None.
-        rounds: Rounds of timing, the report's own number where None.
+        tasks: Tasks to measure; all if None.
+        splits: Splits whose images are compared; "test" if None.
+        rounds: Timing rounds; `error_vs_time.report.ROUNDS` if None.
         clock: "wall", or "cpu" for processor time.
         threads: Threads of the kernels; see `use_threads`.
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        The report, in the shape of ``report.json``.
+        The report, in the form of ``report.json``.
     """
     check_target(target, data)
     input_paths.check_output_folder("--out", out)
@@ -308,7 +309,7 @@ def run_report(
         scene, dataset = open_target(target, data)
         if dataset is None and tasks and set(tasks) <= {"images", "poses"}:
             given = " ".join(tasks)
-            raise errors.ConfigError(f"--tasks {given}: needs the data set: r5dgs report {target} DATA --out {out}")
+            raise errors.ConfigError(f"--tasks {given}: require the data set: r5dgs report {target} DATA --out {out}")
         result = report.measure(
             scene,
             dataset,
@@ -326,14 +327,14 @@ def run_report(
 
 
 def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
-    """Compile the kernels of rasterizer and training, so that no first picture has to wait for that.
+    """Compile the rasterizing and training kernels, so that the first picture does not wait for them.
 
     Args:
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        ``seconds`` it took, kernels ``compiled`` (none where an earlier call did that) and the ``folder`` that keeps
-        them, None where there is no place.
+        ``seconds`` of run time, number of kernels ``compiled`` (0 if all were cached) and the cache ``folder`` (None if
+        no folder can be written).
     """
     from ..progress import make
 
@@ -352,5 +353,5 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
             progress({"event": "ready", **result})
     if progress_kind != "json":
         done = f"compiled {compiled} kernels in {seconds:.1f} s" if compiled else f"ready: loaded in {seconds:.1f} s"
-        print(f"{done}; kept in {folder}" if folder else f"{done}; not kept, as no folder can be written")
+        print(f"{done}; kept in {folder}" if folder else f"{done}; not kept, because no cache folder can be written")
     return result

@@ -1,4 +1,4 @@
-"""Edited points of the worker's scenes: what `points` requests hand over, and the scenes that hold them."""
+"""Point edits of the worker's scenes: decoding of ``points`` requests, and scenes extended by the edited points."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from . import requests as asked
 if TYPE_CHECKING:
     from ..render import scene_renderer
 
-Places = dict[tuple[int, str], Place]  # by number of the scene and key of the edit
+Places = dict[tuple[int, str], Place]  # by scene number and edit key
 _WIDTHS = {"means": 3, "quats": 4, "scales": 3, "base": 4}  # columns of each array; "sh" has any multiple of 3
 
 
 class EditedPoints:
-    """Holds point edits by key, and extends scenes by those that a picture shows."""
+    """Point edits by key, and the scenes extended by the edits that a picture shows."""
 
     def __init__(self) -> None:
         self._edits: dict[str, PointEdit] = {}
-        self._shown: tuple[list[Scene], list[tuple[int, str]]] = [], []  # scenes and edits that were extended last
+        self._shown: tuple[list[Scene], list[tuple[int, str]]] = [], []  # scenes and edits of the last extension
         self._extended: tuple[list[Scene], Places] = [], {}
 
     def keep(self, request: dict[str, Any]) -> None:
-        """Hold the edits of ``keep``, a list of keys, and forget all others.
+        """Keep the edits with the keys in ``keep``, and drop all others.
 
-        ``new`` has those that the worker does not hold yet: by key an object of base64 strings, ``rows`` (int32) and
-        any of ``means quats scales base sh`` (float32).
+        ``new`` holds the edits that the worker does not have yet. It maps a key to an object of base64 strings:
+        ``rows`` (int32) and any of ``means quats scales base sh`` (float32).
 
         Raises:
-            ConfigError: A key is neither held nor new, or an edit cannot be read.
+            ConfigError: A key is neither kept nor new, or an edit cannot be decoded.
         """
         keys, new = asked.need(request, "keep", list), asked.need(request, "new", dict)
         decoded = {key: _edit_of(value) for key, value in new.items()}
@@ -49,17 +49,17 @@ class EditedPoints:
         self._edits = {key: decoded[key] if key in decoded else self._edits[key] for key in keys}
 
     def extend(self, scenes: list[Scene], wanted: list[tuple[int, str]]) -> tuple[list[Scene], Places]:
-        """Extend scenes by the edits that a picture shows; the result is kept until scenes or edits change.
+        """Return the scenes extended by the edits that a picture shows; cached until scenes or edits change.
 
         Args:
             scenes: The loaded scenes.
-            wanted: Number of the scene and key of each edit, each once.
+            wanted: Scene number and key of each edit, without duplicates.
 
         Returns:
-            The scenes, the same list as long as nothing changes, and the place of each edit.
+            The extended scenes (the same list object while nothing changes), and the place of each edit.
 
         Raises:
-            ConfigError: An edit is not held, or does not fit its scene.
+            ConfigError: An edit is missing, or does not fit its scene.
         """
         lost = [key for _, key in wanted if key not in self._edits]
         if lost:
@@ -81,7 +81,7 @@ class EditedPoints:
 
 
 def wanted(entries: Sequence[Any], numbers: list[int]) -> list[tuple[int, str]]:
-    """Number of the scene and key of each edit that entries of ``instances`` show, each once."""
+    """Return scene number and key of each edit in the entries of ``instances``, without duplicates."""
     edited = [entry for entry in entries if isinstance(entry, dict) and entry.get("points") is not None]
     found = [(asked.number_of(entry, numbers), entry["points"]) for entry in edited]
     for _, key in found:
@@ -91,7 +91,7 @@ def wanted(entries: Sequence[Any], numbers: list[int]) -> list[tuple[int, str]]:
 
 
 def instance_of(entry: dict[str, Any], numbers: list[int], places: Places) -> scene_renderer.Instance:
-    """An entry of ``instances``, which has either ``start`` and ``count`` or the key of an edit as ``points``."""
+    """Convert an entry of ``instances``, with either ``start`` and ``count`` or the key of an edit as ``points``."""
     if not isinstance(entry, dict) or entry.get("points") is None:
         return asked.instance_of(entry, numbers)
     place = places[asked.number_of(entry, numbers), entry["points"]]
@@ -113,7 +113,7 @@ def _edit_of(value: Any) -> PointEdit:
 
 
 def _array(value: dict[str, Any], name: str, dtype: str, width: int = 1) -> np.ndarray:
-    """An array of a request. [n] or [n, width]"""
+    """Decode an array of a request. [n] or [n, width]"""
     try:
         found = np.frombuffer(base64.b64decode(value[name], validate=True), dtype)
         return found.reshape(-1, width) if width > 1 else found

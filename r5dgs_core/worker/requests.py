@@ -1,4 +1,4 @@
-"""Fields of a request to the worker, checked: each function returns a value, or raises a ConfigError that names it."""
+"""Validation of request fields: each function returns a value, or raises a ConfigError that names the field."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ..search import prompts
 if TYPE_CHECKING:
     from ..render import scene_renderer
 
-MOST_LINE = 512 << 20  # bytes of a request; edited points are large
-MOST_ENTRIES = 100_000  # of a list
+MOST_LINE = 512 << 20  # bytes per request; edited points are large
+MOST_ENTRIES = 100_000  # per list
 _MOST_PATH = 4096  # letters
 _MOST_TINT = 1e6
-_PIXEL_BYTES, _GAUSSIAN_BYTES = 100, 600  # of memory while a picture is drawn, about
-_ASSUMED_MEMORY = 4 << 30  # bytes, on systems that do not report theirs
+_PIXEL_BYTES, _GAUSSIAN_BYTES = 100, 600  # approximate memory per pixel and per Gaussian during rendering
+_ASSUMED_MEMORY = 4 << 30  # bytes, on systems that do not report their memory
 _FIELDS = {
     "hello": (),
     "load": ("paths",),
@@ -41,7 +41,7 @@ _INSTANCE_FIELDS = ("scene", "start", "count", "points", "holdout", "matrix", "w
 
 
 def read_line(stream: BinaryIO) -> bytes:
-    """Read the next line, b"" at the end of the stream.
+    """Read the next line; returns b"" at the end of the stream.
 
     Raises:
         ConfigError: The line is longer than `MOST_LINE`; it is skipped.
@@ -65,13 +65,13 @@ def parse(line: bytes) -> dict[str, Any]:
 
 
 def id_of(request: dict[str, Any]) -> int | str | None:
-    """Number or name of a request, which its answer repeats; None if it has none that can be repeated."""
+    """Return the id of a request, which the response repeats; None if it is missing or invalid."""
     number = request.get("id")
     return number if _is_whole(number) or (isinstance(number, str) and len(number) <= 100) else None
 
 
 def command_of(request: dict[str, Any]) -> str:
-    """Command of a request whose fields are all known."""
+    """Return the command of a request, after checking that all fields are known."""
     command = request.get("command")
     if not isinstance(command, str) or command not in _FIELDS:
         known = ", ".join(_FIELDS)
@@ -81,7 +81,7 @@ def command_of(request: dict[str, Any]) -> str:
 
 
 def need(request: dict[str, Any], key: str, kind: type) -> Any:
-    """A value of some type; lists have at most `MOST_ENTRIES`."""
+    """Return a field of the given type; lists may have at most `MOST_ENTRIES` entries."""
     value = request.get(key)
     if not isinstance(value, kind):
         raise errors.ConfigError(f"worker: '{request.get('command')}' needs '{key}', found {_short(value)}")
@@ -91,12 +91,12 @@ def need(request: dict[str, Any], key: str, kind: type) -> Any:
 
 
 def time_of(request: dict[str, Any]) -> float:
-    """Scene time of a picture."""
+    """Return the scene time of a picture."""
     return _number(request.get("t"), "worker: 'render' needs 't'")
 
 
 def texts_of(request: dict[str, Any]) -> list[str]:
-    """Phrases to embed."""
+    """Return the phrases to embed."""
     texts = need(request, "texts", list)
     if not all(isinstance(text, str) and len(text) <= prompts.MOST_LETTERS for text in texts):
         raise errors.ConfigError(
@@ -106,14 +106,14 @@ def texts_of(request: dict[str, Any]) -> list[str]:
 
 
 def path_of(path: Any, command: str) -> str:
-    """A path in a request."""
+    """Return a path of a request."""
     if not isinstance(path, str) or not 0 < len(path) <= _MOST_PATH or "\0" in path:
         raise errors.ConfigError(f"worker: '{command}' needs paths, found {_short(path)}")
     return path
 
 
 def stamp_of(path: Any) -> tuple[str, int, int]:
-    """Path, time and size of a scene file, which change when the file does."""
+    """Return path, modification time and size of a scene file, which identify its state."""
     path = path_of(path, "load")
     try:
         status = Path(path).stat()
@@ -122,13 +122,13 @@ def stamp_of(path: Any) -> tuple[str, int, int]:
             f"{path}: expected a .r5dgs file, found none ({error.strerror}); choose its new place under "
             "'Scene File' in the R5DGS tab"
         ) from error
-    if not stat.S_ISREG(status.st_mode):  # reading a pipe or a device may never end
+    if not stat.S_ISREG(status.st_mode):  # a pipe or device could block forever
         raise errors.SceneFileError(f"{path}: expected a .r5dgs file, found something that is no file")
     return path, status.st_mtime_ns, status.st_size
 
 
 def number_of(value: dict[str, Any], numbers: list[int]) -> int:
-    """Number of a loaded scene, from its place among the paths; the first one by default."""
+    """Return the number of a loaded scene, from its position among the paths; the first by default."""
     number = value.get("scene", 0)
     if not _is_whole(number) or not 0 <= number < len(numbers):
         raise errors.ConfigError(f"worker: 'scene' has to be a number below {len(numbers)}, found {_short(number)}")
@@ -136,7 +136,7 @@ def number_of(value: dict[str, Any], numbers: list[int]) -> int:
 
 
 def matrix_of(value: Any, size: int, what: str) -> np.ndarray:
-    """A square matrix of finite numbers, float64."""
+    """Return a square matrix of finite numbers, float64. [size, size]"""
     try:
         matrix = np.asarray(value)
         if matrix.dtype.kind not in "if":
@@ -150,7 +150,7 @@ def matrix_of(value: Any, size: int, what: str) -> np.ndarray:
 
 
 def camera_of(value: dict[str, Any]) -> Camera:
-    """A camera that an image can be drawn with."""
+    """Return a camera, checked for rendering."""
     _refuse_others(value, ("width", "height", "intrinsics", "T_cam_world"), "a camera")
     width, height = value.get("width"), value.get("height")
     if not (_is_whole(width) and _is_whole(height) and 0 < width <= 32768 and 0 < height <= 32768):
@@ -167,7 +167,7 @@ def camera_of(value: dict[str, Any]) -> Camera:
 
 
 def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_renderer.Instance:
-    """An entry of ``instances``."""
+    """Convert an entry of ``instances``."""
     from ..render import scene_renderer  # late: it needs torch
 
     start, count = (value.get(name) for name in ("start", "count")) if isinstance(value, dict) else (None, None)
@@ -188,7 +188,7 @@ def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_renderer.Ins
 
 
 def check_rows(instances: Sequence[scene_renderer.Instance], lengths: Sequence[int]) -> None:
-    """Refuse instances with rows that their scene does not have.
+    """Raise ConfigError for instances with rows beyond the end of their scene.
 
     Args:
         instances: The instances.
@@ -203,12 +203,12 @@ def check_rows(instances: Sequence[scene_renderer.Instance], lengths: Sequence[i
 
 
 def check_size(camera: Camera, gaussians: int, ranks: int = 0) -> None:
-    """Refuse a picture that needs more memory than is free.
+    """Raise ConfigError for a picture that needs more memory than is free.
 
     Args:
-        camera: Its camera.
-        gaussians: Number of Gaussians that are drawn.
-        ranks: Groups of a coverage that each pixel keeps.
+        camera: Camera of the picture.
+        gaussians: Number of rendered Gaussians.
+        ranks: Coverage groups kept per pixel.
     """
     needed = camera.width * camera.height * (_PIXEL_BYTES + 16 * ranks) + gaussians * _GAUSSIAN_BYTES
     free = free_memory()
@@ -220,7 +220,7 @@ def check_size(camera: Camera, gaussians: int, ranks: int = 0) -> None:
 
 
 def free_memory() -> int:
-    """Memory that a picture may take, bytes: the available memory, or half of all memory if that is unknown."""
+    """Memory that a picture may use, bytes: the available memory, or half of the total if that is unknown."""
     try:
         with open("/proc/meminfo", encoding="ascii") as stream:
             return next(int(line.split()[1]) << 10 for line in stream if line.startswith("MemAvailable:"))
@@ -233,7 +233,7 @@ def free_memory() -> int:
 
 
 def sky_of(request: dict[str, Any], numbers: list[int]) -> tuple[int, np.ndarray] | None:
-    """Scene and matrix of the sky behind instances; None for black."""
+    """Return scene and matrix of the sky behind instances; None for black."""
     sky = request.get("sky")
     if sky is None:
         return None
@@ -256,12 +256,12 @@ def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
 
 
 def distance_of(request: dict[str, Any]) -> float:
-    """Depth at which depths begin to count."""
+    """Return the offset from the camera at which depth starts."""
     return _number(request.get("distance", 0.0), "worker: 'distance' has to be a number")
 
 
 def near_of(request: dict[str, Any]) -> float | None:
-    """Nearest depth that is drawn; None for the scenes' own."""
+    """Return the nearest depth to render; None for the near plane of each scene."""
     near = request.get("near")
     if near is not None and not (_is_number(near) and 0 < near <= cameras.FARTHEST):
         raise errors.ConfigError(f"worker: 'near' has to be a depth > 0, found {_short(near)}")
@@ -269,7 +269,7 @@ def near_of(request: dict[str, Any]) -> float | None:
 
 
 def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
-    """Names of the arrays to send."""
+    """Return the names of the requested arrays."""
     want = request.get("want", [])
     if not isinstance(want, list) or not all(isinstance(name, str) for name in want):
         raise errors.ConfigError(f"worker: 'want' has to be a list of names, found {_short(want)}")
@@ -280,7 +280,7 @@ def wanted(request: dict[str, Any], known: tuple[str, ...]) -> list[str]:
 
 
 def coverage_of(request: dict[str, Any]) -> tuple[list[int], int] | None:
-    """The group of each instance, and the number of groups that each pixel keeps; None without 'coverage'."""
+    """Return the group of each instance and the number of groups kept per pixel; None without 'coverage'."""
     asked = request.get("coverage")
     if asked is None:
         return None
@@ -319,5 +319,5 @@ def _is_whole(value: Any) -> TypeGuard[int]:
 
 
 def _short(value: Any) -> str:
-    """A value in a message, cut if it is long."""
+    """Return the repr of a value, shortened for messages."""
     return reprlib.repr(value)

@@ -1,20 +1,20 @@
-"""The worker that the Blender add-on talks to: ``python -m r5dgs_core.worker.server``.
+"""Worker process of the Blender add-on: ``python -m r5dgs_core.worker.server``.
 
-Requests are JSON lines on standard input; each gets one JSON line on standard output, followed by the raw bytes of the
-arrays that the line announces, in order:
+Requests are JSON lines on standard input. Each response is one JSON line on standard output, followed by the raw bytes
+of the arrays that the line announces, in order:
 
     -> {"id": 1, "command": "render", ...}
     <- {"id": 1, "ok": true, "result": {...}, "arrays": [{"name": "color", "dtype": "<f4", "shape": [H, W, 3]}]} + bytes
     <- {"id": 1, "ok": false, "error": {"kind": "SceneFileError", "message": "..."}}
 
-The scenes of the last ``load`` stay loaded. The worker ends when its input ends. Torch and the rasterizer are imported
-after the first answer, so that ``hello`` can say what is missing; the rasterizer is then made ready beside the
-requests, and who wants a picture sooner waits for it. Where it has to be compiled for that, lines of no request say so,
-between answers:
+The scenes of the last ``load`` stay in memory. The worker exits at the end of its input. Torch and the rasterizer are
+imported lazily, after the first response, so that ``hello`` can report missing packages. Kernels are then loaded in a
+background thread; render requests block until it finishes. If kernels have to be compiled, events without an id are
+sent between responses:
 
     <- {"event": "compiling", "text": "rasterizer: compiling ...", "arrays": []}
     <- {"event": "ready", "seconds": 7.9, "arrays": []}
-    <- {"event": "failed", "text": "LoweringError: ...", "arrays": []}     (instead, where that goes wrong)
+    <- {"event": "failed", "text": "LoweringError: ...", "arrays": []}     (instead of "ready")
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 
 
 class Warming:
-    """Makes the rasterizer's kernels for pictures ready, in a thread of its own.
+    """Background thread that loads or compiles the rasterizer's kernels.
 
     Args:
-        tell: Called with an event, from that thread, when kernels have to be compiled and when that is over or failed.
+        tell: Called from that thread with an event when compilation starts, and when it is done or has failed.
     """
 
     def __init__(self, tell: Callable[[dict[str, Any]], None]):
@@ -67,55 +67,55 @@ class Warming:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin, unless that was done before."""
+        """Start the thread, unless it was started before."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="r5dgs warm-up", daemon=True)
             self._thread.start()
 
     def wait(self) -> None:
-        """Return when it is over, at once where it has not begun."""
+        """Block until the thread has finished; return at once if it was not started."""
         if self._thread is not None:
             self._thread.join()
 
     @property
     def busy(self) -> bool:
-        """Whether it has begun and is not over."""
+        """True if the thread is running."""
         return self._thread is not None and self._thread.is_alive()
 
     def _run(self) -> None:
         try:
             from ..raster.cpu import compilation
             from ..render import warm_up
-        except (ImportError, errors.ConfigError):  # whoever asks for a picture hears of it
+        except (ImportError, errors.ConfigError):  # the next render request reports it
             return
         try:
             with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
                 over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False), 2)}
-        except Exception as error:  # whoever asks for a picture meets it again; the traceback goes to the log
+        except Exception as error:  # the next render request meets it again; the traceback goes to the log
             traceback.print_exc()
             over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}
-        if compilation.compiled():  # who was told of a beginning is told of the end
+        if compilation.compiled():  # every "compiling" event is followed by "ready" or "failed"
             self._tell(over)
 
 
 class Server:
-    """Answers requests; holds the scenes that were loaded last.
+    """Request handler that holds the scenes of the last ``load``.
 
     Args:
-        warming: What is waited for before the first picture.
+        warming: Thread to wait for before the first picture.
     """
 
     def __init__(self, warming: Warming | None = None) -> None:
         self._warming = warming
-        self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in order
-        self._failed: dict[tuple[str, int, int], str] = {}  # the last file that could not be read, and why
+        self._scenes: dict[tuple[str, int, int], Scene] = {}  # by path, time and size of the file; in load order
+        self._failed: dict[tuple[str, int, int], str] = {}  # stamp and error of the last unreadable file
         self._points = edited_points.EditedPoints()
-        self._stage = None  # of the scenes, from the first picture on
-        self._staged: list[Scene] = []  # what the stage draws: the scenes, extended by edited points
-        self._numbers: list[int] = []  # which of them each path of the last load is
-        self._errors: list[quality.Quality] = []  # what is known of theirs
-        self._players: dict[int, scene_player.Player] = {}  # of each scene, from the first time that is asked for
-        self._encoder: tuple[str, encoder_base.Encoder] | None = None  # the last one, by what it was asked for as
+        self._stage = None  # incremental renderer of `_staged`, created with the first picture
+        self._staged: list[Scene] = []  # the scenes, extended by edited points
+        self._numbers: list[int] = []  # scene number of each path of the last load
+        self._errors: list[quality.Quality] = []  # known error of each scene
+        self._players: dict[int, scene_player.Player] = {}  # by scene number, created on first playback
+        self._encoder: tuple[str, encoder_base.Encoder] | None = None  # the last encoder, with its path or "text"
         self._commands: dict[str, Callable[[dict[str, Any]], Answer]] = {
             "hello": self._hello,
             "load": self._load,
@@ -131,13 +131,13 @@ class Server:
         """Answer one request.
 
         Args:
-            request: ``command`` and its arguments.
+            request: ``command`` and its fields.
 
         Returns:
-            The result, JSON values, and arrays by name.
+            The result as JSON values, and arrays by name.
 
         Raises:
-            R5dgsError: The request asks for what cannot be had.
+            R5dgsError: The request is invalid or cannot be fulfilled.
         """
         return self._commands[asked.command_of(request)](request)
 
@@ -146,13 +146,13 @@ class Server:
         return {"protocol": PROTOCOL, "python": platform.python_version(), "missing": missing, "pid": os.getpid()}, {}
 
     def _load(self, request: dict[str, Any]) -> Answer:
-        """``paths``: read scene files, in this order; what is loaded already is kept, what is not named is let go."""
+        """Load the scene files ``paths`` in this order; keeps those already loaded and drops all others."""
         paths = asked.need(request, "paths", list)
         named = [asked.stamp_of(path) for path in paths]
-        stamps = list(dict.fromkeys(named))  # a file that is named twice is read once
+        stamps = list(dict.fromkeys(named))  # read a repeated file once
         if stamps != list(self._scenes):
             known, self._scenes, self._numbers, self._stage, self._players = self._scenes, {}, [], None, {}
-            known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # before others need room
+            known = {stamp: scene for stamp, scene in known.items() if stamp in stamps}  # free memory before reading
             found = {stamp: known.get(stamp) or self._read(stamp) for stamp in stamps}
             self._errors = [quality.of(scene, Path(stamp[0])) for stamp, scene in found.items()]
             self._scenes = found
@@ -161,36 +161,40 @@ class Server:
         return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
 
     def _read(self, stamp: tuple[str, int, int]) -> Scene:
-        """Read a scene file; one that failed last is not read again until it changes, as viewports ask at each move."""
+        """Read a scene file; the last unreadable file is not tried again until it changes, as viewports retry often."""
         if stamp not in self._failed:
             try:
                 return scene_file.read(Path(stamp[0]))
             except errors.SceneFileError as error:
-                if isinstance(error.__cause__, PermissionError):  # may pass without a change of the file
+                if isinstance(error.__cause__, PermissionError):  # may be resolved without a change of the file
                     raise
                 self._failed = {stamp: str(error)}
         raise errors.SceneFileError(self._failed[stamp])
 
     def _keep_points(self, request: dict[str, Any]) -> Answer:
-        """Hold point edits, see `edited_points.EditedPoints.keep`."""
+        """Keep point edits; see `edited_points.EditedPoints.keep`."""
         self._points.keep(request)
         return {}, {}
 
     def _render(self, request: dict[str, Any]) -> Answer:
-        """Rasterize the loaded scenes.
+        """Rasterize the loaded scenes, as instances or by playback.
 
-        ``camera``: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture. What is seen is
-        either ``instances``, a list of ``scene start count matrix world tint t``: a range of a scene's Gaussians, the
-        [4, 4] map of its bind state into that world, that of the scene's own world (with which its light turns; the
-        same where left out), factors on its colours, and the scene time that bends what has residuals. Instead of
-        ``start count``, ``points`` names an edit that a ``points`` request handed over. An instance with ``holdout``
-        cuts a hole: it is black, and in no array but ``holdout``, its share of each pixel. Or what is seen is ``t``,
-        playback of ``scene`` in its own world. ``sky``: null for black, or ``scene matrix``; with ``t``, that scene's
-        where left out. ``near``: nearest depth that is drawn, the scenes' own where left out. ``distance``: how far
-        before the camera depths count from. ``want``: any of ``depth alpha owners holdout``, with ``t`` ``ids`` for
-        ``owners``: the instance, or object, with the largest share of each pixel, -1 for none. With ``coverage``, of
-        ``groups`` (a number for each instance, -1 for none) and ``ranks``, the groups that cover each pixel most come
-        as ``coverage_groups`` and ``coverage``.
+        Fields of the request:
+            camera: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture.
+            instances: List of ``scene start count matrix world tint t holdout``. Each entry is a range of Gaussians of
+                a scene. ``matrix`` [4, 4] maps their bind state to the world of the picture; ``world`` [4, 4] maps the
+                scene's own world, which turns the view-dependent color (default: ``matrix``); ``tint`` scales the
+                color; ``t`` is the scene time at which residuals are evaluated. ``points`` replaces ``start count`` and
+                names an edit of a ``points`` request. An instance with ``holdout`` is black and appears in no array but
+                ``holdout``, its share of each pixel.
+            t: Scene time for playback of ``scene`` in its own world, instead of ``instances``.
+            sky: Null for black, or ``scene matrix``; with ``t``, the sky of that scene by default.
+            near: Nearest depth to render; the near plane of each scene by default.
+            distance: Offset from the camera at which depth starts.
+            want: Any of ``depth alpha owners holdout``; with ``t``, ``ids`` instead of ``owners holdout``. ``owners``
+                and ``ids`` are the instance or object with the largest share of each pixel, -1 for none.
+            coverage: ``groups`` (a number per instance, -1 for none) and ``ranks``. Adds the arrays ``coverage_groups``
+                and ``coverage``: the groups with the largest share of each pixel.
         """
         scenes = self._loaded()
         camera = asked.camera_of(asked.need(request, "camera", dict))
@@ -215,7 +219,7 @@ class Server:
             else:
                 output, ms_motion, count = self._playback(request, t, scenes, camera, near)
             covered = {} if coverage is None else self._coverage(*coverage, instances, camera, near)
-        except (ValueError, OverflowError, FloatingPointError) as error:  # of Gaussians that are out of range there
+        except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
             raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
@@ -235,13 +239,13 @@ class Server:
         camera: Camera,
         near: float | None,
     ) -> dict[str, np.ndarray]:
-        """Which groups of instances share each pixel, and how much of it each has."""
-        assert self._stage is not None  # the picture was drawn just now
+        """Return the groups of instances that share each pixel, and their shares."""
+        assert self._stage is not None  # created by `_instances`
         found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
         return {"coverage_groups": found, "coverage": shares}
 
     def _known(self, request: dict[str, Any]) -> list[dict[str, Any]]:
-        """What is known of each scene's error, and how many of its Gaussians bend and are shown unbent."""
+        """Return the known error of each scene and the number of its Gaussians with unapplied residuals."""
         shown = request.get("instances", ())
         bent = {self._numbers[entry.get("scene", 0)] for entry in shown if entry.get("t") is not None}
         return [
@@ -287,7 +291,7 @@ class Server:
         return output, ms_motion, len(pose.means)
 
     def _warm_up(self, _: dict[str, Any]) -> Answer:
-        """Make the rasterizer ready; how many kernels this process had to ``compile`` for that."""
+        """Load the rasterizer; returns the number of kernels that this process ``compiled``."""
         self._rasterizer()
         from ..raster.cpu import compilation
         from ..render import warm_up
@@ -296,7 +300,7 @@ class Server:
         return {"compiled": compilation.compiled()}, {}
 
     def _check(self, _: dict[str, Any]) -> Answer:
-        """Versions, device, and the milliseconds of a made picture; what ``warm_up`` says besides."""
+        """Return versions, device and render time of a synthetic picture (ms), and the result of ``warm_up``."""
         warm, _ = self._warm_up({})
         from ..render import speed_test
 
@@ -306,7 +310,7 @@ class Server:
         return {**warm, "versions": versions, **dataclasses.asdict(found)}, {}
 
     def _query(self, request: dict[str, Any]) -> Answer:
-        """``text``: ranked objects of a loaded ``scene``, the first one where left out.
+        """Return the objects of a loaded ``scene`` (the first by default) that match ``text``, ranked.
 
         ``encoder``: folder of the encoder that made the scene's lookup table, or "text", for words that the scene does
         not store; null for none.
@@ -318,7 +322,7 @@ class Server:
         return {"matches": [dataclasses.asdict(match) for match in found]}, {}
 
     def _embed(self, request: dict[str, Any]) -> Answer:
-        """``texts``: embeddings of phrases by an ``encoder`` as in ``query``, and what that is."""
+        """Return embeddings of the phrases ``texts`` by ``encoder`` (see `_query`), and the identity of the encoder."""
         texts = asked.texts_of(request)
         encoder = self._opened(request)
         card = encoder.card
@@ -326,10 +330,10 @@ class Server:
         return {"encoder": known}, {"embeddings": encoder_base.embed_phrases(encoder, texts)}
 
     def _opened(self, request: dict[str, Any]) -> encoder_base.Encoder:
-        """The encoder that is asked for; the last one stays open."""
+        """Return the requested encoder; the last one stays open."""
         where = asked.path_of(request.get("encoder"), "encoder")
         if self._encoder is None or self._encoder[0] != where:
-            self._encoder = None  # its memory first
+            self._encoder = None  # free its memory before the next one is opened
             self._encoder = where, registry.open_encoder(where)
         return self._encoder[1]
 
@@ -339,14 +343,14 @@ class Server:
         return list(self._scenes.values())
 
     def _rasterizer(self):
-        """`render.scene_renderer`, once it is warm."""
+        """Return `render.scene_renderer` after its kernels are loaded."""
         if self._warming is not None:
             self._warming.wait()
         return _rasterizer()
 
 
 def _rasterizer():
-    """`render.scene_renderer`, whose imports need torch and numba."""
+    """Return `render.scene_renderer`, whose import needs torch and numba."""
     try:
         from ..render import scene_renderer
     except ImportError as error:
@@ -357,15 +361,15 @@ def _rasterizer():
 
 
 def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
-    """Answer requests until the input ends or ``shutdown`` comes.
+    """Answer requests until the end of the input or a ``shutdown`` request.
 
     Args:
-        requests: JSON lines.
-        answers: Where the answers go.
-        warm: Whether to make the rasterizer ready after the first answer, see `Warming`.
+        requests: Stream of JSON lines.
+        answers: Stream for the responses.
+        warm: Load the rasterizer after the first response; see `Warming`.
 
     Returns:
-        Whether that is still going on.
+        True if the rasterizer is still loading.
     """
     lock = threading.Lock()
 
@@ -374,7 +378,7 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
             _send(answers, header, arrays or {})
 
     def tell(event: dict[str, Any]) -> None:
-        with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+        with contextlib.suppress(OSError, ValueError):  # the client has closed the stream
             send(event)
 
     warming = Warming(tell) if warm else None
@@ -418,12 +422,12 @@ def _send(answers: BinaryIO, header: dict[str, Any], arrays: dict[str, np.ndarra
 
 
 def main() -> None:
-    """Serve on standard input and output; whatever else prints goes to standard error."""
+    """Serve on standard input and output; all other output goes to standard error."""
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     if serve(sys.stdin.buffer, answers, warm=True):
         sys.stderr.flush()
-        os._exit(0)  # a thread that is compiling can neither be stopped nor outlive the interpreter
+        os._exit(0)  # a compiling thread can neither be stopped nor outlive the interpreter
 
 
 if __name__ == "__main__":

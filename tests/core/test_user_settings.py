@@ -27,7 +27,7 @@ def test_without_a_file_nothing_is_set(place, capsys):
     assert user_settings.read() == {}
     assert main.main(["config", "--user"]) == 0
     shown = capsys.readouterr().out
-    assert str(place) in shown and "not there yet" in shown
+    assert str(place) in shown and "does not exist yet" in shown
     assert all(f"{key} = (not set)" in shown for key in user_settings.MEANINGS)
 
 

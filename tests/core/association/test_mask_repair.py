@@ -111,7 +111,7 @@ def test_an_object_that_was_missed_gets_its_pixels_back(trained, tiny, tmp_path,
             assert (new[ids == 2] == 2).all()
         else:
             np.testing.assert_array_equal(new, ids)
-    assert "in 1 images objects that had no segment got pixels" in capsys.readouterr().out
+    assert "in 1 images, objects without a segment were filled in" in capsys.readouterr().out
     assert json.loads((out / mask_repair.SUMMARY).read_text())["mended"] == 1
 
 
@@ -134,7 +134,7 @@ def test_masks_that_are_read_are_not_written_over(trained, switched):
 
 def test_a_scene_file_alone_is_not_enough(tmp_path):
     (tmp_path / "scene.r5dgs").touch()
-    with pytest.raises(errors.ConfigError, match="needs the data set and a folder, --data and --out"):
+    with pytest.raises(errors.ConfigError, match="requires the options --data and --out"):
         cli_associate.run_associate(tmp_path / "scene.r5dgs")
     with pytest.raises(errors.SceneFileError, match=r"nowhere: expected a run folder or a \.r5dgs file, found nothing"):
         cli_associate.run_associate(tmp_path / "nowhere")

@@ -272,7 +272,7 @@ def test_only_the_data_of_a_run_bakes_it_and_measuring_on_others_is_said(made, t
         caplog.clear()
         assert main.main(["evaluate", str(target), "--data", str(other.root), "--json", str(tmp_path / "e.json")]) == 0
         assert [r.getMessage() for r in caplog.records if r.name == runs.__name__] == [
-            f"{other.root}: {target} was trained on other data than this; it is used all the same"
+            f"{other.root}: differs from the data that {target} was trained on; it is used anyway"
         ]
 
 

@@ -319,7 +319,7 @@ def test_the_command_reports_a_scene_file(scene, data, tmp_path, capsys):
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"report.json", "report.csv", "report.md", "report.png"}
     alone = ["report", str(path), "--out", str(tmp_path / "alone"), "--tasks", "images"]
     assert main.main([*alone, "--progress", "none"]) == 3
-    assert f"--tasks images: needs the data set: r5dgs report {path} DATA" in capsys.readouterr().err
+    assert f"--tasks images: require the data set: r5dgs report {path} DATA" in capsys.readouterr().err
     assert not (tmp_path / "alone").exists()
 
 

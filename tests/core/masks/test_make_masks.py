@@ -143,7 +143,7 @@ def test_masks_of_a_folder_are_taken_over_as_ids(copied, tmp_path, capsys):
     assert (made.images, made.objects, made.numbering) == (36, 2, "scene")
     assert made.unknown == pytest.approx(1 / 36)
     assert "36 of 36 training images, 2 objects" in (told := capsys.readouterr().out)
-    assert "nothing is known of 2.8 % of the pixels" in told
+    assert "2.8 % of the pixels are unknown" in told
     dataset = datasets.read(copied)
     dataset.require_one_numbering()
     for view in dataset.train:
@@ -236,7 +236,7 @@ def test_masks_that_a_backend_does_not_make_leave_nothing_of_others_behind(copie
 def test_255_is_not_called_unknown_where_nothing_is_written(copied):
     """Training would read it as an object all the same."""
     with pytest.raises(
-        errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or say it in .*masks"
+        errors.ConfigError, match=r"--unknown 255: nothing would be written.*--out, or record it in .*masks"
     ):
         cli_masks.run_masks(copied, unknown=255)
     (copied / "object_mask" / "masks.json").write_text('{"format_version": 1, "unknown": 255}')

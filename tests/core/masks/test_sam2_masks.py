@@ -254,7 +254,7 @@ def test_the_command_makes_goes_on_and_says_what_comes_next(tiny, folder, tmp_pa
         return label(self, video, room, report)
 
     monkeypatch.setattr(sam2_masks.Sam2Masks, "label", stopped)
-    with pytest.raises(errors.Interrupted, match="videos that are done stay"):
+    with pytest.raises(errors.Interrupted, match="finished videos are kept"):
         cli_masks.run_masks(tiny.root, **options)
     first = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.png")}
     assert len(first) == 12
