@@ -1,1 +1,1 @@
-"""The render engine: requests to the worker, viewport, passes and previews."""
+"""Render engine: worker requests, viewport drawing, passes and previews."""

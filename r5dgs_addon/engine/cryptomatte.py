@@ -1,6 +1,6 @@
-"""Cryptomatte of objects: soft masks of the clouds, picked by name in the compositor.
+"""Object Cryptomatte: soft masks of the point clouds, picked by name in the compositor.
 
-Each pass holds two ranks of a pixel as identity and coverage; the names lie in the metadata of the render result.
+Each pass holds two ranks per pixel as identity and coverage. The names are stored in the render result's metadata.
 """
 
 from typing import Any
@@ -13,37 +13,37 @@ from . import render_request
 
 LAYER = "CryptoObject"
 CHANNELS = "rgba"
-RANKS = 2  # of one pass
+RANKS = 2  # ranks per pass
 
 
 def pass_names(view_layer: bpy.types.ViewLayer) -> list[str]:
-    """The passes that a view layer asks for, none where it asks for no Cryptomatte."""
+    """Cryptomatte passes of a view layer, or an empty list if Cryptomatte is off."""
     if not view_layer.use_pass_cryptomatte_object:
         return []
     return [f"{LAYER}{number:02d}" for number in range((view_layer.pass_cryptomatte_depth + 1) // RANKS)]
 
 
 def names_of(seen: render_request.Shown) -> list[str]:
-    """The names of the clouds that are seen, each once; hold-outs have none."""
+    """Unique names of the visible point clouds, without hold-outs."""
     return list(dict.fromkeys(instance.object.name for instance in seen.instances if not instance.holdout))
 
 
 def request(seen: render_request.Shown, passes: int) -> dict[str, Any]:
-    """What the worker is asked for beside the picture: the name of each instance by number, and how many ranks."""
+    """Request arguments for coverage: name index of each instance (-1 for hold-outs) and number of ranks."""
     names = names_of(seen)
     groups = [-1 if one.holdout else names.index(one.object.name) for one in seen.instances]
     return {"groups": groups, "ranks": RANKS * passes}
 
 
 def pixels(arrays: dict[str, np.ndarray], seen: render_request.Shown, number: int) -> np.ndarray:
-    """What a pass of a number holds, of the worker's answer; rows from the top. [H, W, 4] float32"""
+    """Pixels of a Cryptomatte pass from the worker's arrays, top row first. [H, W, 4] float32"""
     ranks = slice(RANKS * number, RANKS * (number + 1))
     values = np.array([*(cryptomatte.value_of(name) for name in names_of(seen)), 0], np.float32)
-    identities, shares = values[arrays["coverage_groups"][..., ranks]], arrays["coverage"][..., ranks]  # none is last
+    identities, shares = values[arrays["coverage_groups"][..., ranks]], arrays["coverage"][..., ranks]  # -1: none
     return np.stack([identities, shares], axis=-1).reshape(*shares.shape[:2], 2 * RANKS)
 
 
 def write_names(result: bpy.types.RenderResult, view_layer: bpy.types.ViewLayer, seen: render_request.Shown) -> None:
-    """Put the names into the metadata of a render result."""
+    """Store the names in the metadata of a render result."""
     for key, text in cryptomatte.metadata(f"{view_layer.name}.{LAYER}", names_of(seen)).items():
         result.stamp_data_add_field(key, text)

@@ -1,6 +1,6 @@
-"""The render engine R5DGS: F12, animations and Rendered viewports with the worker's rasterizer.
+"""The R5DGS render engine: F12, animations and Rendered viewports with the worker's rasterizer.
 
-A picture is what the depsgraph shows, see `render_request`; so a frame of an animation is the frame that F12 renders.
+An image shows the depsgraph (see `render_request`), so a frame of an animation equals the frame that F12 renders.
 """
 
 import functools
@@ -17,8 +17,8 @@ from ..worker import jobs
 from . import cryptomatte, render_notes, render_passes, render_request, stereo, view_cameras, viewport
 
 ENGINE = "R5DGS"
-LOOK_S = 0.005  # between two looks at the worker, and at whether the user wants to stop
-GRACE_S = 0.2  # a picture that is stopped may take this long, before the worker is
+LOOK_S = 0.005  # polling interval of the worker and of the user's request to stop
+GRACE_S = 0.2  # time that a stopped render may take to finish before the worker is ended
 
 
 class R5DGS_RenderEngine(bpy.types.RenderEngine):
@@ -29,18 +29,18 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
     bl_use_preview = False
     bl_use_eevee_viewport = True  # for Material Preview
 
-    _port = None  # what this engine draws in its viewport
+    _port = None  # viewport that this engine instance draws
     _said = ""
 
     def update_render_passes(self, scene, renderlayer):
-        """Tell the compositor which passes there are."""
+        """Register the passes with the compositor."""
         for one in render_passes.of_layer(renderlayer):
             self.register_pass(scene, renderlayer, one.name, len(one.channels), one.channels, one.kind)
 
     def render(self, depsgraph):
-        """Render a view layer; called for every frame, in a thread of its own where there is a window.
+        """Render a view layer. Called once per frame, in a separate thread if there is a window.
 
-        An error that is reported ends the render, and nothing is written; without, a black picture would be saved.
+        A reported error ends the render and prevents Blender from saving a black image.
         """
         try:
             self._render(depsgraph)
@@ -51,10 +51,10 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
             raise
 
     def view_update(self, context, depsgraph):
-        """Nothing to do: `view_draw`, which follows, sees by itself what has changed."""
+        """Do nothing: `view_draw` follows and detects changes itself."""
 
     def view_draw(self, context, depsgraph):
-        """Draw the last picture of the viewport, and ask for another where it is not of what the viewport shows."""
+        """Draw the last image of the viewport, and request another if the view has changed."""
         if self._port is None:
             self._port = viewport.Port()
         self._port.draw(self, context, depsgraph)
@@ -102,7 +102,7 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         self.update_progress(1.0)
 
     def _ask(self, steps):
-        """The worker's arrays, or None where the user stops the render."""
+        """Return the worker's arrays, or None if the user stops the render."""
         job = jobs.start(steps)
         while not job.done:
             if self._stopped(job.doing):
@@ -114,20 +114,20 @@ class R5DGS_RenderEngine(bpy.types.RenderEngine):
         return arrays
 
     def _stopped(self, doing: str) -> bool:
-        """Say what is waited for, wait a moment, and see whether the user wants to stop."""
+        """Show the current status, wait briefly, and return True if the user wants to stop."""
         self._say(f"{doing[:1].upper()}{doing[1:]}")
         time.sleep(LOOK_S)
         return self.test_break()
 
     def _say(self, text: str) -> None:
-        """Show a few words over the picture and in the console, once."""
+        """Show a status text in the render window and the console, unless it is unchanged."""
         if text != self._said:
             self._said = text
             self.update_stats("", text)
 
 
 def _leave(job: jobs.Job) -> None:
-    """Give up on a job; one that ends by itself in a moment spares the worker."""
+    """Abandon a job. If it ends within `GRACE_S`, the worker is kept."""
     end = time.monotonic() + GRACE_S
     while not (job.done or job.drop()) and time.monotonic() < end:
         time.sleep(LOOK_S)
@@ -135,7 +135,7 @@ def _leave(job: jobs.Job) -> None:
 
 
 def register():
-    """Register the settings and the engine, and let Blender's panels that are for all engines show for it."""
+    """Register settings and engine, and show Blender's engine-independent panels for it."""
     render_settings.register()
     view_transform.register()
     bpy.utils.register_class(R5DGS_RenderEngine)

@@ -1,7 +1,7 @@
-"""Live preview: while it is on, the image `R5DGS Preview` follows the frame and whatever else Blender shows.
+"""Live preview: keeps the image `R5DGS Preview` up to date with the current frame and scene.
 
-A timer, in Blender's own thread, compares what the camera sees with what the image shows, and asks the worker for the
-next picture where they differ and it is free: no handler, no data touched from a thread, and the latest state wins.
+A timer in Blender's main thread compares the camera's view with the image. If they differ and the worker is idle, it
+requests the next image. No handlers are needed, no thread touches Blender's data, and the latest state wins.
 """
 
 from typing import Any
@@ -14,27 +14,27 @@ from ..ui import status_bar
 from ..worker import jobs
 from . import render_request
 
-KEY = "live preview"  # what `jobs.busy` knows its pictures by
-LOOK_S = 0.05  # between two looks while a picture is made
-IDLE_S = 0.1  # between two looks at what Blender shows
+KEY = "live preview"  # job key for `jobs.busy`
+LOOK_S = 0.05  # timer interval while an image is rendered
+IDLE_S = 0.1  # timer interval while the image is up to date
 
 _job: jobs.Job | None = None
-_asked: list[tuple[str, str, dict[str, Any]]] | None = None  # what the last picture was asked for with
+_asked: list[tuple[str, str, dict[str, Any]]] | None = None  # steps of the last request
 _message = ""
 
 
 def running() -> bool:
-    """Whether it is on."""
+    """True if the live preview is on."""
     return bpy.app.timers.is_registered(look)
 
 
 def message() -> str:
-    """Why there is no picture; else empty."""
+    """Error message if there is no image, or ""."""
     return _message
 
 
 def start() -> None:
-    """Switch it on."""
+    """Start the live preview."""
     global _asked, _message
     if not running():
         _asked, _message = None, ""
@@ -42,7 +42,7 @@ def start() -> None:
 
 
 def stop() -> None:
-    """Switch it off. A picture that is being made is not waited for."""
+    """Stop the live preview without waiting for a running render."""
     global _job, _asked, _message
     _job, _asked, _message = None, None, ""
     if running():
@@ -50,7 +50,7 @@ def stop() -> None:
 
 
 def look() -> float:
-    """Take a picture that is ready, and ask for one of what Blender shows now. Returns seconds to the next look."""
+    """Show a finished image and request the next one if the view changed. Returns the timer interval in seconds."""
     global _job, _asked, _message
     if _job is not None:
         if not _job.done:
@@ -83,17 +83,17 @@ def look() -> float:
 
 @persistent
 def _stop_before_load(*_):
-    """Another file is about to be opened: nothing of this one may be touched any more."""
+    """Stop before another file is opened, because data of this one must not be accessed afterwards."""
     stop()
 
 
 def register():
-    """Listen to loading."""
+    """Register the load handler."""
     bpy.app.handlers.load_pre.append(_stop_before_load)
 
 
 def unregister():
-    """Switch it off, and undo `register`."""
+    """Stop the live preview and undo `register`."""
     stop()
     if _stop_before_load in bpy.app.handlers.load_pre:
         bpy.app.handlers.load_pre.remove(_stop_before_load)

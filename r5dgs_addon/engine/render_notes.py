@@ -1,4 +1,4 @@
-"""Notes on what a render leaves out, for the render's report, once per render, and the render properties."""
+"""Notes about unsupported features of a render, for its report (once per render) and the render properties."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -6,15 +6,15 @@ from bpy.app.handlers import persistent
 from ..scene import evaluated_points, loaded_scenes
 from . import visible_clouds
 
-_reported: set[str] = set()  # since the render began; an animation is one render
+_reported: set[str] = set()  # since the start of the render; an animation is one render
 
 
 def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> list[str]:
-    """Name what the engine does not render of a Blender scene, as sentences without a period.
+    """Features of a Blender scene that the engine does not render, as sentences without a period.
 
     Args:
-        scene: The scene.
-        depsgraph: Evaluated; its other hold-outs are named, too.
+        scene: Blender scene.
+        depsgraph: Evaluated depsgraph, or None to skip the check for hold-outs other than point clouds.
     """
     notes = []
     if scene.camera is not None and scene.camera.type == "CAMERA" and scene.camera.data.dof.use_dof:
@@ -30,7 +30,7 @@ def of(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> 
 
 
 def report(engine: bpy.types.RenderEngine, notes: list[str]) -> None:
-    """Report sentences as warnings, each once per render."""
+    """Report notes as warnings, each once per render."""
     for note in notes:
         if note not in _reported:
             _reported.add(note)
@@ -43,7 +43,7 @@ def _begin(*_):
 
 
 def register():
-    """Listen to the beginning of renders."""
+    """Register the handler of the start of renders."""
     bpy.app.handlers.render_init.append(_begin)
 
 

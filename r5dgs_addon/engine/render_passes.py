@@ -1,4 +1,4 @@
-"""The passes of the render engine: which a view layer asks for, and what the worker's arrays are in each."""
+"""Passes of the render engine: selection by view layer and conversion from the worker's arrays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from .. import compat
 from ..color import display_to_linear
 from . import cryptomatte, render_request, visible_clouds
 
-NOTHING = 1e10  # depth where there is nothing, as Blender's own engines write it
-SOLID = 0.5  # alpha from which on a pixel has a depth and an object
+NOTHING = 1e10  # depth of empty pixels, as in Blender's own engines
+SOLID = 0.5  # minimum alpha of pixels that have a depth and an object
 
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass of a render result.
+    """Render pass.
 
     Attributes:
-        name: Blender's name of it.
-        channels: Their names, one letter each.
-        kind: Of its socket in the compositor: COLOR or VALUE.
-        want: The worker's array that it is made of; empty for the colour.
+        name: Blender's name of the pass.
+        channels: Channel names, one letter each.
+        kind: Type of its compositor socket, COLOR or VALUE.
+        want: Array of the worker that it is made of; "" for colour.
     """
 
     name: str
@@ -39,7 +39,7 @@ INDEX = Pass(compat.OBJECT_INDEX, "X", "VALUE", "owners")
 
 
 def of_layer(view_layer: bpy.types.ViewLayer) -> list[Pass]:
-    """The passes that a view layer asks for, *Combined* first."""
+    """Passes of a view layer, *Combined* first."""
     found = [COMBINED]
     if view_layer.use_pass_z:
         found.append(DEPTH)
@@ -50,7 +50,7 @@ def of_layer(view_layer: bpy.types.ViewLayer) -> list[Pass]:
 
 
 def wanted(passes: Sequence[Pass], transparent: bool) -> tuple[str, ...]:
-    """The arrays to ask the worker for, beside the colour."""
+    """Names of the arrays to request from the worker in addition to the colour."""
     names = [one.want for one in passes if one.want]
     return (*names, "alpha") if transparent or DEPTH in passes else tuple(names)
 
@@ -62,17 +62,17 @@ def pixels(
     transparent: bool,
     inverse: view_inverse.Inverse | None = None,
 ) -> np.ndarray:
-    """What a pass holds.
+    """Pixels of a pass.
 
     Args:
         one: The pass.
-        arrays: The worker's answer, of what `wanted` names.
-        seen: What was rendered.
-        transparent: Whether the film is.
-        inverse: Of the view transform; of *Standard* where None.
+        arrays: Arrays from the worker, as named by `wanted`.
+        seen: Rendered scene.
+        transparent: True if the film is transparent.
+        inverse: Inverse of the view transform, or None for *Standard*.
 
     Returns:
-        Rows from the top. [H, W, channels] float32
+        Pixels, top row first. [H, W, channels] float32
     """
     if one == COMBINED:
         return display_to_linear.scene_linear(arrays["color"], alpha(arrays, transparent), inverse)
@@ -84,25 +84,25 @@ def pixels(
 
 
 def alpha(arrays: dict[str, np.ndarray], transparent: bool) -> np.ndarray | None:
-    """Alpha of a picture, 0 in hold-outs, or None if it is opaque everywhere. [H, W]"""
+    """Alpha of an image, 0 in hold-outs, or None if it is opaque everywhere. [H, W]"""
     if transparent:
         return arrays["alpha"]
     return 1 - arrays["holdout"] if "holdout" in arrays else None
 
 
 def depths(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Depths of a picture with ``alpha`` and ``depth``, `NOTHING` where it is not solid. [H, W] float32"""
+    """Depths from ``alpha`` and ``depth``; `NOTHING` where alpha is below `SOLID`. [H, W] float32"""
     return np.where(arrays["alpha"] >= SOLID, arrays["depth"], np.float32(NOTHING)).astype(np.float32)
 
 
 def indices(arrays: dict[str, np.ndarray], seen: render_request.Shown) -> np.ndarray:
-    """Object indices of a picture with ``owners``, 0 where nothing is in front. [H, W] int64"""
+    """Object indices from ``owners``, 0 for background. [H, W] int64"""
     own = [index_of(instance) for instance in seen.instances]
-    return np.array([*own, 0], np.int64)[arrays["owners"]]  # none is -1, the last
+    return np.array([*own, 0], np.int64)[arrays["owners"]]  # owner -1 (none) selects the last value
 
 
 def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:
-    """The worker's arrays of a picture of nothing, with as many ranks of coverage."""
+    """Arrays of an empty image with the given number of coverage ranks."""
     size = (camera.height, camera.width)
     return {
         "color": np.zeros((*size, 3), np.float32),
@@ -115,18 +115,18 @@ def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:
 
 
 def index_of(instance: visible_clouds.Instance) -> int:
-    """Object index of a cloud: the user's *Pass Index* where one is set, else the id of the scene's table."""
+    """Object index of a point cloud: the user's *Pass Index* if set, otherwise its object id."""
     makers = [instance.object] if instance.parent is None else [instance.parent, instance.object]
     indices = [maker.pass_index for maker in makers if maker.pass_index]
     return indices[0] if indices else max(instance.object.r5dgs.object_id, 0)
 
 
 def fill(layer: bpy.types.RenderLayer, arrays: dict[str, np.ndarray]) -> None:
-    """Write passes of a render layer in one go, which is far faster than one by one.
+    """Write all passes of a render layer in one call, which is far faster than one call per pass.
 
     Args:
-        layer: Of a render result.
-        arrays: Rows from the top, by name of the pass; passes without one stay black. [H, W, channels]
+        layer: Layer of a render result.
+        arrays: Pixels by pass name, top row first; other passes stay black. [H, W, channels]
     """
     height, width = arrays[COMBINED.name].shape[:2]
     parts = []

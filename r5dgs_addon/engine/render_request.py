@@ -1,8 +1,8 @@
-"""What Blender shows, as a request to the worker, and the worker's picture as a Blender image.
+"""Worker request for the current state of the Blender scene, and conversion of the result to a Blender image.
 
-All loaded scenes of the active Blender scene are in one picture, in Blender's world. The picture is display-referred
-sRGB, as trained. It is kept in an image of 8 bits per channel in the color space sRGB: Blender shows such images as
-they are, saves the same bytes, and linearises them where the compositor needs it.
+All loaded scenes of the active Blender scene are rendered into one image, in Blender's world. The image is
+display-referred sRGB, as trained. It is stored with 8 bits per channel in the color space sRGB: Blender displays and
+saves such images unchanged, and linearises them for the compositor.
 """
 
 import os
@@ -21,18 +21,18 @@ from ..worker import jobs
 from . import render_stats, view_cameras, visible_clouds
 
 IMAGE = "R5DGS Preview"
-PREVIEW = "preview"  # what `jobs.busy` knows previews by
+PREVIEW = "preview"  # job key for `jobs.busy`
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What Blender shows of its loaded scenes.
+    """Visible parts of the loaded scenes.
 
     Attributes:
-        view: What looks, in Blender's world.
-        scenes: Collections of the loaded scenes that can be seen; instances number them.
-        worlds: Map of each scene's world to Blender's. [4, 4] each
-        instances: Visible clouds and instances of them.
+        view: View to render, in Blender's world.
+        scenes: Collections of the visible loaded scenes, indexed by the instances.
+        worlds: Transform of each scene's world to Blender's. [4, 4] each
+        instances: Visible point clouds and instances of them.
     """
 
     view: view_cameras.View
@@ -42,7 +42,7 @@ class Shown:
 
     @property
     def camera(self) -> cameras.Camera:
-        """The camera, in Blender's world, OpenCV axes."""
+        """Camera in Blender's world, OpenCV axes."""
         return self.view.camera
 
 
@@ -51,18 +51,18 @@ def shown(
     looks: Callable[[Callable[[], np.ndarray]], view_cameras.View] | None = None,
     space: bpy.types.SpaceView3D | None = None,
 ) -> Shown:
-    """What Blender shows of its loaded scenes at the evaluated frame, sub-frame included.
+    """Visible parts of the loaded scenes at the evaluated frame, sub-frame included.
 
     Args:
-        depsgraph: Evaluated; one of a viewport hides what viewports hide, one of a render what renders hide.
-        looks: Gives what looks, of `view_cameras`, of points around what is seen; the active camera where None.
-        space: A 3D view whose local view hides the rest.
+        depsgraph: Evaluated depsgraph; its mode decides between viewport and render visibility.
+        looks: Function of `view_cameras` that maps a getter of bounding points to the view; None for the active camera.
+        space: 3D view whose local view is respected.
 
     Returns:
         View, scenes and instances.
 
     Raises:
-        ConfigError: The camera cannot be expressed, or a cloud has lost its points.
+        ConfigError: The camera is unsupported, or a point cloud has lost its points.
     """
     scenes, instances = visible_clouds.instances(depsgraph, space)
     instances = tuple(one for one in instances if one.seen)
@@ -72,28 +72,29 @@ def shown(
 
 
 def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Have the worker render, and wait for it.
+    """Render in the worker and wait for the result.
 
     Args:
-        seen: What `shown` gave.
-        want: Any of ``depth alpha owners``. With hold-outs, ``holdout`` comes, too.
-        sky: Whether the first scene's sky lies behind everything, or black.
+        seen: Result of `shown`.
+        want: Any of ``depth alpha owners``. With hold-outs, ``holdout`` is added.
+        sky: True to draw the first scene's sky as background instead of black.
 
     Returns:
-        The result, with ``ms_motion``, ``ms_raster`` and ``gaussians``, and arrays, top row first: ``color``, display-
-        referred sRGB over the sky or, without one, multiplied by alpha [H, W, 3]; ``alpha`` [H, W]; ``depth``, expected
-        z in the camera frame divided by alpha, 0 where alpha is 0 [H, W]; ``owners``, which of ``seen.instances`` has
-        the largest share of the pixel, -1 where alpha is below a half [H, W] int32; ``holdout``, the coverage of
-        hold-outs, which are black and part of nothing else [H, W].
+        The result with ``ms_motion``, ``ms_raster`` and ``gaussians``, and arrays, top row first: ``color``,
+        display-referred sRGB over the sky or, without sky, premultiplied by alpha [H, W, 3]; ``alpha`` [H, W];
+        ``depth``,
+        expected z in the camera frame divided by alpha, 0 if alpha is 0 [H, W]; ``owners``, index into
+        ``seen.instances`` of the instance with the largest share of the pixel, -1 if alpha is below 0.5 [H, W] int32;
+        ``holdout``, coverage of hold-outs, which are black and contribute to no other array [H, W].
 
     Raises:
-        R5dgsError: What the worker reports.
+        R5dgsError: Error reported by the worker.
     """
     return jobs.run(steps(seen, want, sky))
 
 
 def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
-    """The worker's requests for a picture, as `jobs.start` takes them; the job's answer is what `render` returns."""
+    """Worker requests of an image, for `jobs.start`. The job returns the same as `render`."""
     picture = {
         "camera": seen.view.request(),
         "instances": [instance.request() for instance in seen.instances],
@@ -109,10 +110,10 @@ def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tup
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:
-    """The file that a loaded scene came from, see `trust.find`.
+    """File of a loaded scene, see `trust.find`.
 
     Raises:
-        SceneFileError: It is missing, or the user has to allow it first.
+        SceneFileError: The file is missing, or the user must allow it first.
     """
     found = trust.find(collection)
     if found.path is not None:
@@ -130,12 +131,12 @@ def scene_path(collection: bpy.types.Collection) -> Path:
 
 
 def start(context: bpy.types.Context) -> jobs.Job:
-    """Begin a picture of what Blender shows without waiting; give the job's answer to `finish`."""
+    """Submit a preview of the current scene without waiting. Pass the job's result to `finish`."""
     return jobs.submit(PREVIEW, steps(shown(context.evaluated_depsgraph_get())))
 
 
 def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.types.Image, dict[str, Any]]:
-    """Put the worker's answer into the image `R5DGS Preview`, and its figures where the sidebar shows them.
+    """Write the worker's result to the image `R5DGS Preview` and its statistics to the sidebar.
 
     Returns:
         The image, and the result: ``ms_motion ms_raster gaussians``, and ``name error unbent`` for each of ``scenes``.
@@ -147,7 +148,7 @@ def finish(answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> tuple[bpy.ty
 
 
 def show(context: bpy.types.Context, image: bpy.types.Image) -> bool:
-    """Put an image into Image Editors that hold none; whether one shows it, or there is no window to look at."""
+    """Show an image in empty Image Editors. Returns True if an editor shows it, or in background mode."""
     if bpy.app.background:
         return True
     areas = [area for window in context.window_manager.windows for area in window.screen.areas]
@@ -159,14 +160,14 @@ def show(context: bpy.types.Context, image: bpy.types.Image) -> bool:
 
 
 def write_image(name: str, color: np.ndarray) -> bpy.types.Image:
-    """Put a display-referred picture into a Blender image of 8 bits per channel, made where it does not exist.
+    """Write a display-referred image to a Blender image with 8 bits per channel, which is created if missing.
 
     Args:
         name: Name of the image.
         color: sRGB, clamped to [0, 1] here, top row first. [H, W, 3]
 
     Returns:
-        The image.
+        The Blender image.
     """
     height, width = color.shape[:2]
     image = bpy.data.images.get(name)

@@ -1,4 +1,4 @@
-"""What the last picture took, and the error that goes with it: for the sidebar, not saved."""
+"""Render time and error of the last preview, shown in the sidebar and not saved."""
 
 from typing import Any
 
@@ -9,17 +9,17 @@ from ..ui import plural
 
 
 class R5DGS_PG_figures(bpy.types.PropertyGroup):
-    """Figures of the last preview."""
+    """Statistics of the last preview."""
 
     size: StringProperty(name="Size", description="Width and height of the last preview in pixels")
-    ms_motion: FloatProperty(name="Motion", description="Milliseconds that bringing Gaussians to their places took")
-    ms_raster: FloatProperty(name="Raster", description="Milliseconds that rasterizing took")
-    error: StringProperty(name="Error", description="What is known of the error of the scenes in the picture")
-    unbent: IntProperty(name="Not Bent", description="Gaussians that bend while observed, shown as if they did not")
+    ms_motion: FloatProperty(name="Motion", description="Time spent posing Gaussians (ms)")
+    ms_raster: FloatProperty(name="Raster", description="Time spent rasterizing (ms)")
+    error: StringProperty(name="Error", description="Known error of the rendered scenes")
+    unbent: IntProperty(name="Not Bent", description="Gaussians with residual motion that the preview leaves out")
 
 
 def remember(image: bpy.types.Image, result: dict[str, Any]) -> None:
-    """Keep the figures of a picture, of the worker's result."""
+    """Store the statistics of an image from the worker's result."""
     figures = bpy.context.window_manager.r5dgs_figures
     figures.size = f"{image.size[0]} x {image.size[1]}"
     figures.ms_motion, figures.ms_raster = result["ms_motion"], result["ms_raster"]
@@ -30,7 +30,7 @@ def remember(image: bpy.types.Image, result: dict[str, Any]) -> None:
 
 
 def speed() -> str:
-    """The last preview's size and milliseconds in a line; empty before the first."""
+    """Size and render time of the last preview in one line, or "" before the first preview."""
     figures = bpy.context.window_manager.r5dgs_figures
     if not figures.size:
         return ""
@@ -39,7 +39,7 @@ def speed() -> str:
 
 
 def errors() -> list[str]:
-    """What is known of the last preview's error, a line for each thing."""
+    """Known error of the last preview, one line per item."""
     figures = bpy.context.window_manager.r5dgs_figures
     lines = [figures.error] if figures.error else []
     if figures.unbent:
@@ -48,7 +48,7 @@ def errors() -> list[str]:
 
 
 def register():
-    """Register the group and hang it on the window manager."""
+    """Register the property group on the window manager."""
     bpy.utils.register_class(R5DGS_PG_figures)
     bpy.types.WindowManager.r5dgs_figures = PointerProperty(type=R5DGS_PG_figures)
 

@@ -1,4 +1,4 @@
-"""The views of a stereoscopic or multi-view render: each is a picture of its own, by an eye of its own."""
+"""Views of a stereoscopic or multi-view render. Each view is rendered separately, with its own eye."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from . import view_cameras
 
 
 def names(scene: bpy.types.Scene) -> list[str]:
-    """Names of the views that a Blender scene renders; one without a name where it renders in mono."""
+    """Names of the views that a scene renders, or [""] without multi-view."""
     render = scene.render
     if not render.use_multiview:
         return [""]
@@ -20,20 +20,20 @@ def names(scene: bpy.types.Scene) -> list[str]:
 def eyes(
     engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph
 ) -> Iterator[tuple[str, view_cameras.Eye | None]]:
-    """The views one after the other, each the engine's active one while it is its turn.
+    """Iterate over the views, making each the active view of the engine.
 
     Args:
-        engine: What renders.
-        depsgraph: Evaluated.
+        engine: Render engine.
+        depsgraph: Evaluated depsgraph.
 
     Yields:
-        The view's name and its eye; none, which means the camera's own, where the scene renders in mono.
+        Name of the view, and its eye, or None for the camera itself (without multi-view).
     """
     for name in names(depsgraph.scene):
         camera = None
         if name:
             engine.active_view_set(name)
-            camera = engine.camera_override  # the one that the view's suffix chooses among several
+            camera = engine.camera_override  # camera selected by the view's suffix
         if camera is None or camera.type != "CAMERA":
             yield name, None
         else:

@@ -1,4 +1,4 @@
-"""What looks at the scenes: Blender's camera or a 3D view, as a camera of the core in Blender's world."""
+"""Conversion of Blender cameras and 3D views to core cameras in Blender's world."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,13 +13,14 @@ from ...r5dgs_core.scene import cameras
 
 @dataclass(frozen=True)
 class View:
-    """A camera of the core, and what it takes to be one.
+    """Core camera and depth range of a view.
 
     Attributes:
-        camera: OpenCV axes, in Blender's world.
-        distance: By how much it stands behind Blender's camera: 0, but for parallel projections, which are seen from
-            very far; depths are larger by that.
-        near: Nearest depth that is drawn; None for the scenes' own near plane.
+        camera: Camera with OpenCV axes, in Blender's world.
+        distance: Distance by which it is moved back from Blender's camera. Non-zero only for parallel projections,
+            which
+            are approximated from very far away; depths are larger by this value.
+        near: Nearest rendered depth, or None for the scenes' own near plane.
     """
 
     camera: cameras.Camera
@@ -27,7 +28,7 @@ class View:
     near: float | None = None
 
     def request(self) -> dict[str, Any]:
-        """The camera as the worker reads it."""
+        """Camera in the format of the worker request."""
         return {
             "width": self.camera.width,
             "height": self.camera.height,
@@ -38,12 +39,12 @@ class View:
 
 @dataclass(frozen=True)
 class Eye:
-    """One of the places that a stereoscopic camera sees from.
+    """Eye of a stereoscopic camera.
 
     Attributes:
         camera: The camera.
-        matrix_world: Where the eye is, to world, Blender's camera axes. [4, 4]
-        shift_x: Its shift, which is the camera's and that of the eye.
+        matrix_world: Eye to world, with Blender's camera axes. [4, 4]
+        shift_x: Total lens shift of camera and eye.
     """
 
     camera: bpy.types.Object
@@ -58,14 +59,14 @@ def of_camera(
     border: bool = True,
     eye: Eye | None = None,
 ) -> View:
-    """The picture that Blender would render.
+    """View of the image that Blender would render.
 
     Args:
-        depsgraph: Its scene has the resolution, its percentage, the pixel aspect and the border.
-        points: Gives points around what is seen, Blender's world; called for orthographic cameras alone.
-        camera: The camera; the scene's active one where None.
-        border: Whether a render border cuts the picture; else it is whole.
-        eye: What looks instead of the camera.
+        depsgraph: Depsgraph whose scene defines resolution, percentage, pixel aspect and border.
+        points: Returns bounding points of the scene in Blender's world; called only for orthographic cameras.
+        camera: Camera, or None for the scene's active one.
+        border: True to crop the image to the render border.
+        eye: Eye that replaces the camera.
 
     Returns:
         The view.
@@ -111,12 +112,12 @@ def of_region(
     region_3d: bpy.types.RegionView3D,
     points: Callable[[], np.ndarray],  # [P, 3]
 ) -> View:
-    """What a 3D view shows.
+    """View of a 3D viewport.
 
     Args:
-        region: Its window region.
-        region_3d: How it looks.
-        points: Gives points around what is seen, Blender's world; called for orthographic views alone.
+        region: Window region.
+        region_3d: Its view and projection matrices.
+        points: Returns bounding points of the scene in Blender's world; called only for orthographic views.
 
     Returns:
         The view.
@@ -127,9 +128,9 @@ def of_region(
 
 
 def size_of(scene: bpy.types.Scene) -> tuple[int, int]:
-    """Width and height of the whole picture that Blender would render, in pixels."""
+    """Width and height of the full image that Blender would render, in pixels."""
     render = scene.render
-    # Whole numbers, as Blender does it: 100 * (29 / 100) is less than 29 in floating point.
+    # Integer arithmetic, as in Blender: 100 * (29 / 100) is below 29 in floating point.
     return (
         max(render.resolution_x * render.resolution_percentage // 100, 1),
         max(render.resolution_y * render.resolution_percentage // 100, 1),
@@ -137,7 +138,7 @@ def size_of(scene: bpy.types.Scene) -> tuple[int, int]:
 
 
 def border_of(scene: bpy.types.Scene) -> tuple[int, int, int, int]:
-    """The render border in pixels of the whole picture: left, top, width, height."""
+    """Render border in pixels of the full image: left, top, width, height."""
     width, height = size_of(scene)
     render = scene.render
     left, right = int(render.border_min_x * width), int(render.border_max_x * width)
@@ -146,7 +147,7 @@ def border_of(scene: bpy.types.Scene) -> tuple[int, int, int, int]:
 
 
 def _fitted(camera: bpy.types.Camera, render: bpy.types.RenderSettings, width: int, height: int) -> float:
-    """Pixels of width that a shift of 1 is: those of the side that the sensor is fitted to."""
+    """Pixels of a lens shift of 1: size of the image side that the sensor is fitted to."""
     across, up = render.pixel_aspect_x * width, render.pixel_aspect_y * height
     horizontal = camera.sensor_fit == "HORIZONTAL" or camera.sensor_fit == "AUTO" and across >= up
     return width if horizontal else up / render.pixel_aspect_x
@@ -160,6 +161,6 @@ def _view(projection, matrix_world, width: int, height: int, points: Callable, n
         depths = (points() - world[:3, 3]) @ forward
         span = (float(depths.min()), float(depths.max())) if len(depths) else span
     camera, distance = cameras.from_projection(p, world, width, height, span, name)
-    # Behind an orthographic camera nothing is drawn, before or behind an orthographic view everything is.
+    # Orthographic cameras clip what is behind them; orthographic viewports do not.
     near = distance if distance and not behind else None
     return View(camera, distance, near)

@@ -1,7 +1,7 @@
-"""Rendered viewports: each draws its last picture and asks the worker for the next without waiting for it.
+"""Rendered viewports. Each draws its last image and requests the next one from the worker without blocking.
 
-While a view moves, pictures are small and the latest wish wins; once it rests, one of full size follows. A timer, in
-Blender's own thread, gives wishes to the worker and takes pictures from it.
+While a view moves, images are small and only the latest request counts. When it rests, an image of full size follows.
+A timer in Blender's main thread submits requests and receives images.
 """
 
 import functools
@@ -23,10 +23,10 @@ from ..ui import plural, status_bar
 from ..worker import jobs
 from . import render_passes, render_request, view_cameras
 
-KEY = "viewport"  # what `jobs.busy` knows their pictures by
-LOOK_S = 0.01  # between two looks at the worker
-REST_S = 0.15  # a view that has not moved for this long rests
-QUICK_MS = 40.0  # pictures of full size that take no longer come at once
+KEY = "viewport"  # job key for `jobs.busy`
+LOOK_S = 0.01  # polling interval of the worker
+REST_S = 0.15  # time without movement after which a view counts as resting
+QUICK_MS = 40.0  # full-size images that render at least this fast are requested even while the view moves
 FULL = 1
 
 _ports: "weakref.WeakSet[Port]" = weakref.WeakSet()
@@ -34,14 +34,14 @@ _asked: "tuple[jobs.Job, Port, Wish, int] | None" = None
 
 
 class Wish:
-    """What a viewport wants to show.
+    """Image requested by a viewport.
 
     Args:
-        seen: What it shows, with a camera of full size.
-        sky: Whether the sky lies behind everything.
-        transparent: Whether the film is.
-        moving: By what pictures are smaller while it moves.
-        inverse: Of the view transform; of *Standard* where None.
+        seen: Visible parts of the scenes, with a camera of full size.
+        sky: True to draw the sky as background.
+        transparent: True if the film is transparent.
+        moving: Factor by which the image is smaller while the view moves.
+        inverse: Inverse of the view transform, or None for *Standard*.
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class Wish:
         self.since = time.monotonic()
 
     def same(self, other: "Wish | None") -> bool:
-        """Whether another wish is for the same picture."""
+        """True if another request is for the same image."""
         if other is None or self.inverse is not other.inverse:
             return False
         return (self.steps, self.transparent) == (other.steps, other.transparent)
 
     def requests(self, smaller: int) -> list[tuple[str, str, dict[str, Any]]]:
-        """The worker's requests for the picture, smaller by a factor."""
+        """Worker requests for the image, reduced in size by a factor."""
         *before, (doing, command, arguments) = self.steps
         if smaller == FULL:
             return self.steps
@@ -76,20 +76,20 @@ class Wish:
 
 
 class Port:
-    """A viewport: its wish, its last picture, and how that was made."""
+    """State of a viewport: requested image, last image, and render time."""
 
     def __init__(self):
         self._wish: Wish | None = None
-        self._shown: tuple[Wish, int] | None = None  # what the picture is of, and by what it is smaller
+        self._shown: tuple[Wish, int] | None = None  # request of the shown image, and its reduction factor
         self._failed: Wish | None = None
-        self._pixels: np.ndarray | None = None  # a picture that is not on the GPU yet
+        self._pixels: np.ndarray | None = None  # image not yet uploaded to the GPU
         self._texture = None
         self._message = ""
         self._full_ms = 1e9
         _ports.add(self)
 
     def draw(self, engine: bpy.types.RenderEngine, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
-        """Draw the last picture over the region, and wish for what it shows now."""
+        """Draw the last image over the region and request the current view."""
         region, scene = context.region, depsgraph.scene
         try:
             self.want(_wish(context, depsgraph))
@@ -109,14 +109,14 @@ class Port:
         engine.update_stats("R5DGS", self._message)
 
     def want(self, wish: Wish) -> None:
-        """Wish for a picture; nothing happens where it is the one that was wished for."""
+        """Set the requested image. Does nothing if it equals the current request."""
         if not wish.same(self._wish):
             self._wish, self._failed = wish, None
         if self.next() is not None and not bpy.app.timers.is_registered(look):
             bpy.app.timers.register(look, first_interval=0.0)
 
     def next(self) -> tuple[Wish, int] | None:
-        """The picture that it waits for and by what that is smaller; None where it shows what it should."""
+        """Next request and its reduction factor, or None if the shown image is up to date."""
         wish = self._wish
         if wish is None or wish.same(self._failed):
             return None
@@ -127,11 +127,11 @@ class Port:
         return wish, FULL if done or quick else wish.moving
 
     def rests(self) -> bool:
-        """Whether the view has not moved for a while."""
+        """True if the view has not moved for `REST_S`."""
         return self._wish is not None and time.monotonic() - self._wish.since >= REST_S
 
     def take(self, wish: Wish, smaller: int, answer: tuple[dict[str, Any], dict[str, np.ndarray]]) -> None:
-        """Keep a picture of the worker for the next drawing."""
+        """Store an image from the worker for the next redraw."""
         result, arrays = answer
         milliseconds = result["ms_motion"] + result["ms_raster"]
         alpha = render_passes.alpha(arrays, wish.transparent)
@@ -143,16 +143,16 @@ class Port:
         self._message = f"{plural.of(result['gaussians'], 'Gaussian')} in {milliseconds:.0f} ms"
 
     def say(self, message: str) -> None:
-        """Show a few words at the viewport's corner."""
+        """Show a status text in the viewport's corner."""
         self._message = message
 
     def fail(self, wish: Wish, error: errors.R5dgsError) -> None:
-        """Show why there is no picture, and do not ask for it again until something changes."""
+        """Show an error, and do not repeat the request until it changes."""
         self._failed, self._message = wish, str(error)
 
 
 def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
-    """What the viewport that is being drawn should show."""
+    """Return the request for the viewport that is being drawn."""
     scene, settings = depsgraph.scene, render_settings.of(depsgraph.scene)
     looks = functools.partial(view_cameras.of_region, context.region, context.region_data)
     seen = render_request.shown(depsgraph, looks, context.space_data)
@@ -164,7 +164,7 @@ def _wish(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> Wish:
 
 
 def look() -> float | None:
-    """Take a picture that is ready, and give the worker the next wish. Returns seconds to the next look."""
+    """Receive a finished image and submit the next request. Returns the timer interval, or None to stop."""
     global _asked
     if _asked is not None:
         job, port, wish, smaller = _asked
@@ -184,7 +184,7 @@ def look() -> float | None:
         return None
     if jobs.busy() or bpy.app.is_job_running("RENDER"):
         return 0.1
-    for port, wish, smaller in sorted(waiting, key=lambda one: -one[2]):  # small pictures first: they are waited for
+    for port, wish, smaller in sorted(waiting, key=lambda one: -one[2]):  # moving views first
         if smaller == FULL and wish.moving != FULL and not port.rests():
             continue
         try:
@@ -197,7 +197,7 @@ def look() -> float | None:
 
 
 def forget() -> None:
-    """Stop looking after viewports."""
+    """Forget all viewports and stop the timer."""
     global _asked
     _asked = None
     _ports.clear()

@@ -1,7 +1,7 @@
-"""Which clouds Blender shows, where, and of which loaded scene; the depsgraph decides.
+"""Visible point clouds of the loaded scenes, with their transforms, as evaluated by the depsgraph.
 
-A cloud of a scene is shown at A x for a point x of its bind state, A being its matrix in Blender's world. The scene's
-own world, in which its light stands, is turned with its root; an instance of a collection turns both.
+A bind-state point x of a point cloud appears at A x, where A is the object's matrix in Blender's world. The scene's own
+world, in which its light direction is fixed, follows its root. A collection instance transforms both.
 """
 
 import itertools
@@ -14,27 +14,27 @@ import numpy as np
 
 from ..scene import evaluated_points, loaded_scenes, point_clouds, timeline
 
-FLAT = 1e-6  # smallest scale of a map over its largest
+FLAT = 1e-6  # minimum ratio of smallest to largest scale
 
 
 @dataclass(frozen=True)
 class Instance:
-    """A visible cloud, or an instance of one.
+    """Visible point cloud, or an instance of one.
 
     Attributes:
-        scene: Number of its collection among the scenes.
-        start: First row in the scene file; of an edited cloud, of what it was loaded with.
+        scene: Index of its loaded scene.
+        start: First row in the scene file, before any edit.
         count: Number of points.
-        matrix: Bind state to Blender's world. [4, 4]
-        world: The scene's world to Blender's. [4, 4]
-        tint: Factors on red, green and blue.
-        t: Scene time that bends what has residuals, where the scene plays exactly; else None.
-        object: The cloud; of an instance, the one that is instanced.
-        collection: The loaded scene.
-        parent: The object that makes the instance, or None.
-        edit: The points, if they are not those of the scene file.
-        holdout: True if it cuts a hole into pictures.
-        seen: True if cameras see it: neither its ray visibility nor an indirect-only collection hides it from them.
+        matrix: Transform from bind state to Blender's world. [4, 4]
+        world: Transform from the scene's world to Blender's. [4, 4]
+        tint: Factors of red, green and blue.
+        t: Scene time at which residuals are evaluated if Exact Mode is on, otherwise None.
+        object: Point cloud object, or the instanced one.
+        collection: Loaded scene.
+        parent: Instancer, or None.
+        edit: Edited points, or None if they are those of the scene file.
+        holdout: True if it is a hold-out.
+        seen: True if cameras see it: neither ray visibility nor an indirect-only collection hides it.
     """
 
     scene: int
@@ -52,7 +52,7 @@ class Instance:
     seen: bool = True
 
     def request(self) -> dict[str, Any]:
-        """What the worker reads."""
+        """Entry of the worker request."""
         entry: dict[str, Any] = {
             "scene": self.scene,
             "matrix": self.matrix.tolist(),
@@ -71,17 +71,17 @@ class Instance:
 def instances(
     depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
 ) -> tuple[tuple[bpy.types.Collection, ...], tuple[Instance, ...]]:
-    """The loaded scenes of a Blender scene that are not excluded, and their visible clouds.
+    """Loaded scenes in the view layer and their visible point clouds.
 
     Args:
-        depsgraph: Evaluated.
-        space: A 3D view whose local view hides the rest.
+        depsgraph: Evaluated depsgraph.
+        space: 3D view whose local view is respected.
 
     Returns:
-        Collections of the clouds, or, where no cloud is visible, all that are not excluded; and the clouds.
+        Collections of the visible point clouds, or all that are not excluded if none is visible; and the instances.
 
     Raises:
-        ConfigError: A cloud has lost points, and nothing tells which.
+        ConfigError: A point cloud has lost points and cannot be matched with its scene file.
     """
     homes, scenes = _homes(), _scenes(depsgraph)
     seen = [(obj, matrix, parent, homes.get(obj) or _by_root(obj)) for obj, matrix, parent in _clouds(depsgraph, space)]
@@ -93,7 +93,7 @@ def instances(
     frame, found = depsgraph.scene.frame_current_final, []
     for obj, matrix, parent, collection in seen:
         world = worlds[collection]
-        if parent is not None:  # what the instancer does to the cloud, it does to its world
+        if parent is not None:  # the instancer transforms the point cloud and its world alike
             own = np.array(obj.evaluated_get(depsgraph).matrix_world, np.float64)
             world = matrix @ np.linalg.solve(own, world)
         tint, number = tuple(obj.r5dgs_look.tint), scenes.index(collection)
@@ -110,7 +110,7 @@ def instances(
 
 
 def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | None = None) -> np.ndarray:
-    """Map of a loaded scene's world to Blender's; that of the file where its root is gone or flat. [4, 4] float64"""
+    """Transform from a loaded scene's world to Blender's, or identity if its root is missing or flat. [4, 4] float64"""
     root = collection.r5dgs.root
     if root is None:
         return np.eye(4)
@@ -120,7 +120,7 @@ def world_of(collection: bpy.types.Collection, depsgraph: bpy.types.Depsgraph | 
 
 
 def flat(matrices: list[np.ndarray]) -> np.ndarray:
-    """Which maps flatten space, as far as single precision tells: what is scaled to nothing is not seen. [n]"""
+    """Mask of transforms that are singular within single precision; such objects are invisible. [n]"""
     if not matrices:
         return np.zeros(0, bool)
     scales = np.linalg.svd(np.stack(matrices)[:, :3, :3], compute_uv=False)
@@ -128,9 +128,9 @@ def flat(matrices: list[np.ndarray]) -> np.ndarray:
 
 
 def points(found: tuple[Instance, ...]) -> Callable[[], np.ndarray]:
-    """A function that gives the corners of boxes around visible clouds, Blender's world. [P, 3] float64
+    """Return a function that computes the bounding box corners of visible point clouds. [P, 3] float64
 
-    It looks at every point, for which perspective views have no need. (Blender's own boxes are not up to date.)
+    It reads every point, so it is called only for parallel projections. Blender's own bounding boxes may be outdated.
     """
 
     def corners() -> np.ndarray:
@@ -152,7 +152,7 @@ def _positions(cloud: bpy.types.PointCloud) -> np.ndarray:
 
 
 def _box(positions: np.ndarray) -> np.ndarray:
-    """Corners of the box around points. [8, 3]"""
+    """Corners of the points' bounding box. [8, 3]"""
     if len(positions) == 0:
         return np.zeros((0, 3))
     ends = [(column.min(), column.max()) for column in positions.T]
@@ -162,13 +162,13 @@ def _box(positions: np.ndarray) -> np.ndarray:
 def _clouds(
     depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None
 ) -> Iterator[tuple[bpy.types.Object, np.ndarray, bpy.types.Object | None]]:
-    """Visible clouds: object, matrix in Blender's world, and what makes an instance of it, or None."""
+    """Visible point clouds: object, matrix in Blender's world, and instancer or None."""
     instancing = False
     for obj in depsgraph.objects:
         instancing |= obj.instance_type == "COLLECTION" and obj.instance_collection is not None
         if obj.original.r5dgs.role == "CLOUD" and obj.type == "POINTCLOUD" and _seen(obj.original, depsgraph, space):
             yield obj.original, np.array(obj.matrix_world, np.float64), None
-    if not instancing:  # going through instances is slow where ellipsoids stand for Gaussians
+    if not instancing:  # iterating over instances is slow if ellipsoids are shown
         return
     for instance in depsgraph.object_instances:
         if not instance.is_instance or instance.object.type != "POINTCLOUD":
@@ -179,30 +179,30 @@ def _clouds(
 
 
 def is_held_out(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return True if an object, or the instancer of it, is a hold-out by itself or by a collection."""
-    own = obj.evaluated_get(depsgraph)  # a render does not write animated values to the original
+    """Return True if an object or its instancer is a hold-out, by itself or by a collection."""
+    own = obj.evaluated_get(depsgraph)  # renders do not write animated values to the original
     return own.is_holdout or (parent or obj).holdout_get(view_layer=depsgraph.view_layer)
 
 
 def _is_seen(obj: bpy.types.Object, parent: bpy.types.Object | None, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return True if cameras see an object, or an instance of it."""
+    """Return True if cameras see an object or its instance."""
     maker = parent or obj
     direct = not maker.indirect_only_get(view_layer=depsgraph.view_layer) or is_held_out(obj, parent, depsgraph)
     return direct and all(one.evaluated_get(depsgraph).visible_camera for one in (obj, maker))
 
 
 def _seen(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None) -> bool:
-    """Whether a viewport shows an object: the depsgraph of one knows neither local views nor collections' eyes."""
+    """True if a viewport shows an object. Its depsgraph ignores local views and collection visibility."""
     return depsgraph.mode == "RENDER" or obj.visible_get(view_layer=depsgraph.view_layer, viewport=space)
 
 
 def _homes() -> dict[bpy.types.Object, bpy.types.Collection]:
-    """The loaded scene that each object lies in."""
+    """Loaded scene that contains each object."""
     return {obj: collection for collection in loaded_scenes.scene_collections() for obj in collection.all_objects}
 
 
 def _by_root(obj: bpy.types.Object) -> bpy.types.Collection | None:
-    """The loaded scene whose root a cloud hangs from, for one that was moved to another collection."""
+    """Loaded scene whose root is an ancestor of the object, for objects moved to other collections."""
     while obj.parent is not None:
         obj = obj.parent
         if obj.r5dgs.role == "ROOT":
@@ -211,7 +211,7 @@ def _by_root(obj: bpy.types.Object) -> bpy.types.Collection | None:
 
 
 def _scenes(depsgraph: bpy.types.Depsgraph) -> list[bpy.types.Collection]:
-    """Loaded scenes in the depsgraph's view layer that are not excluded there."""
+    """Loaded scenes in the depsgraph's view layer that are not excluded."""
     found, waiting = [], [depsgraph.view_layer.layer_collection]
     while waiting:
         layer = waiting.pop(0)

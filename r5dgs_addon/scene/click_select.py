@@ -1,27 +1,27 @@
-"""A click on Gaussians in a 3D view selects the anchor that moves them; the Outliner still selects clouds.
+"""Selection of anchors by clicking Gaussians in a 3D view. The Outliner still selects point clouds.
 
-Blender says when the active object changes. Where the last thing that the user did was a click in a 3D view and the
-new active object is a cloud, its anchor takes the cloud's place.
+Blender notifies the add-on when the active object changes. If the last operator was a click in a 3D view and the new
+active object is a point cloud, its anchor is selected instead.
 """
 
 import bpy
 from bpy.app.handlers import persistent
 
 CLICK = "VIEW3D_OT_select"
-_listener = object()  # owns the subscription
-_active = [0]  # `session_uid` of the active object after the last change that was heard of
+_listener = object()  # owner of the message bus subscription
+_active = [0]  # `session_uid` of the active object after the last notification
 
 
 def follow(context: bpy.types.Context, extend: bool, before: int = 0) -> bpy.types.Object | None:
-    """Let the anchor of the active cloud take its place in the selection.
+    """Replace the active point cloud in the selection by its anchor.
 
     Args:
-        context: Its view layer's selection is changed.
-        extend: Whether others stay selected. An anchor that was active already is then taken out, as Blender does it.
-        before: The `session_uid` of what was active before the click; 0 where that is not known.
+        context: Context whose view layer's selection changes.
+        extend: True to keep other objects selected. An anchor that was already active is deselected, as in Blender.
+        before: ``session_uid`` of the active object before the click; 0 if unknown.
 
     Returns:
-        The anchor; None where the active object is no cloud with an anchor that can be selected.
+        The anchor, or None if the active object is no point cloud with a selectable anchor.
     """
     layer = context.view_layer
     cloud = layer.objects.active
@@ -43,7 +43,7 @@ def follow(context: bpy.types.Context, extend: bool, before: int = 0) -> bpy.typ
 
 
 def listen() -> None:
-    """Be told when the active object changes; Blender forgets that when it opens a file."""
+    """Subscribe to changes of the active object. Blender drops subscriptions when it opens a file."""
     bpy.msgbus.clear_by_owner(_listener)
     bpy.msgbus.subscribe_rna(
         key=(bpy.types.LayerObjects, "active"), owner=_listener, args=(), notify=_when_active_changes
@@ -70,7 +70,7 @@ def _after_load(*_) -> None:
 
 
 def register():
-    """Listen, and again in each file that is opened."""
+    """Subscribe now and after each file is opened."""
     bpy.app.handlers.load_post.append(_after_load)
     listen()
 

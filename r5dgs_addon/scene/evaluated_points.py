@@ -1,8 +1,8 @@
-"""Points of clouds as Blender evaluates them: after edits of their data and after modifiers.
+"""Evaluated points of point clouds: after edits of their data and after modifiers.
 
-A cloud stores fingerprints of the attributes that it was loaded with. Attributes that still have theirs are those of
-the scene file; only the others are handed on. A cloud is compared again after an update of its geometry, after loading,
-undo and redo, and when a render begins; one with modifiers also at each frame of a render.
+A point cloud stores fingerprints of the attributes that were loaded. Attributes with unchanged fingerprints are taken
+from the scene file; only the others are passed on. A point cloud is compared again after an update of its geometry,
+after loading, undo and redo, and when a render starts; with modifiers, also at each rendered frame.
 """
 
 import hashlib
@@ -23,17 +23,17 @@ PARTS = {
     "scales": ("scale", "FLOAT_VECTOR", "vector", 3),
     "base": ("radiance:base", "FLOAT_COLOR", "color", 4),
 }
-BENDING = ("means", "quats", "scales")  # parts that Exact Mode overwrites at every frame
+BENDING = ("means", "quats", "scales")  # attributes that Exact Mode overwrites at every frame
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Edited points of a cloud; equal if they hold the same.
+    """Edited points of a point cloud, compared by ``key``.
 
     Attributes:
         key: Digest of the points.
-        points: The points. Only what differs from the scene file is there.
-        bent: True if they are already bent as Exact Mode bends them.
+        points: The attributes that differ from the scene file.
+        bent: True if Exact Mode has already applied the residual motion.
     """
 
     key: str
@@ -41,7 +41,7 @@ class Edit:
     bent: bool = field(default=False, compare=False)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays that differ from the scene file, and ``rows``, contiguous, as the worker reads them."""
+        """Contiguous arrays that differ from the scene file, and ``rows``, for the worker."""
         names = ("rows", *PARTS, "sh")
         found = {name: getattr(self.points, name) for name in names}
         return {name: np.ascontiguousarray(values) for name, values in found.items() if values is not None}
@@ -49,26 +49,26 @@ class Edit:
 
 @dataclass(frozen=True)
 class Found:
-    """Result of comparing a cloud's points with the scene file.
+    """Result of comparing a point cloud with the scene file.
 
     Attributes:
-        edit: The points, if they differ; else None.
-        notes: Sentences on what cannot be drawn of them; each begins with the cloud's name.
+        edit: Edited points, or None if there is no difference.
+        notes: Messages about points that cannot be drawn; each begins with the object's name.
     """
 
     edit: Edit | None = None
     notes: tuple[str, ...] = ()
 
 
-_known: dict[tuple, tuple[int, Found]] = {}  # by object and depsgraph; with the session_uid of the object's data
+_known: dict[tuple, tuple[int, Found]] = {}  # by object and depsgraph; with session_uid of the data
 
 
 def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) -> Found:
-    """Compare a cloud's evaluated points with its scene file.
+    """Compare a point cloud's evaluated points with its scene file.
 
     Args:
-        obj: The cloud, original.
-        depsgraph: Evaluated.
+        obj: Original point cloud object.
+        depsgraph: Evaluated depsgraph.
         gaussians: Number of Gaussians in the scene file.
 
     Returns:
@@ -88,27 +88,29 @@ def of(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, gaussians: int) ->
 
 
 def notes(collection: bpy.types.Collection) -> list[str]:
-    """Return the notes of the last comparisons of a loaded scene's clouds, without comparing them again."""
-    known = [(key[0], found) for key, (_, found) in list(_known.items()) if found.notes]  # renders add to it meanwhile
+    """Return the cached notes about a loaded scene's point clouds, without a new comparison."""
+    known = [
+        (key[0], found) for key, (_, found) in list(_known.items()) if found.notes
+    ]  # a render thread may add entries
     own = {obj.session_uid for obj in collection.all_objects} if known else set()
     return list(dict.fromkeys(note for uid, found in known if uid in own for note in found.notes))
 
 
 def forget(*_) -> None:
-    """Compare all clouds again when they are needed next."""
+    """Clear the cache, so that all point clouds are compared again."""
     _known.clear()
 
 
 def evaluated(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bpy.types.PointCloud:
-    """Return a cloud's points after its modifiers; those before them if its ellipsoids hide them."""
+    """Return a point cloud after its modifiers, or before them if older ellipsoids hide its points."""
     found = obj.evaluated_get(depsgraph).data
     return obj.data if len(found.points) == 0 and viewport_display.hides_points(obj) else found
 
 
 def _is_modified(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
-    """Return True if modifiers are on that change a cloud's points; ellipsoids do not."""
+    """Return True if enabled modifiers other than the ellipsoids change the points."""
     flag = "show_render" if depsgraph.mode == "RENDER" else "show_viewport"
-    found = obj.evaluated_get(depsgraph).modifiers  # a render does not write animated switches to the original
+    found = obj.evaluated_get(depsgraph).modifiers  # renders do not write animated switches to the original
     return any(one.name != viewport_display.MODIFIER and getattr(one, flag) for one in found)
 
 
@@ -124,7 +126,7 @@ def _compare(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph, edited: bool
     rows = _rows(obj, cloud, stored)
     values: dict[str, np.ndarray] = {}
     for part, (name, *kind) in PARTS.items():
-        if prefix and part in BENDING:  # Exact Mode takes edits over without a new evaluation
+        if prefix and part in BENDING:  # Exact Mode applies edits without a new evaluation
             found = _changed(obj.data, prefix + name, stored.get(name), *kind)
         else:
             found = _changed(cloud, name, stored.get(name), *kind)
@@ -160,7 +162,7 @@ def _notes(obj: bpy.types.Object, problems: list[str]) -> tuple[str, ...]:
 
 
 def _rows(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, str]) -> np.ndarray | None:
-    """Row of the scene file that each point is; None for those that the cloud was loaded with. [n] int32"""
+    """Scene file row of each point, or None if they are unchanged. [n] int32"""
     attribute = point_clouds.attribute(cloud, point_clouds.ROW, "INT")
     if attribute is None:
         if len(cloud.points) == obj.r5dgs.count:
@@ -181,7 +183,7 @@ def _rows(obj: bpy.types.Object, cloud: bpy.types.PointCloud, stored: dict[str, 
 def _changed(
     cloud: bpy.types.PointCloud, name: str, stored: str | None, kind: str, field_name: str, width: int
 ) -> np.ndarray | None:
-    """Values of an attribute, or None if they have the stored fingerprint or cannot be read. [n, width]"""
+    """Values of an attribute, or None if its fingerprint is unchanged or it cannot be read. [n, width]"""
     attribute = point_clouds.attribute(cloud, name, kind)
     if attribute is None:
         return None
@@ -190,7 +192,7 @@ def _changed(
 
 
 def _changed_harmonics(cloud: bpy.types.PointCloud, stored: dict[str, str]) -> np.ndarray | None:
-    """Harmonics of higher degree, or None if all of them have their fingerprints or some are missing. [n, K, 3]"""
+    """Higher-degree harmonics, or None if all fingerprints are unchanged or some are missing. [n, K, 3]"""
     count = sum(name.startswith(point_clouds.HARMONICS) for name in stored)
     kind = ("FLOAT_VECTOR", "vector", 3)
     names = [f"{point_clouds.HARMONICS}{k}" for k in range(count)]
@@ -201,7 +203,7 @@ def _changed_harmonics(cloud: bpy.types.PointCloud, stored: dict[str, str]) -> n
 
 
 def _drawable(rows: np.ndarray, values: dict[str, np.ndarray], gaussians: int) -> np.ndarray:
-    """Points that are Gaussians: those that nodes add have no valid row, or no size. [n] bool"""
+    """Mask of drawable points; points added by nodes have no valid row or no size. [n] bool"""
     there = (rows >= 0) & (rows < gaussians)
     if "scales" in values:
         there &= values["scales"].any(-1)
@@ -213,7 +215,7 @@ def _drawable(rows: np.ndarray, values: dict[str, np.ndarray], gaussians: int) -
 def _without_the_originals(
     obj: bpy.types.Object, rows: np.ndarray, values: dict[str, np.ndarray], stored: dict[str, str]
 ) -> dict[str, np.ndarray]:
-    """Values without those that only follow from points being deleted, repeated or sorted by modifiers."""
+    """Remove values that differ only because modifiers deleted, repeated or sorted points."""
     start = obj.r5dgs.start
     if not len(rows) or rows.min() < start or rows.max() >= start + obj.r5dgs.count:
         return values
@@ -240,13 +242,13 @@ def _is_radius_changed(obj: bpy.types.Object, cloud: bpy.types.PointCloud, store
     radius = point_clouds.attribute(cloud, "radius", "FLOAT")
     if radius is None or "radius" not in stored or len(cloud.points) != obj.r5dgs.count:
         return False
-    ellipsoids = obj.modifiers.get(viewport_display.MODIFIER) is not None  # they hide the points by their radius
+    ellipsoids = obj.modifiers.get(viewport_display.MODIFIER) is not None  # they set the radius to 0
     return not ellipsoids and point_clouds.fingerprint(point_clouds.view(radius, "value", 1)) != stored["radius"]
 
 
 def _made_besides_points(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[str]:
-    """Sentences on geometry that the modifiers of a cloud make and the engine does not draw."""
-    if obj.modifiers.get(viewport_display.MODIFIER) is not None:  # its ellipsoids are instances like any others
+    """Messages about geometry created by modifiers that the engine does not draw."""
+    if obj.modifiers.get(viewport_display.MODIFIER) is not None:  # instances are its ellipsoids
         return []
     own, instanced = set(), False
     for one in depsgraph.object_instances:
@@ -267,11 +269,11 @@ def _key(rows: np.ndarray, values: dict[str, np.ndarray]) -> str:
 
 @persistent
 def _follow_updates(_, depsgraph=None):
-    """Forget the clouds whose geometry was updated."""
+    """Remove the point clouds whose geometry was updated from the cache."""
     if not _known or depsgraph is None:
         return
     updated = {one.id.original.session_uid for one in depsgraph.updates if one.is_updated_geometry}
-    for key, (data, _) in list(_known.items()):  # a render's thread may change it meanwhile
+    for key, (data, _) in list(_known.items()):  # a render thread may change it meanwhile
         if key[0] in updated or data in updated:
             _known.pop(key, None)
 
@@ -289,7 +291,7 @@ def _hooks():
 
 
 def register():
-    """Listen to changes of clouds."""
+    """Register the handlers."""
     for events, handler in _hooks():
         events.append(handler)
 

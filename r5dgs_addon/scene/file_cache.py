@@ -1,4 +1,4 @@
-"""Cache of files that were read, and of errors in reading them, until a file changes."""
+"""Cache of file contents and read errors, valid until the file changes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 
 class Remembered(Generic[T]):
-    """Reads each file once for each state of it; a file that cannot be read is not read again either.
+    """Cache that reads each version of a file once. Failed reads are cached, too.
 
     Args:
-        read: Reads a file; raises SceneFileError.
+        read: Function that reads a file; raises SceneFileError.
     """
 
     def __init__(self, read: Callable[[Path], T]):
@@ -21,14 +21,14 @@ class Remembered(Generic[T]):
         self._known: dict[Path, tuple[tuple[int, int], T | errors.SceneFileError]] = {}
 
     def get(self, path: Path, again: bool = False) -> T:
-        """The content of a file.
+        """Return the content of a file.
 
         Args:
             path: The file.
-            again: Try a file anew that could not be read before, as the user asks for it.
+            again: True to retry a read that failed before, for explicit requests of the user.
 
         Raises:
-            SceneFileError: It cannot be read.
+            SceneFileError: The file cannot be read.
         """
         try:
             status = path.stat()
@@ -41,7 +41,7 @@ class Remembered(Generic[T]):
             try:
                 known = stamp, self._read(path)
             except errors.SceneFileError as error:
-                if isinstance(error.__cause__, PermissionError):  # may pass without a change of the file
+                if isinstance(error.__cause__, PermissionError):  # permissions change without a new timestamp
                     raise
                 known = stamp, error
             self._known[path] = known
@@ -50,5 +50,5 @@ class Remembered(Generic[T]):
         return known[1]
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Clear the cache."""
         self._known.clear()

@@ -1,7 +1,7 @@
-"""Isolating objects of loaded scenes: all others are hidden, and shown again as they were.
+"""Isolation of objects of loaded scenes: all others are hidden, and later restored.
 
-Hidden are the eye of the view layer (clouds and anchors) and renders (clouds). What that changed is kept in the .blend,
-so that a saved file can still go back. Nothing but objects of loaded scenes is touched.
+Objects are hidden in the view layer (point clouds and anchors) and in renders (point clouds). The changes are recorded
+in the .blend, so that a saved file can be restored. Only objects of loaded scenes are changed.
 """
 
 import bpy
@@ -10,14 +10,14 @@ from . import loaded_scenes, selection
 
 
 def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
-    """Show some objects and hide the others of all scenes loaded in the Blender scene.
+    """Show the given objects and hide all others of the scenes loaded in the Blender scene.
 
     Args:
-        context: Its scene and view layer are changed.
-        wanted: What to show, though it was hidden.
+        context: Context whose scene and view layer change.
+        wanted: Objects to show, even if hidden before.
 
     Returns:
-        How many objects of the tables are hidden by that.
+        Number of objects that are hidden.
     """
     restore(context.scene)
     state, layer = context.scene.r5dgs_words, context.view_layer
@@ -29,7 +29,7 @@ def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
             item = (collection, obj.r5dgs.object_id)
             hide = item not in wanted
             if hide and obj.r5dgs.role == "CLOUD" and (obj in shown_here or obj.library is None):
-                hidden.add(item)  # else it is instanced from a library, and cannot be hidden by itself
+                hidden.add(item)  # otherwise instanced from a library, and cannot be hidden alone
             before = (obj.hide_get(view_layer=layer), obj.hide_render)
             after = (hide if obj in shown_here else before[0], _may_render(obj, hide))
             if before != after:
@@ -40,12 +40,12 @@ def isolate(context: bpy.types.Context, wanted: list[selection.Wanted]) -> int:
 
 
 def restore(scene: bpy.types.Scene) -> bool:
-    """Show everything as it was before `isolate`. Returns whether anything was isolated."""
+    """Restore the visibility before `isolate`. Returns True if objects were isolated."""
     state = scene.r5dgs_words
     layer = scene.view_layers.get(state.hidden_in)
     known = set(layer.objects) if layer is not None else set()
     for record in state.hidden:
-        if record.obj is not None:  # else deleted since
+        if record.obj is not None:  # else deleted in the meantime
             _set(record.obj, layer if record.obj in known else None, record.hide, record.hide_render)
     was = is_isolated(scene)
     state.hidden.clear()
@@ -54,12 +54,12 @@ def restore(scene: bpy.types.Scene) -> bool:
 
 
 def is_isolated(scene: bpy.types.Scene) -> bool:
-    """Whether objects are isolated."""
+    """True if objects are isolated."""
     return bool(scene.r5dgs_words.hidden_in)
 
 
 def _may_render(obj: bpy.types.Object, hide: bool) -> bool:
-    """What ``hide_render`` becomes: anchors are never rendered, linked data is not ours to change."""
+    """New value of ``hide_render``, unchanged for anchors (never rendered) and linked objects (read-only)."""
     return hide if obj.r5dgs.role == "CLOUD" and obj.library is None else obj.hide_render
 
 

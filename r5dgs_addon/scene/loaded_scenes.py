@@ -1,4 +1,4 @@
-"""The loaded scenes of a .blend: their collections, which of them a Blender scene shows, members and origin."""
+"""Loaded scenes of a .blend: collections, presence in a Blender scene, members and origin."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,26 +6,25 @@ from collections.abc import Iterator
 import bpy
 import numpy as np
 
-ORIGIN = "r5dgs_origin"  # custom property of the root: other properties of Blender hold float32
+ORIGIN = "r5dgs_origin"  # custom property of the root, because Blender's built-in vectors are float32
 
 
 def scene_collections() -> list[bpy.types.Collection]:
-    """All collections that hold a loaded R5DGS scene."""
+    """Return all collections that hold a loaded R5DGS scene."""
     return [collection for collection in bpy.data.collections if collection.r5dgs.is_scene]
 
 
 def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.Object]]:
-    """Loaded scenes in a Blender scene.
+    """Loaded scenes in a Blender scene, and the objects that instance them.
 
     Returns:
-        The objects that instance each of them; none for a scene whose own objects are in the Blender scene, which come
-        first.
+        Instancers by collection. Scenes whose own objects are in the Blender scene come first and have none.
     """
     inside = set(scene.collection.children_recursive)
     loaded = scene_collections()
     result: dict[bpy.types.Collection, list[bpy.types.Object]] = {one: [] for one in loaded if one in inside}
     outside = set(loaded) - inside
-    if outside:  # else the objects need not be looked through
+    if outside:  # otherwise skip the loop over objects
         known: dict[bpy.types.Collection, set[bpy.types.Collection]] = {}  # panels call this at each redraw
         for obj in scene.collection.all_objects:
             own = obj.instance_collection if obj.instance_type == "COLLECTION" else None
@@ -39,7 +38,7 @@ def shown(scene: bpy.types.Scene) -> dict[bpy.types.Collection, list[bpy.types.O
 
 
 def _instanced(obj: bpy.types.Object) -> set[bpy.types.Collection]:
-    """Collections that an object instances, also through instances in them."""
+    """Collections that an object instances, including nested instances."""
     found: set[bpy.types.Collection] = set()
     waiting = [obj]
     while waiting:
@@ -52,7 +51,7 @@ def _instanced(obj: bpy.types.Object) -> set[bpy.types.Collection]:
 
 
 def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """The loaded scene that the active object belongs to or instances, else the first one in the Blender scene."""
+    """Loaded scene that the active object belongs to or instances, otherwise the first one, or None."""
     candidates = shown(context.scene)
     active = context.view_layer.objects.active
     if active is not None:
@@ -63,19 +62,19 @@ def active_collection(context: bpy.types.Context) -> bpy.types.Collection | None
 
 
 def is_own(collection: bpy.types.Collection) -> bool:
-    """Whether a loaded scene belongs to the open .blend: neither linked from another one nor an override of that."""
+    """True if a loaded scene is local to the open .blend, neither linked nor a library override."""
     return collection.library is None and collection.override_library is None
 
 
 def members(collection: bpy.types.Collection, *roles: str) -> list[bpy.types.Object]:
-    """Objects of a loaded scene that have one of these roles."""
+    """Objects of a loaded scene with one of the given roles."""
     return [obj for obj in collection.all_objects if obj.r5dgs.role in roles]
 
 
 def origin(collection: bpy.types.Collection | None) -> np.ndarray:
-    """The point of the data set's world from which a loaded scene's positions are measured. [3] float64
+    """Origin of a loaded scene's positions in the data set's world. [3] float64
 
-    Zero near the world's origin, without a scene, and after the root or its property was removed.
+    Zero if the scene is near the world's origin, missing, or has lost its root or property.
     """
     root = None if collection is None else collection.r5dgs.root
     try:
@@ -86,13 +85,13 @@ def origin(collection: bpy.types.Collection | None) -> np.ndarray:
 
 
 def origin_text(origin: np.ndarray) -> str:
-    """An origin for messages and labels, such as "(5000002, -3500000, 1500002)"."""
+    """Format an origin for messages and labels, such as "(5000002, -3500000, 1500002)"."""
     return f"({', '.join(f'{value:.15g}' for value in origin)})"
 
 
 @contextlib.contextmanager
 def nothing_left_after_error() -> Iterator[None]:
-    """Remove all data that the block made, if it raises."""
+    """Remove all data-blocks created in the ``with`` block if it raises."""
     kinds = ("collections", "objects", "pointclouds", "actions", "materials", "node_groups")
     before = {kind: {data.session_uid for data in getattr(bpy.data, kind)} for kind in kinds}
     try:

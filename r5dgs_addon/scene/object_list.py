@@ -1,6 +1,6 @@
-"""What a row of the objects list shows of an object, and what editing the row does: functions of properties.
+"""Getters and setters of the properties shown in a row of the objects list.
 
-A row is an entry of the table; an object may have several clouds, and all of them are changed together.
+A row is an entry of the table. An object may have several point clouds, which are changed together.
 """
 
 import bpy
@@ -12,18 +12,18 @@ GREY = (0.5, 0.5, 0.5)
 
 
 def label(entry: bpy.types.PropertyGroup) -> str:
-    """The object's name."""
+    """Name of the object."""
     return object_names.name_of(entry)
 
 
 def set_label(entry: bpy.types.PropertyGroup, name: str) -> None:
-    """Rename the object; a name that cannot be had changes nothing."""
+    """Rename the object. Does nothing if the name is empty or the scene is linked."""
     if name.strip() and entry.id_data.library is None:
         object_names.rename(entry.id_data, entry.object_id, name)
 
 
 def color(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
-    """The object's colour in viewports, display-referred: its tint's where it has one, else the table's."""
+    """Display-referred viewport colour of the object: its tint if tinted, otherwise the table's colour."""
     own = object_names.clouds(entry.id_data, entry.object_id)
     return tuple(point_clouds.linear_to_srgb(np.array(own[0].color[:3])).tolist()) if own else GREY
 
@@ -34,19 +34,19 @@ def set_color(entry: bpy.types.PropertyGroup, value) -> None:
 
 
 def tint(entry: bpy.types.PropertyGroup) -> tuple[float, float, float]:
-    """The object's tint."""
+    """Tint of the object."""
     own = object_names.clouds(entry.id_data, entry.object_id)
     return tuple(own[0].r5dgs_look.tint) if own else object_tint.NONE
 
 
 def is_hidden(entry: bpy.types.PropertyGroup) -> bool:
-    """Whether all of it is hidden in the view layer."""
+    """True if all point clouds of the object are hidden in the view layer."""
     layer = bpy.context.view_layer
     return all(cloud.hide_get(view_layer=layer) for cloud in object_names.clouds(entry.id_data, entry.object_id))
 
 
 def set_hidden(entry: bpy.types.PropertyGroup, hide: bool) -> None:
-    """Hide or show all of it in the view layer."""
+    """Hide or show the object in the view layer."""
     layer = bpy.context.view_layer
     for cloud in object_names.clouds(entry.id_data, entry.object_id):
         if cloud in layer.objects.values():
@@ -54,19 +54,19 @@ def set_hidden(entry: bpy.types.PropertyGroup, hide: bool) -> None:
 
 
 def is_hidden_in_renders(entry: bpy.types.PropertyGroup) -> bool:
-    """Whether all of it is left out of renders."""
+    """True if all point clouds of the object are disabled in renders."""
     return all(cloud.hide_render for cloud in object_names.clouds(entry.id_data, entry.object_id))
 
 
 def set_hidden_in_renders(entry: bpy.types.PropertyGroup, hide: bool) -> None:
-    """Leave all of it out of renders, or not."""
+    """Disable or enable the object in renders."""
     for cloud in object_names.clouds(entry.id_data, entry.object_id):
         if cloud.library is None:
             cloud.hide_render = hide
 
 
 def active_row(state: bpy.types.PropertyGroup) -> int:
-    """Row of the active object in its scene's list; -1 where it is of none."""
+    """Row of the active object in its scene's list, or -1."""
     active = bpy.context.view_layer.objects.active
     found = selection.owner([state.id_data], active) if active is not None else None
     ids = [entry.object_id for entry in state.table]
@@ -74,7 +74,7 @@ def active_row(state: bpy.types.PropertyGroup) -> int:
 
 
 def set_active_row(state: bpy.types.PropertyGroup, row: int) -> None:
-    """Select the object of a row, and no other."""
+    """Select only the object of a row."""
     context = bpy.context
     if 0 <= row < len(state.table) and not selection.obstacle(context):
         selection.select(context, [(state.id_data, state.table[row].object_id)], "SET")

@@ -1,8 +1,8 @@
-"""The table of a loaded scene: what its objects are called and which of Blender's data are theirs.
+"""Object table of a loaded scene: names of the objects and the data-blocks that belong to them.
 
-Whoever renames an object in the Outliner renames it in the table: loading marks the collection, the anchor and the
-cloud that bear an object's name with the name given, and where none of one kind bears that any more, the new name
-counts. No handler is needed for that; `names` is asked whenever names are shown, searched or exported.
+Renaming an object in the Outliner renames it in the table. Loading marks the collection, anchor and point cloud of each
+object with the assigned name. If no data-block of one kind still has that name, the new name counts. No handler is
+needed, because `names` is evaluated whenever names are shown, searched or exported.
 """
 
 import re
@@ -13,32 +13,32 @@ from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 from ...r5dgs_core import errors
 from ...r5dgs_core.search import object_search
 
-NAME_BYTES = 63  # Blender cuts longer names; cutting them here keeps whole characters
-NOBODY = -2  # no object of any table; -1 are the unassigned Gaussians
-_NUMBER = re.compile(r"\.\d{3,}$")  # what Blender adds to a name that is taken
+NAME_BYTES = 63  # Blender's limit; cutting here keeps multi-byte characters whole
+NOBODY = -2  # id of no object; -1 marks unassigned Gaussians
+_NUMBER = re.compile(r"\.\d{3,}$")  # suffix that Blender adds to duplicate names
 _ANCHOR = " anchor"
-KINDS = ("COLLECTION", "ANCHOR", "CLOUD")  # what bears an object's name, the most telling first
+KINDS = ("COLLECTION", "ANCHOR", "CLOUD")  # data-blocks named after an object, in order of precedence
 
 
 class R5DGS_PG_named(bpy.types.PropertyGroup):
-    """Which object of the table a collection, an anchor or a cloud was named after."""
+    """Object that a collection, anchor or point cloud is named after."""
 
-    object_id: IntProperty(name="Object Id", description="Object that it is named after", default=NOBODY, options=set())
-    given: StringProperty(name="Name Given", description="Its name when R5DGS named it", options=set())
-    meanings: BoolProperty(name="Meanings", description="Whether the scene file knows words by meaning", options=set())
+    object_id: IntProperty(name="Object Id", description="Object that gave the name", default=NOBODY, options=set())
+    given: StringProperty(name="Name Given", description="Name assigned by R5DGS", options=set())
+    meanings: BoolProperty(name="Meanings", description="The scene file stores word embeddings", options=set())
 
 
 def fit(name: str) -> str:
-    """A name as long as Blender allows."""
+    """Truncate a name to Blender's maximum length."""
     return name.encode()[:NAME_BYTES].decode(errors="ignore")
 
 
 def remember(collection: bpy.types.Collection, meanings: bool) -> None:
-    """Mark what bears the objects' names in a scene that was just built.
+    """Mark the data-blocks that are named after objects in a newly built scene.
 
     Args:
-        collection: The loaded scene.
-        meanings: Whether its file stores embeddings.
+        collection: Loaded scene.
+        meanings: True if its file stores embeddings.
     """
     collection.r5dgs_named.meanings = meanings
     largest: dict[int, bpy.types.Object] = {}
@@ -57,7 +57,7 @@ def remember(collection: bpy.types.Collection, meanings: bool) -> None:
 
 
 def names(collection: bpy.types.Collection) -> dict[int, str]:
-    """What each object of a loaded scene's table is called now, unique, in the order of the table."""
+    """Current unique name of each object of a loaded scene's table, in table order."""
     result = {entry.object_id: entry.name for entry in collection.r5dgs.table}
     renamed = {}
     for object_id, bearers in _bearers(collection).items():
@@ -72,7 +72,7 @@ def names(collection: bpy.types.Collection) -> dict[int, str]:
 
 
 def name_of(entry: bpy.types.PropertyGroup) -> str:
-    """What one object is called now: as `names`, without looking at all others where nothing of it was renamed."""
+    """Current name of one object. Like `names`, but skips other objects if nothing of this one was renamed."""
     collection = entry.id_data
     home = collection.children.get(entry.name)
     cloud = home.objects.get(entry.name) if home is not None else None
@@ -87,7 +87,7 @@ def name_of(entry: bpy.types.PropertyGroup) -> str:
 
 
 def labels(collection: bpy.types.Collection) -> list[object_search.Label]:
-    """What the objects of a loaded scene answer to; the unassigned Gaussians answer to nothing."""
+    """Names and aliases by which objects of a loaded scene are found; excludes the unassigned Gaussians."""
     current = names(collection)
     return [
         object_search.Label(entry.object_id, current[entry.object_id], tuple(alias.name for alias in entry.aliases))
@@ -97,30 +97,30 @@ def labels(collection: bpy.types.Collection) -> list[object_search.Label]:
 
 
 def present(collection: bpy.types.Collection) -> set[int]:
-    """Ids of the objects that have clouds; the others were deleted."""
+    """Ids of the objects that have point clouds, that is, were not deleted."""
     return {obj.r5dgs.object_id for obj in collection.all_objects if obj.r5dgs.role == "CLOUD"}
 
 
 def clouds(collection: bpy.types.Collection, object_id: int) -> list[bpy.types.Object]:
-    """The clouds of one object, its duplicates' among them."""
+    """Point clouds of an object, including its duplicates."""
     return [o for o in collection.all_objects if o.r5dgs.role == "CLOUD" and o.r5dgs.object_id == object_id]
 
 
 def entry_of(collection: bpy.types.Collection, object_id: int):
-    """The table's entry of an object, or None."""
+    """Table entry of an object, or None."""
     return next((entry for entry in collection.r5dgs.table if entry.object_id == object_id), None)
 
 
 def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str:
-    """Rename an object: in the table, and its collection, anchor, clouds and shadow with it.
+    """Rename an object in the table, with its collection, anchor, point clouds and shadow.
 
     Args:
-        collection: A loaded scene.
+        collection: Loaded scene.
         object_id: Object of its table.
-        wanted: The new name.
+        wanted: New name.
 
     Returns:
-        The name that it has now: the one wanted, with a number where another object of the scene is called so.
+        The resulting name: ``wanted``, with a number if another object of the scene has that name.
 
     Raises:
         ConfigError: The name is empty, or the scene is linked from another file.
@@ -156,7 +156,7 @@ def rename(collection: bpy.types.Collection, object_id: int, wanted: str) -> str
 
 
 def _bearers(collection: bpy.types.Collection) -> dict[int, dict[str, list]]:
-    """What was named after each object: its collections, anchors and clouds."""
+    """Data-blocks named after each object, by kind."""
     result: dict[int, dict[str, list]] = {}
     for bearer in (*collection.children_recursive, *collection.all_objects):
         named = bearer.r5dgs_named
@@ -167,13 +167,13 @@ def _bearers(collection: bpy.types.Collection) -> dict[int, dict[str, list]]:
 
 
 def _bears_given(bearer) -> bool:
-    """Whether it has the name that it was given; copies of it that Blender numbered have it too."""
+    """True if a data-block still has the assigned name, ignoring Blender's number suffix."""
     name, given = bearer.name, bearer.r5dgs_named.given
     return name == given or _NUMBER.sub("", name) == _NUMBER.sub("", given)
 
 
 def _new_name(bearers: dict[str, list]) -> str:
-    """The name that the user gave: of the first kind of which none bears the one given before; "" without any."""
+    """Name assigned by the user, from the first kind without any data-block of the former name; "" if none."""
     for kind in KINDS:
         named = bearers.get(kind, ())
         if not named or any(_bears_given(bearer) for bearer in named):
@@ -181,7 +181,7 @@ def _new_name(bearers: dict[str, list]) -> str:
         name = named[0].name
         plain = _NUMBER.sub("", name)
         siblings = bpy.data.collections if kind == "COLLECTION" else bpy.data.objects
-        if siblings.get(plain) is not None:  # then the number is Blender's doing
+        if siblings.get(plain) is not None:  # otherwise the user typed the number
             name = plain
         return name.removesuffix(_ANCHOR) if kind == "ANCHOR" else name
     return ""
@@ -196,14 +196,14 @@ def _unique(name: str, taken: set[str]) -> str:
 
 
 def _rename_part(text: str, old: str, new: str, own: bool, nobodys: bool) -> str:
-    """Name of a part, such as 'mug still', 'mug shadow' or 'background with mug', after its object was renamed."""
+    """Rename a part such as 'mug still', 'mug shadow' or 'background with mug' after its object was renamed."""
     text = re.sub(rf"(?<= with ){re.escape(old)}(?=$|{_ANCHOR}| shadow|\.\d)", lambda _: new, text)
     parts = [part for part, belongs in ((" still", own), (" with ", own), (" shadow", nobodys)) if belongs]
     return re.sub(rf"^{re.escape(old)}(?={'|'.join(parts)})", lambda _: new, text) if parts else text
 
 
 def register():
-    """Register the group and hang it on objects and collections."""
+    """Register the property group on objects and collections."""
     bpy.utils.register_class(R5DGS_PG_named)
     bpy.types.Object.r5dgs_named = PointerProperty(type=R5DGS_PG_named)
     bpy.types.Collection.r5dgs_named = PointerProperty(type=R5DGS_PG_named)

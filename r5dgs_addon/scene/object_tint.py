@@ -1,7 +1,7 @@
-"""How the user recolours objects: a tint on clouds, which preview, render and export obey and viewports show.
+"""Recolouring of objects by a tint, which is applied in preview, render, export and viewport.
 
-The tint multiplies the display-referred sRGB colour of the cloud's Gaussians. It lies on the object and not in its
-points, so that taking it back loses nothing; `display_color` and the object's viewport colour follow it.
+The tint multiplies the display-referred sRGB colour of the Gaussians. It is stored on the object and not in its
+points, so that removing it restores the original colours. `display_color` and the object's viewport colour follow it.
 """
 
 import bpy
@@ -11,7 +11,7 @@ from bpy.props import BoolProperty, FloatVectorProperty, PointerProperty
 from . import point_clouds
 
 NONE = (1.0, 1.0, 1.0)
-OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}  # so that a library override of a linked scene keeps its own
+OVERRIDABLE = {"LIBRARY_OVERRIDABLE"}  # lets a library override of a linked scene keep its own tint
 
 
 def _follow(look: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
@@ -19,11 +19,11 @@ def _follow(look: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
 
 
 class R5DGS_PG_look(bpy.types.PropertyGroup):
-    """How a cloud looks other than its file says."""
+    """Tint of a point cloud and its original viewport colour."""
 
     tint: FloatVectorProperty(
         name="Tint",
-        description="Color that the Gaussians are multiplied with; white leaves them as they were captured",
+        description="Color that multiplies the Gaussians; white keeps the captured colors",
         subtype="COLOR_GAMMA",
         size=3,
         default=NONE,
@@ -35,11 +35,11 @@ class R5DGS_PG_look(bpy.types.PropertyGroup):
         override=OVERRIDABLE,
     )
     shown: BoolProperty(
-        name="Shown", description="Whether the viewport color is the tint's", options=set(), override=OVERRIDABLE
+        name="Shown", description="The viewport color shows the tint", options=set(), override=OVERRIDABLE
     )
     plain: FloatVectorProperty(
         name="Plain Color",
-        description="Viewport color of the object without tint",
+        description="Viewport color without the tint",
         size=4,
         options=set(),
         override=OVERRIDABLE,
@@ -47,24 +47,24 @@ class R5DGS_PG_look(bpy.types.PropertyGroup):
 
 
 def tint(obj: bpy.types.Object) -> np.ndarray:
-    """The factors on a cloud's display-referred sRGB colour. [3] float64"""
+    """Factors of a point cloud's display-referred sRGB colour. [3] float64"""
     return np.array(obj.r5dgs_look.tint, np.float64)
 
 
 def is_tinted(obj: bpy.types.Object) -> bool:
-    """Whether a cloud is recoloured."""
+    """True if a point cloud is tinted."""
     return tuple(obj.r5dgs_look.tint) != NONE
 
 
 def recolor(wanted: list[bpy.types.Object], tint) -> list[str]:
-    """Tint clouds.
+    """Tint point clouds.
 
     Args:
-        wanted: The clouds.
-        tint: Factors on display-referred sRGB. [3]
+        wanted: Point clouds.
+        tint: Factors of display-referred sRGB. [3]
 
     Returns:
-        Names of those that are linked from another file and therefore left as they are.
+        Names of linked point clouds, which are not changed.
     """
     for cloud in wanted:
         if cloud.library is None:
@@ -73,7 +73,7 @@ def recolor(wanted: list[bpy.types.Object], tint) -> list[str]:
 
 
 def show(cloud: bpy.types.Object) -> None:
-    """Let a cloud's viewport colour and the display colour of its points follow its tint."""
+    """Apply a point cloud's tint to its viewport colour and to the display colour of its points."""
     look, factors = cloud.r5dgs_look, tint(cloud)
     if is_tinted(cloud):
         if not look.shown:
@@ -89,7 +89,7 @@ def show(cloud: bpy.types.Object) -> None:
 
 
 def _shares_points(cloud: bpy.types.Object) -> bool:
-    """Whether an object of another tint shows the same points (Alt+D)."""
+    """True if an object with another tint uses the same points (Alt+D)."""
     if cloud.data.users == 1:
         return False
     return any(
@@ -99,7 +99,7 @@ def _shares_points(cloud: bpy.types.Object) -> bool:
 
 
 def register():
-    """Register the group and hang it on objects."""
+    """Register the property group on objects."""
     bpy.utils.register_class(R5DGS_PG_look)
     bpy.types.Object.r5dgs_look = PointerProperty(type=R5DGS_PG_look, override=OVERRIDABLE)
 

@@ -1,4 +1,4 @@
-"""Gaussians as attributes of a point cloud, under the names that Blender 5.3 draws as splats, and their material."""
+"""Storage of Gaussians as point cloud attributes, named as Blender 5.3 expects for splats, and their materials."""
 
 import ctypes
 import hashlib
@@ -10,42 +10,43 @@ from ...r5dgs_core.scene import spherical_harmonics
 from ...r5dgs_core.scene.scene import Scene
 from .. import compat
 
-# A colour attribute named exactly `color` renders black in Cycles, hence this name.
+# Not `color`: a colour attribute of exactly that name renders black in Cycles.
 DISPLAY_COLOR = "display_color"
 ROW = "gaussian"
 HARMONICS = "radiance:sh_"
-BIND = "bind_state:"  # prefix of the attributes that Exact Mode keeps of what it overwrites
+BIND = "bind_state:"  # prefix of attributes that keep the values overwritten by Exact Mode
 _FINGERPRINTS = "r5dgs_fingerprints"  # custom property of point clouds
 _BLOCK = 2048
-# Spheres stand for Gaussians in viewports without splats; large or faint ones would hide what lies behind them.
+# Display radius of Gaussians in viewports without splats, limited so that large or faint ones hide little.
 DISPLAY_SIGMAS = 1.2
-LARGEST_DISPLAY_RADIUS = 0.012  # of the scene's size
+LARGEST_DISPLAY_RADIUS = 0.012  # as a fraction of the scene's extent
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """Display-referred sRGB in [0, 1] to linear light, as Blender's colours are. Any shape."""
+    """Convert display-referred sRGB in [0, 1] to linear light, the space of Blender's colours. Any shape."""
     srgb = np.clip(srgb, 0.0, 1.0)
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] to display-referred sRGB. Any shape."""
+    """Convert linear light in [0, 1] to display-referred sRGB. Any shape."""
     linear = np.clip(linear, 0.0, 1.0)
     return np.where(linear <= 0.04045 / 12.92, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, sh_degree: int) -> None:
-    """Write Gaussians to a point cloud of as many points.
+    """Write Gaussians to a point cloud with the same number of points.
 
     Attributes: `position`; `scale` (standard deviations) and `rotation` (wxyz); `radiance:base` (degree-0 coefficients
-    and opacity) and `radiance:sh_<k>` (the others), as trained: display-referred; `object_id`; `gaussian`, the row in
-    the scene file, which a point keeps when others are deleted; and for display `radius` and `display_color` (linear).
+    and opacity) and `radiance:sh_<k>` (the others), display-referred as trained; `object_id`; `gaussian`, the row in
+    the
+    scene file, kept when other points are deleted; and for display, `radius` and `display_color` (linear).
 
     Args:
-        cloud: The point cloud.
-        scene: The scene.
-        rows: Its rows to write.
-        extent: The scene's size.
+        cloud: Point cloud.
+        scene: Source scene.
+        rows: Rows of the scene to write.
+        extent: Extent of the scene.
         sh_degree: Highest degree of the coefficients to write, at most 3.
     """
     sh = scene.sh[rows]
@@ -69,11 +70,11 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
     _write(cloud, "object_id", "INT", "value", scene.object_ids[rows], np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
     compat.make_gaussian_splat(cloud)
-    cloud.update_tag()  # without it 4.2 keeps a stale evaluated copy
+    cloud.update_tag()  # otherwise 4.2 keeps a stale evaluated copy
 
 
 def fingerprint(values: np.ndarray) -> str:
-    """Return a digest of an array's bytes that any edit changes; far quicker than a cryptographic one."""
+    """Return a digest that changes with any edit of an array; much faster than a cryptographic hash of all bytes."""
     data = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
     cut = len(data) // (8 * _BLOCK) * 8 * _BLOCK
     blocks = data[:cut].view(np.uint64).reshape(-1, _BLOCK)
@@ -84,13 +85,13 @@ def fingerprint(values: np.ndarray) -> str:
 
 
 def fingerprints(cloud: bpy.types.PointCloud) -> dict[str, str]:
-    """Return the fingerprints of the attributes that a point cloud was filled with, by name; none of older files."""
+    """Return the stored fingerprints of the loaded attributes by name; empty for files of older versions."""
     stored = cloud.get(_FINGERPRINTS)
     return {} if stored is None else stored.to_dict()
 
 
 def attribute(cloud: bpy.types.PointCloud, name: str, kind: str) -> bpy.types.Attribute | None:
-    """Return an attribute of the points, or None if it is missing or of another type."""
+    """Return an attribute of the points, or None if it is missing or has another type."""
     found = cloud.attributes.get(name)
     return found if found is not None and found.data_type == kind and found.domain == "POINT" else None
 
@@ -103,9 +104,9 @@ def read(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.f
 
 
 def view(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.float32) -> np.ndarray:
-    """Return the values of an attribute without copying them where Blender keeps them in one piece. [n, width]
+    """Return the values of an attribute without a copy if they are contiguous in memory. [n, width]
 
-    The array is valid until Blender changes the attribute; do not write to it.
+    The array is read-only and valid until Blender changes the attribute.
     """
     count, size = len(source.data), width * np.dtype(dtype).itemsize
     if count == 0:
@@ -118,11 +119,11 @@ def view(source: bpy.types.Attribute, field: str, width: int, dtype: type = np.f
 
 
 def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
-    """Write `display_color` of a filled point cloud anew: its own colours times a tint.
+    """Update `display_color` of a filled point cloud to its own colours times a tint.
 
     Args:
-        cloud: The point cloud; one without `radiance:base` is left as it is.
-        tint: Factors on display-referred sRGB. [3]
+        cloud: Point cloud; unchanged if it lacks `radiance:base`.
+        tint: Factors of display-referred sRGB. [3]
     """
     stored = cloud.attributes.get("radiance:base")
     if stored is None:
@@ -136,7 +137,7 @@ def show_tint(cloud: bpy.types.PointCloud, tint: np.ndarray) -> None:
 
 
 def material(name: str) -> bpy.types.Material:
-    """A material that shows `display_color` as it is, without light."""
+    """Return a new unlit material that shows `display_color`."""
     result = bpy.data.materials.new(name)
     nodes = compat.empty_nodes(result)
     _, emission, output = _emission(nodes, "GEOMETRY")
@@ -145,7 +146,7 @@ def material(name: str) -> bpy.types.Material:
 
 
 def instance_material(name: str) -> bpy.types.Material:
-    """As `material`, for instances on the points; as opaque as the Gaussian."""
+    """Like `material`, for instances on the points, with the opacity of the Gaussians."""
     result = bpy.data.materials.new(name)
     nodes = compat.empty_nodes(result)
     attribute, emission, output = _emission(nodes, "INSTANCER")
@@ -160,7 +161,7 @@ def instance_material(name: str) -> bpy.types.Material:
 
 
 def _emission(tree: bpy.types.NodeTree, source: str) -> list[bpy.types.Node]:
-    """Nodes attribute, emission and output, the first two linked."""
+    """Return attribute, emission and output nodes, the first two linked."""
     kinds = ("ShaderNodeAttribute", "ShaderNodeEmission", "ShaderNodeOutputMaterial")
     attribute, emission, output = (tree.nodes.new(kind) for kind in kinds)
     attribute.attribute_type, attribute.attribute_name = source, DISPLAY_COLOR
@@ -170,10 +171,7 @@ def _emission(tree: bpy.types.NodeTree, source: str) -> list[bpy.types.Node]:
 
 
 def _planes(sh: np.ndarray) -> np.ndarray:
-    """Coefficients by themselves, some thousand Gaussians at a time so that the processor's cache holds them.
-
-    [N, K, 3] -> [K, N, 3]
-    """
+    """Transpose coefficients in blocks that fit the processor's cache. [N, K, 3] -> [K, N, 3]"""
     count, bases, _ = sh.shape
     result = np.empty((bases, count, 3), np.float32)
     for start in range(0, count, 4096):
@@ -182,7 +180,7 @@ def _planes(sh: np.ndarray) -> np.ndarray:
 
 
 def _write(cloud, name: str, kind: str, field: str, values: np.ndarray, dtype: type = np.float32) -> np.ndarray:
-    """Write an attribute, made if it is missing. Returns the values in the attribute's own type."""
+    """Write an attribute, created if missing. Returns the values in the attribute's dtype."""
     attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
     values = np.ascontiguousarray(values, dtype)
     attribute.data.foreach_set(field, values.ravel())

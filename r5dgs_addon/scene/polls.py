@@ -1,4 +1,4 @@
-"""What several operators have in common."""
+"""Mixins with poll methods for operators."""
 
 from bpy.props import IntProperty, StringProperty
 
@@ -6,7 +6,7 @@ from . import loaded_scenes, object_names, selection
 
 
 class NeedsScene:
-    """An operator that needs a loaded scene in the open Blender scene."""
+    """Mixin for operators that need a loaded scene in the active Blender scene."""
 
     @classmethod
     def poll(cls, context):
@@ -17,7 +17,7 @@ class NeedsScene:
 
 
 class NeedsCamera(NeedsScene):
-    """An operator that looks at loaded scenes through the active camera."""
+    """Mixin for operators that view loaded scenes through the active camera."""
 
     @classmethod
     def poll(cls, context):
@@ -30,7 +30,7 @@ class NeedsCamera(NeedsScene):
 
 
 class Selects:
-    """An operator that selects or hides objects of loaded scenes."""
+    """Mixin for operators that select or hide objects of loaded scenes."""
 
     @classmethod
     def poll(cls, context):
@@ -41,7 +41,7 @@ class Selects:
 
 
 class OfObject(NeedsScene):
-    """An operator on one object of the table: the active one, unless another is named."""
+    """Mixin for operators on one object of the table: the active one, unless properties name another."""
 
     scene: StringProperty(name="Scene", description="Collection of the object's scene", options={"SKIP_SAVE"})
     object_id: IntProperty(
@@ -52,5 +52,5 @@ class OfObject(NeedsScene):
     )
 
     def found(self, context):
-        """The collection of its scene and its id, or None."""
+        """Collection of the object's scene and the object's id, or None."""
         return selection.find(context, self.scene, self.object_id)

@@ -1,7 +1,6 @@
-"""State that belongs to a .blend file: what each object of a loaded scene is, and the scene's table of words.
+"""Properties stored in the .blend file: role of each object in a loaded scene, and the scene's object table.
 
-Everything that playback, selection and preview need to find their way back after saving, reloading or moving files
-lies here and not in Python's memory.
+Playback, selection and preview restore their state from these properties after saving, reloading or moving files.
 """
 
 import bpy
@@ -28,26 +27,26 @@ ROLES = (
 
 
 class R5DGS_PG_object(bpy.types.PropertyGroup):
-    """What one Blender object is in its R5DGS scene."""
+    """Role of a Blender object in its R5DGS scene."""
 
-    role: EnumProperty(name="Role", description="What this object is in its R5DGS scene", items=ROLES)
+    role: EnumProperty(name="Role", description="Role of this object in its R5DGS scene", items=ROLES)
     object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects", default=0)
     motion_id: IntProperty(name="Motion Group", description="Id of the rigid motion", default=0)
     start: IntProperty(name="First Gaussian", description="First row in the scene file", default=0)
     count: IntProperty(name="Gaussians", description="Number of rows in the scene file", default=0)
-    pivot: FloatVectorProperty(name="Pivot", description="Point that the motion turns about, scene coordinates", size=3)
+    pivot: FloatVectorProperty(name="Pivot", description="Pivot of the motion in scene coordinates", size=3)
 
 
 class R5DGS_PG_alias(bpy.types.PropertyGroup):
-    """Another word that finds an object: its `name`."""
+    """Alias of an object; the word is its `name`."""
 
 
 class R5DGS_PG_entry(bpy.types.PropertyGroup):
-    """One object of the scene's table; `name` is the object's name."""
+    """Entry of the scene's object table; `name` is the object's name."""
 
     object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
-    aliases: CollectionProperty(name="Aliases", description="Other words that find it", type=R5DGS_PG_alias)
-    caption: StringProperty(name="Caption", description="A sentence about it")
+    aliases: CollectionProperty(name="Aliases", description="Other words that find the object", type=R5DGS_PG_alias)
+    caption: StringProperty(name="Caption", description="Sentence that describes the object")
     count: IntProperty(name="Gaussians", description="Number of Gaussians")
     label: StringProperty(
         name="Name",
@@ -57,7 +56,7 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     )
     color: FloatVectorProperty(
         name="Color",
-        description="Color in viewports; choosing another one tints the object",
+        description="Color in viewports; changing it tints the object",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,
@@ -67,7 +66,7 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     )
     tint: FloatVectorProperty(
         name="Tint",
-        description="Color that the object's Gaussians are multiplied with; white leaves them as captured",
+        description="Color that multiplies the object's Gaussians; white keeps the captured colors",
         subtype="COLOR_GAMMA",
         size=3,
         min=0.0,
@@ -78,44 +77,48 @@ class R5DGS_PG_entry(bpy.types.PropertyGroup):
     )
     hidden: BoolProperty(
         name="Hide in Viewport",
-        description="Hide the object in the view layer, and thereby in previews",
+        description="Hide the object in the view layer and in previews",
         get=object_list.is_hidden,
         set=object_list.set_hidden,
     )
     hidden_in_renders: BoolProperty(
         name="Hide in Renders",
-        description="Leave the object out of renders",
+        description="Hide the object in renders",
         get=object_list.is_hidden_in_renders,
         set=object_list.set_hidden_in_renders,
     )
 
 
 class R5DGS_PG_scene(bpy.types.PropertyGroup):
-    """The loaded scene that a collection holds."""
+    """Loaded scene that a collection holds."""
 
-    is_scene: BoolProperty(name="R5DGS Scene", description="Whether this collection holds a loaded R5DGS scene")
+    is_scene: BoolProperty(name="R5DGS Scene", description="This collection holds a loaded R5DGS scene")
     scene_name: StringProperty(name="Name", description="Name of the scene in its file")
     filepath: StringProperty(
         name="Scene File",
-        description="The .r5dgs file that the preview reads; relative to the .blend file where possible",
+        description="The .r5dgs file that the preview reads; relative to the .blend file if possible",
         subtype="FILE_PATH",
         options={"ANIMATABLE"} | compat.PATH_OPTIONS,
         update=trust.choose,
     )
     seen_at: StringProperty(
-        name="Seen At", description="Where the scene file was last seen: a .blend that appends this starts elsewhere"
+        name="Seen At", description="Last known location of the scene file, used after appending from another .blend"
     )
     display: EnumProperty(
         name="Display",
-        description="What stands for Gaussians where the viewport draws no splats",
+        description="Representation of Gaussians in viewports that draw no splats",
         items=viewport_display.ITEMS,
     )
     gaussians: IntProperty(name="Gaussians", description="Number of Gaussians in the scene file")
     t_start: FloatProperty(name="First Time", description="First observed scene time", precision=4)
-    t_max: FloatProperty(name="Last Observed Time", description="Motion is extrapolated after it", precision=4)
+    t_max: FloatProperty(
+        name="Last Observed Time",
+        description="Last observed scene time, after which motion is extrapolated",
+        precision=4,
+    )
     t_end: FloatProperty(name="Last Time", description="End of the extrapolated keys", precision=4)
     frames_per_unit: FloatProperty(name="Frames per Unit", description="Frames per unit of scene time", default=60.0)
-    frame_zero: FloatProperty(name="Frame of Time 0", description="Frame at which the scene time is 0", default=1.0)
+    frame_zero: FloatProperty(name="Frame of Time 0", description="Frame of scene time 0", default=1.0)
     root: PointerProperty(name="Root", description="Empty that carries the world convention", type=bpy.types.Object)
     table: CollectionProperty(name="Objects", description="The scene's table of objects", type=R5DGS_PG_entry)
     row: IntProperty(
@@ -130,7 +133,7 @@ CLASSES = (R5DGS_PG_object, R5DGS_PG_alias, R5DGS_PG_entry, R5DGS_PG_scene)
 
 
 def register():
-    """Register the groups and hang them on objects and collections."""
+    """Register the property groups on objects and collections."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Object.r5dgs = PointerProperty(type=R5DGS_PG_object)

@@ -1,4 +1,4 @@
-"""Handlers of the .blend file: the path of a scene file follows when the .blend is saved elsewhere."""
+"""Save handlers that keep the stored path of scene files valid when the .blend is saved elsewhere."""
 
 import os
 from pathlib import Path
@@ -10,14 +10,14 @@ from . import trust
 
 
 def relative_to(path: str, blend_path: str) -> str:
-    """Write a path relative to a .blend file (Blender's ``//``), absolute where that is impossible.
+    """Make a path relative to a .blend file (Blender's ``//``), or keep it absolute if that is impossible.
 
     Args:
         path: Absolute path.
-        blend_path: Path of the .blend file, "" where it was never saved.
+        blend_path: Path of the .blend file, or "" if unsaved.
 
     Returns:
-        The path to store.
+        Path to store.
     """
     if not blend_path:
         return path
@@ -27,12 +27,12 @@ def relative_to(path: str, blend_path: str) -> str:
         return path
 
 
-_open_file: list[tuple[str, dict[int, str]]] = []  # before saving: the open .blend, and the paths in it by session_uid
+_open_file: list[tuple[str, dict[int, str]]] = []  # before saving: open .blend, and its paths by session_uid
 
 
 @persistent
 def _relink_before_save(target, *_):
-    """Turn the stored paths so that they hold from where the .blend is about to lie."""
+    """Rewrite the stored paths relative to the .blend file that is about to be written."""
     target = target if isinstance(target, str) and target else bpy.data.filepath
     _open_file.clear()
     if not target:
@@ -50,7 +50,7 @@ def _relink_before_save(target, *_):
 
 @persistent
 def _restore_after_save(target, *_):
-    """Where the open .blend is still another file (*Save Copy*, a failed save), turn its paths back."""
+    """Restore the stored paths if the open .blend is still another file (*Save Copy*, a failed save)."""
     if not _open_file:
         return
     open_file, paths = _open_file.pop()
@@ -64,7 +64,7 @@ def _restore_after_save(target, *_):
 
 
 def _own_scenes() -> list[bpy.types.Collection]:
-    """Loaded scenes that this .blend stores; linked ones and their overrides belong to their library."""
+    """Loaded scenes stored in this .blend; linked scenes and library overrides belong to their library."""
     every = bpy.data.collections
     return [c for c in every if c.r5dgs.is_scene and c.library is None and c.override_library is None]
 
@@ -79,7 +79,7 @@ def _hooks():
 
 
 def register():
-    """Listen to saving."""
+    """Register the save handlers."""
     for events, handler in _hooks():
         events.append(handler)
 

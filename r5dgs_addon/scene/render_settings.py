@@ -1,22 +1,22 @@
-"""Settings of the render engine R5DGS, on Blender's scenes."""
+"""Scene settings of the R5DGS render engine."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, PointerProperty
 
 MOVING = (
-    ("1", "Full", "Full size at once; slow where pictures take long"),
-    ("2", "Half", "Half as many pixels across"),
-    ("4", "Quarter", "A quarter as many pixels across"),
-    ("8", "Eighth", "An eighth as many pixels across"),
+    ("1", "Full", "Full resolution"),
+    ("2", "Half", "Half the resolution"),
+    ("4", "Quarter", "A quarter of the resolution"),
+    ("8", "Eighth", "An eighth of the resolution"),
 )
 
 
 class R5DGS_PG_render(bpy.types.PropertyGroup):
-    """How the render engine R5DGS renders a Blender scene."""
+    """Settings of the R5DGS render engine."""
 
     sky: BoolProperty(
         name="Sky",
-        description="Render the captured scene's own sky behind everything; black without, or nothing where the film "
+        description="Render the captured scene's sky as background; if off, black, or nothing if the film "
         "is transparent",
         default=True,
     )
@@ -28,19 +28,19 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
     )
     moving: EnumProperty(
         name="While Moving",
-        description="Size of pictures in the viewport until it rests",
+        description="Resolution of the viewport while the view moves",
         items=MOVING,
         default="4",
     )
 
 
 def of(scene: bpy.types.Scene) -> R5DGS_PG_render:
-    """The settings of a scene."""
+    """Return the settings of a scene."""
     return scene.r5dgs_render
 
 
 def register():
-    """Register the group and hang it on scenes."""
+    """Register the settings on scenes."""
     bpy.utils.register_class(R5DGS_PG_render)
     bpy.types.Scene.r5dgs_render = PointerProperty(type=R5DGS_PG_render)
 

@@ -1,22 +1,22 @@
-"""Objects of loaded scenes and Blender's selection: who is selected, selecting others, hiding all but some."""
+"""Selection of objects of loaded scenes, and lookup of the object that a selected Blender object belongs to."""
 
 import bpy
 
 from . import loaded_scenes, object_names
 
-Wanted = tuple[bpy.types.Collection, int]  # a loaded scene and the id of one of its objects
+Wanted = tuple[bpy.types.Collection, int]  # loaded scene, and id of one of its objects
 NO_SCENE = "Load an R5DGS scene first"
 
 
 def obstacle(context: bpy.types.Context) -> str:
-    """Why objects of scenes cannot be selected now, in words for the user; "" where they can."""
+    """Reason why objects of scenes cannot be selected now, as a message for the user, or ""."""
     if context.mode != "OBJECT":
         return "Switch to Object Mode first"
     return "" if scenes(context) else NO_SCENE
 
 
 def scenes(context: bpy.types.Context) -> list[bpy.types.Collection]:
-    """The loaded scenes in the active Blender scene, the active one first, instanced ones among them."""
+    """Loaded scenes in the active Blender scene, including instanced ones; the active one first."""
     active = loaded_scenes.active_collection(context)
     if active is None:
         return []
@@ -24,15 +24,15 @@ def scenes(context: bpy.types.Context) -> list[bpy.types.Collection]:
 
 
 def find(context: bpy.types.Context, scene: str, object_id: int) -> Wanted | None:
-    """The object that an operator's properties name: where they name no scene, the active object's.
+    """Find the object that an operator's properties name.
 
     Args:
-        context: Its active object and scene are asked.
-        scene: Name of a loaded scene's collection, or "".
-        object_id: Id in its table; `object_names.NOBODY` for the active object's.
+        context: Context with the active object and scene.
+        scene: Name of a loaded scene's collection, or "" for any.
+        object_id: Id in its table, or `object_names.NOBODY` for the active object's.
 
     Returns:
-        The scene and the id, or None where there is no such thing.
+        Scene and object id, or None if not found.
     """
     loaded = scenes(context)
     if scene:
@@ -47,7 +47,7 @@ def find(context: bpy.types.Context, scene: str, object_id: int) -> Wanted | Non
 
 
 def owner(loaded: list[bpy.types.Collection], obj: bpy.types.Object) -> Wanted | None:
-    """Which scene's object an anchor or a cloud belongs to; None for everything else."""
+    """Scene and object id that an anchor or point cloud belongs to; None for other objects."""
     if obj.r5dgs.role not in ("ANCHOR", "CLOUD"):
         return None
     for collection in loaded:
@@ -57,24 +57,24 @@ def owner(loaded: list[bpy.types.Collection], obj: bpy.types.Object) -> Wanted |
 
 
 def selected(context: bpy.types.Context) -> list[Wanted]:
-    """The objects of which an anchor or a cloud is selected, the active one first."""
+    """Objects with a selected anchor or point cloud, the active one first."""
     loaded, active = scenes(context), context.view_layer.objects.active
     chosen = sorted(context.selected_objects, key=lambda obj: obj != active)
     return list(dict.fromkeys(found for obj in chosen if (found := owner(loaded, obj)) is not None))
 
 
 def select(context: bpy.types.Context, wanted: list[Wanted], mode: str) -> list[str]:
-    """Change the selection by the clouds and anchors of some objects; the first one's anchor becomes active.
+    """Select or deselect the point clouds and anchors of objects. The first object's anchor becomes active.
 
-    Objects of an instanced scene cannot be selected: what instances it is instead.
+    For an instanced scene, its instancers are selected instead.
 
     Args:
-        context: Its view layer's selection is changed.
+        context: Context whose view layer's selection changes.
         wanted: Objects, best first.
         mode: "SET", "ADD" or "SUBTRACT".
 
     Returns:
-        Names of what is hidden and therefore cannot be selected.
+        Names of hidden objects, which cannot be selected.
     """
     if mode == "SET":
         for chosen in context.selected_objects:

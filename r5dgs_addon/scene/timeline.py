@@ -1,4 +1,4 @@
-"""Scene time and Blender frames: frame = frame_zero + t * frames_per_unit."""
+"""Conversion between scene time and Blender frames: frame = frame_zero + t * frames_per_unit."""
 
 import math
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from ...r5dgs_core import errors
 from ...r5dgs_core.scene.scene import Scene
 
 MARKER = "t_max"
-LAST_FRAME = 1_048_574  # of Blender
-LONGEST = 20.0  # observed spans past t_max; farther ones take minutes to key, and say nothing
+LAST_FRAME = 1_048_574  # Blender's last frame
+LONGEST = 20.0  # limit of extrapolation past t_max, in observed spans; farther keys take minutes and are meaningless
 
 
 @dataclass(frozen=True)
 class Times:
-    """The times of a loaded scene and their frames.
+    """Times of a loaded scene and their frames.
 
     Attributes:
         t_start: First observed time.
         t_max: Last observed time.
         t_end: End of the extrapolated keys.
         frames_per_unit: Frames per unit of scene time.
-        frame_zero: Frame at which the scene time is 0.
+        frame_zero: Frame of scene time 0.
     """
 
     t_start: float
@@ -33,13 +33,13 @@ class Times:
 
     @staticmethod
     def of(scene: Scene, frame_zero: float = 1.0, t_end: float | None = None) -> "Times":
-        """The times of a scene; an end before t_max counts as t_max."""
+        """Times of a scene; an end before t_max is clamped to t_max."""
         start = float(scene.track_times[0])
         end = default_end(scene) if t_end is None else max(float(t_end), scene.t_max)
         return Times(start, float(scene.t_max), end, float(scene.frames_per_unit), float(frame_zero))
 
     def frame(self, t: float) -> float:
-        """Frame of a scene time, with its fraction."""
+        """Frame of a scene time, including its fraction."""
         return self.frame_zero + t * self.frames_per_unit
 
     def time(self, frame: float) -> float:
@@ -48,26 +48,26 @@ class Times:
 
 
 def of_collection(collection: bpy.types.Collection) -> Times:
-    """The times of a loaded scene, from its properties."""
+    """Times of a loaded scene, from its properties."""
     state = collection.r5dgs
     return Times(state.t_start, state.t_max, state.t_end, state.frames_per_unit, state.frame_zero)
 
 
 def default_end(scene: Scene) -> float:
-    """End of the extrapolation unless the user says otherwise: a third of the observed span later, and at least 1."""
+    """Default end of extrapolation: a third of the observed span after t_max, and at least 1."""
     start = float(scene.track_times[0])
     return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
 
 
 def check_end(name: str, times: Times) -> None:
-    """Refuse to extrapolate too far, or past Blender's last frame.
+    """Check that extrapolation does not end too late or past Blender's last frame.
 
     Args:
-        name: What the message calls the scene.
-        times: Its times, with the end that is wanted.
+        name: Name of the scene for the error message.
+        times: Times of the scene, with the requested end.
 
     Raises:
-        ConfigError: The end is no number, or too far, or a frame is past Blender's last one.
+        ConfigError: The end is NaN or too late, or a frame is past Blender's last one.
     """
     longest = max(times.t_max + LONGEST * max(times.t_max - times.t_start, 1 / times.frames_per_unit), 1.0)
     if not times.t_end <= longest:
@@ -87,7 +87,7 @@ def check_end(name: str, times: Times) -> None:
 
 
 def fit(scene: bpy.types.Scene, times: Times) -> None:
-    """Set a Blender scene's frame range to the scene's times and mark t_max."""
+    """Set a Blender scene's frame range to the scene's times, and add a marker at t_max."""
     scene.frame_start = _start(times)
     fit_end(scene, times)
     if not _is_marked(scene, times):
@@ -113,5 +113,5 @@ def _end(scene: bpy.types.Scene, times: Times) -> int:
 
 
 def fit_end(scene: bpy.types.Scene, times: Times) -> None:
-    """Set the last frame of a Blender scene to the last one that has keys."""
+    """Set the last frame of a Blender scene to the last frame with keys."""
     scene.frame_end = _end(scene, times)

@@ -1,9 +1,10 @@
-"""Rules for reading scene files that a .blend names.
+"""Access rules for the scene files that a .blend names.
 
-A .blend can come from anybody and name any path, and much is read without a click: Exact Mode on each frame, Rendered
-viewports, renders in the background. A file is read if it lies beside or below the .blend that names it, in a trusted
-folder of the preferences, or if the user loaded, chose or allowed it in this session. For any other the panel *Scene*
-asks. On Windows a network path is not even looked up before that, as the lookup would send the user's credentials.
+A .blend from an untrusted source can name any path, and many reads happen without a click: Exact Mode at each frame,
+Rendered viewports, background renders. A file may be read if it is in the folder of the .blend that names it or below,
+in a trusted folder of the preferences, or if the user loaded, chose or allowed it in this session. For other files,
+the *Scene* panel asks the user. On Windows, network paths are not even looked up before that, because the lookup would
+send the user's credentials.
 """
 
 import contextlib
@@ -26,8 +27,8 @@ class Found:
     """Result of the search for the file of a loaded scene.
 
     Attributes:
-        path: The file to read; None if none was found that may be read.
-        asked: The file that the user has to allow first; None if there is none.
+        path: File to read, or None if no readable file was found.
+        asked: File that the user must allow first, or None.
     """
 
     path: Path | None = None
@@ -35,16 +36,16 @@ class Found:
 
 
 def _library(collection: bpy.types.Collection) -> bpy.types.Library | None:
-    """The .blend that a loaded scene is linked from, or overrides; None for one of the open .blend."""
+    """Library that a loaded scene is linked from or overrides, or None if it is local."""
     override = collection.override_library
     return collection.library or (override.reference.library if override and override.reference else None)
 
 
 def folders(collection: bpy.types.Collection) -> list[str]:
-    """Folders of the .blend files that name the file of a loaded scene: the library's, and that of the open one.
+    """Folders of the .blend files that name the file of a loaded scene: the library and the open .blend.
 
-    The library's counts only if the linked scene itself names the file: of an override, the open .blend stores the
-    file's path, and the path of a library that need not exist.
+    The library counts only if the linked scene itself names the file. For an override, the open .blend stores both the
+    file's path and the path of the library, which need not exist.
     """
     library, override = _library(collection), collection.override_library
     named = library is not None and (override is None or override.reference.r5dgs.filepath == collection.r5dgs.filepath)
@@ -53,10 +54,11 @@ def folders(collection: bpy.types.Collection) -> list[str]:
 
 
 def places(collection: bpy.types.Collection) -> list[Path]:
-    """Possible paths of the file of a loaded scene, likeliest first.
+    """Possible paths of the file of a loaded scene, most likely first.
 
-    These are the stored path, relative to the library for linked data; the folder of the open .blend, as both files may
-    have moved together; and the place where the file was last seen, as appended data comes from a .blend elsewhere.
+    These are the stored path, relative to the library for linked data; the same name in the folder of the open .blend,
+    as
+    both files may have moved together; and the last known location, as appended data comes from another .blend.
     """
     stored = Path(bpy.path.abspath(collection.r5dgs.filepath, library=_library(collection)))
     found = [stored]
@@ -68,7 +70,7 @@ def places(collection: bpy.types.Collection) -> list[Path]:
 
 
 def find(collection: bpy.types.Collection) -> Found:
-    """Return the first of `places` that exists, or ask for it if it may not be read."""
+    """Return the first existing path of `places` that may be read, or the path that the user must allow."""
     trusted = [*folders(collection), *preferences.choice().trusted]
     asked = None
     for place in places(collection):
@@ -76,14 +78,14 @@ def find(collection: bpy.types.Collection) -> Found:
             if place.is_file():
                 return Found(path=place)
         elif on_network(place):
-            asked = asked or place  # whether it exists is not known
+            asked = asked or place  # its existence is unknown
         elif place.is_file():
-            return Found(asked=asked or Path(os.path.realpath(place)))  # the user sees what a link leads to
+            return Found(asked=asked or Path(os.path.realpath(place)))  # show the target of a link
     return Found(asked=asked)
 
 
 def may_read(place: Path, folders: list[str]) -> bool:
-    """Return True if a file was allowed in this session, or lies in or below a folder once links are followed."""
+    """Return True if a file was allowed in this session, or is in or below one of the folders after resolving links."""
     given = _key(os.path.abspath(place))
     if given in _allowed:
         return True
@@ -94,17 +96,17 @@ def may_read(place: Path, folders: list[str]) -> bool:
 
 
 def allow(place: Path) -> None:
-    """Let a file be read until Blender ends."""
+    """Allow a file to be read until Blender exits."""
     _allowed.update((_key(os.path.abspath(place)), _key(os.path.realpath(place))))
 
 
 def on_network(place: Path, windows: bool = os.name == "nt") -> bool:
-    """Return True for a path of the form ``\\\\server\\share`` on Windows or a device path, which can name one."""
+    """Return True for UNC or device paths (``\\\\server\\share``) on Windows."""
     return windows and str(place).replace("/", "\\").startswith("\\\\")
 
 
 def choose(state: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
-    """Allow the file that the user, or a script, has entered as *Scene File*."""
+    """Allow the file that the user or a script entered as *Scene File*."""
     if not _following:
         allow(places(state.id_data)[0])
 
@@ -114,7 +116,7 @@ _following: list[bool] = []  # not empty while the add-on itself writes paths
 
 @contextlib.contextmanager
 def following() -> Iterator[None]:
-    """Let the block write *Scene File* without allowing what it writes."""
+    """Let the ``with`` block change *Scene File* without allowing the new path."""
     _following.append(True)
     try:
         yield

@@ -1,8 +1,8 @@
-"""Stand-ins for Gaussians in viewports that do not draw splats: points, or an ellipsoid for each by geometry nodes.
+"""Display of Gaussians in viewports without splats: points, or one ellipsoid each by geometry nodes.
 
-Points are quick at any number. Ellipsoids show size, direction and opacity as they are, at a price; they are
-instances that a modifier of the point cloud makes. The modifier passes the points on with a radius of 0, so that the
-evaluated cloud still has them.
+Points are fast for any number of Gaussians. Ellipsoids show size, orientation and opacity, but are slower. They are
+instances created by a modifier, which passes the points on with radius 0, so that the evaluated point cloud keeps
+them.
 """
 
 import bpy
@@ -11,21 +11,21 @@ from . import point_clouds
 
 POINTS, ELLIPSOIDS = "POINTS", "ELLIPSOIDS"
 ITEMS = (
-    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; quick"),
-    (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, direction and opacity; slow above 100,000"),
+    (POINTS, "Points", "A sphere for each Gaussian, of at most a hundredth of the scene's size; fast"),
+    (ELLIPSOIDS, "Ellipsoids", "Each Gaussian with its size, orientation and opacity; slow above 100,000"),
 )
 MODIFIER = "R5DGS Ellipsoids"
 SIGMAS = 1.5  # half axes of an ellipsoid, in standard deviations
 JOIN = "GeometryNodeJoinGeometry"
-SUBDIVISIONS = 2  # of the icosphere: 80 faces
+SUBDIVISIONS = 2  # icosphere subdivisions: 80 faces
 
 
 def show(collection: bpy.types.Collection, display: str) -> None:
-    """Have all clouds of a loaded scene shown in one way.
+    """Set the display of all point clouds of a loaded scene.
 
     Args:
-        collection: A loaded scene of this .blend file.
-        display: One of `ITEMS`.
+        collection: Loaded scene of this .blend file.
+        display: Key of `ITEMS`.
     """
     every = [obj for obj in collection.all_objects if obj.r5dgs.role == "CLOUD" and obj.library is None]
     present = [(cloud, cloud.modifiers.get(MODIFIER)) for cloud in every]
@@ -47,14 +47,14 @@ def show(collection: bpy.types.Collection, display: str) -> None:
 
 
 def hides_points(cloud: bpy.types.Object) -> bool:
-    """Return True if a cloud has ellipsoids of a version that did not pass the points on."""
+    """Return True if ellipsoids made by an older version hide the points."""
     found = cloud.modifiers.get(MODIFIER)
     tree = None if found is None else found.node_group
     return tree is not None and not any(node.bl_idname == JOIN for node in tree.nodes)
 
 
 def _forget(tree: bpy.types.NodeTree) -> None:
-    """Remove a tree and its materials where nothing uses them any more."""
+    """Remove a node tree and its materials if unused."""
     if tree.users or tree.library is not None:
         return
     made = [node.inputs["Material"].default_value for node in tree.nodes if node.bl_idname == "GeometryNodeSetMaterial"]
@@ -65,7 +65,7 @@ def _forget(tree: bpy.types.NodeTree) -> None:
 
 
 def _tree(material: bpy.types.Material) -> bpy.types.NodeTree:
-    """Geometry nodes that put an ellipsoid on every point, by its attributes `scale` and `rotation`."""
+    """Geometry node tree that places an ellipsoid on every point by its attributes `scale` and `rotation`."""
     tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
     for in_out in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
