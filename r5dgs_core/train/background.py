@@ -1,7 +1,7 @@
-"""The learned sky: spherical harmonics over the world's viewing direction, behind everything.
+"""Background of the images: a learned sky (spherical harmonics of the viewing direction, world) or a fixed colour.
 
-A constant sky is its first coefficient; a horizon gradient needs the next ones. Views with a fixed background colour
-(transparent images) use the first coefficient alone and do not train it.
+Degree 0 is a constant sky; a horizon gradient needs higher degrees. A fixed colour (transparent images) is stored as
+degree 0 and is not trained.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from ..scene import cameras, sh_color
 from ..scene.cameras import Camera
 from .initialization import sky
 
-BASES_BYTES = 1 << 29  # what the harmonics of the cameras' rays may take before they are made anew
+BASES_BYTES = 1 << 29  # limit of the cache of harmonics per camera; it is cleared when full
 
 
 class Background:
     """Sky colour by viewing direction.
 
     Args:
-        coefficients: Start values. [Kb, 3]
-        learned: Whether they are trained.
+        coefficients: Initial coefficients. [Kb, 3]
+        learned: True if they are trained.
     """
 
     def __init__(self, coefficients: Tensor, learned: bool):
@@ -31,7 +31,7 @@ class Background:
         self._bases: dict[tuple, Tensor] = {}
 
     def image(self, camera: Camera) -> Tensor:
-        """Colours behind the pixels of a camera: [3] for a fixed colour, else [H, W, 3]."""
+        """Return the background of a camera: [3] if the colour is fixed, else [H, W, 3]."""
         coefficients = self.params["background"]
         if not self.learned:
             return sh_color.dc_to_rgb(coefficients[0]).clamp(0, 1)
@@ -47,12 +47,12 @@ class Background:
 
 
 def fixed(color: np.ndarray) -> Background:
-    """A background of one colour that is not trained. [3]"""
+    """Return a background of one fixed colour [3]."""
     return Background(torch.from_numpy(sh_color.rgb_to_dc(np.asarray(color, np.float32)))[None], False)
 
 
 def learned(coefficients: np.ndarray, degree: int = sky.DEGREE) -> Background:
-    """A trained sky of a degree that starts at given coefficients, the missing ones at zero. [Kb, 3]"""
+    """Return a trained sky of a degree, initialised with given coefficients [Kb, 3] and zeros for the rest."""
     start = torch.zeros((degree + 1) ** 2, 3)
     given = torch.from_numpy(np.asarray(coefficients, np.float32))[: len(start)]
     start[: len(given)] = given

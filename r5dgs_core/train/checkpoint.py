@@ -1,8 +1,8 @@
-"""Run folders and checkpoints: named tensors and plain values, written whole or not at all.
+"""Run folders and checkpoints: named tensors and plain values, written atomically.
 
-A run folder holds ``run.json`` (configuration, data set, versions, platform), ``checkpoint.pt`` (the last state),
+A run folder contains ``run.json`` (configuration, data set, versions, platform), ``checkpoint.pt`` (the last state),
 ``checkpoint.previous.pt`` (the state before it), ``log.jsonl`` (one line per logged step) and ``learning_curves.png``
-(the log as a picture).
+(plot of the log).
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ CHECKPOINT_FILE, PREVIOUS_FILE = GENERATIONS = "checkpoint.pt", "checkpoint.prev
 
 @dataclass(frozen=True)
 class Run:
-    """What ``run.json`` says.
+    """Content of ``run.json``.
 
     Attributes:
         folder: The run folder.
-        dataset_root: Where the data set was.
+        dataset_root: Location of the data set at the start of the run.
         digest: Hash of the data set's content.
         config: Configuration of the run.
-        versions: Versions of what it ran on.
-        platform: What else its times depend on, as of `machine`; empty where that is not known.
+        versions: Versions of Python and packages.
+        platform: Hardware that timings depend on, as from `machine`; empty if unknown.
     """
 
     folder: Path
@@ -55,10 +55,10 @@ class Run:
     platform: dict[str, Any]
 
     def data(self, given: Path | None = None) -> Path:
-        """Where to look for the data set: the ``given`` place, else where it was.
+        """Return the location of the data set: ``given``, or else the recorded one.
 
         Raises:
-            CheckpointError: It is no longer where it was, and no place is given.
+            CheckpointError: ``given`` is None and the recorded location no longer exists.
         """
         if given is None and not self.dataset_root.is_dir():
             raise CheckpointError(
@@ -70,24 +70,24 @@ class Run:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that the next step and `bake` depend on.
+    """State that the next step and `bake` depend on.
 
     Attributes:
-        tensors: By name: ``gaussians.NAME`` of N Gaussians, ``object_ids`` [B] (0 first), ``background`` [Kb, 3], those
-            of the representation, of the optimizer (``adam.NAME.MOMENT``), of the growth (``gradients.NAME``), the
-            state of the ``generator``; of a finished run also ``labels`` [N] and, where there are masks, ``identities``
-            [N, 16] with ``classifier.weight`` and ``classifier.bias``.
+        tensors: Tensors by name: ``gaussians.NAME`` of N Gaussians, ``object_ids`` [B] (0 first), ``background`` [Kb,
+            3], those of the representation, of the optimizer (``adam.NAME.MOMENT``) and of the densification
+            (``gradients.NAME``), and the state of the ``generator``. A finished run also has ``labels`` [N] and, if
+            there are masks, ``identities`` [N, 16] with ``classifier.weight`` and ``classifier.bias``.
         representation: Name of the representation, as in the configuration.
         iteration: Steps taken.
-        entered: First and last observed time that take part, as indices.
+        entered: Indices of the first and the last observed time in training.
         first_time: Index of the time that training began with.
-        queue: Views that are still to be drawn, the next one last.
+        queue: Views still to be drawn, the next one last.
         running_loss: Smoothed loss, nan before the first step.
-        origin: World point that is the origin of training coordinates. [3]
+        origin: World point at the origin of training coordinates. [3]
         scale: World units per unit of training coordinates.
-        observed: Times at which each object was placed by its masks. [B - 1, S] bool
-        finished: Whether labels and identities are made too.
-        seconds: Wall time of all sittings together.
+        observed: Times at which each object was located by its masks. [B - 1, S] bool
+        finished: True if labels and identities are complete, too.
+        seconds: Wall time of training, over all resumed sessions.
     """
 
     tensors: dict[str, Tensor]
@@ -105,14 +105,14 @@ class Checkpoint:
 
 
 def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
-    """The run that `create_run` would make; nothing is written.
+    """Return the run that `create_run` would create, without writing anything.
 
     Raises:
-        CheckpointError: The folder exists and holds something else than a run.
+        CheckpointError: The folder exists and is not a run folder.
     """
     folder = Path(folder)
     try:
-        # All that a kill at the very start leaves.
+        # Files that a process killed at the very start leaves behind.
         half_written = [*atomic_files.leftovers(folder / RUN_FILE), folder / folder_lock.LOCK_FILE]
         foreign = folder.exists() and (
             not folder.is_dir()
@@ -126,10 +126,10 @@ def plan_run(folder: Path, dataset: Dataset, config: Config) -> Run:
 
 
 def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
-    """Make a run folder, or empty one of what an earlier run left, and write its ``run.json``.
+    """Create a run folder, or delete the files of an earlier run in it, and write ``run.json``.
 
     Raises:
-        CheckpointError: The folder exists and holds something else than a run, or cannot be written.
+        CheckpointError: The folder exists and is not a run folder, or cannot be written.
     """
     run = plan_run(folder, dataset, config)
     text = {
@@ -143,7 +143,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
     }
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        # The newest checkpoint goes last of the two: a kill in between leaves the old run as it was.
+        # The newest checkpoint is deleted after the previous one, so that a kill in between keeps the old run.
         for name in (PREVIOUS_FILE, CHECKPOINT_FILE, LOG_FILE, EVALUATION_FILE, CURVES_FILE):
             (run.folder / name).unlink(missing_ok=True)
         atomic_files.write(run.folder / RUN_FILE, json.dumps(text, indent=2).encode())
@@ -153,7 +153,7 @@ def create_run(folder: Path, dataset: Dataset, config: Config) -> Run:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a kill in the middle of writing left in a run folder; for the process that holds it.
+    """Remove partly written files of a killed process; the caller must hold the folder's lock.
 
     Raises:
         CheckpointError: A file cannot be removed.
@@ -167,7 +167,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def refuse_to_lose(folder: Path) -> None:
-    """Raise CheckpointError where a folder holds a run that a new one would replace."""
+    """Raise `CheckpointError` if the folder contains a run that a new one would replace."""
     folder = Path(folder)
     if not (folder / RUN_FILE).exists() or newest_file(folder) is None:
         return
@@ -182,7 +182,7 @@ def open_run(folder: Path) -> Run:
     """Read a run folder's ``run.json``.
 
     Raises:
-        CheckpointError: There is none, or it is damaged or of another version.
+        CheckpointError: The file is missing, damaged or of another version.
     """
     path = Path(folder) / RUN_FILE
     input_paths.check_run(Path(folder))
@@ -211,17 +211,17 @@ def open_run(folder: Path) -> Run:
 
 
 def newest_file(folder: Path) -> Path | None:
-    """Return the newest checkpoint file of a run, damaged or not; None if there is none yet."""
+    """Return the newest checkpoint file of a run, even if it is damaged; None if there is none yet."""
     return next((path for name in GENERATIONS if (path := Path(folder) / name).exists()), None)
 
 
 def save(folder: Path, state: Checkpoint) -> None:
-    """Make a state the newest checkpoint of a run; the newest so far becomes the previous one.
+    """Save a state as the newest checkpoint of a run; the former newest becomes the previous one.
 
-    A kill or an error at any moment leaves at least one whole checkpoint.
+    At least one complete checkpoint exists at any moment, even after a kill.
 
     Raises:
-        CheckpointError: It cannot be written.
+        CheckpointError: The file cannot be written.
     """
     path, previous = (Path(folder) / name for name in GENERATIONS)
     content = {f.name: getattr(state, f.name) for f in dataclasses.fields(state)}
@@ -234,15 +234,15 @@ def save(folder: Path, state: Checkpoint) -> None:
 
 
 def load(folder: Path, *, mend: bool = False) -> Checkpoint:
-    """Read the newest checkpoint of a run that is whole, with a warning if that is the previous one.
+    """Read the newest intact checkpoint of a run; a warning is logged if that is the previous one.
 
     Args:
         folder: The run folder.
-        mend: Put the previous checkpoint into the place of a damaged newest one, so that `save` keeps it; for the
-            process that holds the folder.
+        mend: Replace a damaged newest checkpoint by the previous one, so that `save` keeps it. The caller must hold the
+            folder's lock.
 
     Raises:
-        CheckpointError: There is none, or both are damaged, incomplete or of another version.
+        CheckpointError: There is no checkpoint, or both are damaged, incomplete or of another version.
     """
     path, previous = (Path(folder) / name for name in GENERATIONS)
     if newest_file(folder) is None:
@@ -250,7 +250,7 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
     try:
         return read(path)
     except CheckpointError as error:
-        if isinstance(error.__cause__, PermissionError):  # the file may be whole
+        if isinstance(error.__cause__, PermissionError):  # the file may be intact
             raise
         try:
             state = read(previous)
@@ -267,7 +267,7 @@ def load(folder: Path, *, mend: bool = False) -> Checkpoint:
 
 
 def read(path: Path) -> Checkpoint:
-    """Read one checkpoint file. Raises CheckpointError without a remedy."""
+    """Read one checkpoint file. Raises `CheckpointError` without a remedy."""
     try:
         return Checkpoint(**checkpoint_content.check(checkpoint_file.read(path)))
     except FileNotFoundError:

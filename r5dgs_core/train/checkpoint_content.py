@@ -1,4 +1,4 @@
-"""Rules that the content of a checkpoint keeps: plain values, and tensors whose shapes and types fit each other."""
+"""Validation of a checkpoint's content: plain values, and tensors with consistent shapes and types."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..model import plain_tensors
 from ..model.gaussians import PARAMETERS
 
 FORMAT_VERSION = 1
-RESIDUAL_GAINS = "residual.gains"  # a tensor that may be nan: the gain of a body is not always known
-TRAIN_PSNR = "train_psnr"  # a tensor: `probe.training_psnr` of a finished run, dB
+RESIDUAL_GAINS = "residual.gains"  # name of a tensor that may contain nan (unknown gains)
+TRAIN_PSNR = "train_psnr"  # name of a tensor: `probe.training_psnr` of a finished run, dB
 TENSORS = (*(f"gaussians.{name}" for name in (*PARAMETERS, "motion_ids")), "object_ids", "background", "generator")
 
 _WHOLE = (torch.int64, torch.int32)
 _DTYPES = (torch.float32, torch.float64, torch.uint8, torch.bool, *_WHOLE)
-# Lengths by letter: N Gaussians, B classes of them with the background, G bodies with the pinned one, S observed times,
+# Lengths by letter: N Gaussians, B classes (background included), G groups (pinned one included), S observed times,
 # W shadows. Other letters stand for any length; the same letter always stands for the same length.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "gaussians.means": ("N", 3),
@@ -68,7 +68,7 @@ _WHOLE_NUMBERS = {
     "field.bodies",
     "field.iteration",
 }
-_REQUIRED = {  # of each representation
+_REQUIRED = {  # by representation
     "tracks": ("light", *(name for name in _SHAPES if name.startswith("tracks.") and name != "tracks.entered")),
     "field": ("light", *(name for name in _SHAPES if name.startswith("field."))),
     "still": ("still.centers", "still.time"),
@@ -82,7 +82,7 @@ def check(content: Any) -> dict[str, Any]:
         content: Content of the file.
 
     Raises:
-        CheckpointError: Something is missing or does not fit; the message names it and not the file.
+        CheckpointError: A value is missing or invalid; the message names the value, but not the file.
     """
     version = content.get("format_version") if isinstance(content, dict) else None
     if not isinstance(version, int) or version != FORMAT_VERSION:
@@ -101,7 +101,7 @@ def check(content: Any) -> dict[str, Any]:
 
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
-    """Raise CheckpointError if a tensor is not plain memory, or two do not fit each other."""
+    """Raise `CheckpointError` if a tensor is not plain memory or the shapes of two tensors are inconsistent."""
     lengths: dict[str, int] = {}
     for name, tensor in tensors.items():
         if fault := plain_tensors.fault(tensor, _DTYPES):
@@ -123,7 +123,7 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
 
 
 def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[[Any], bool]:
-    """A test for a row of numbers of some kinds, of a length if one is given."""
+    """Return a predicate for sequences of numbers of some kinds, of a given length if any."""
     return lambda value: (
         isinstance(value, list | tuple)
         and (length is None or len(value) == length)
@@ -132,7 +132,7 @@ def _are(kinds: type | tuple[type, ...], length: int | None = None) -> Callable[
 
 
 def _is(kinds: type | tuple[type, ...]) -> Callable[[Any], bool]:
-    """A test for a number of some kinds."""
+    """Return a predicate for numbers of some kinds."""
     return lambda value: _are(kinds, 1)([value])
 
 

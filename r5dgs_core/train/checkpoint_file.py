@@ -1,6 +1,6 @@
-"""Checkpoint files: the zip of ``torch.save`` with a digest of every byte before it as the archive's comment.
+"""Checkpoint files: ``torch.save`` archives with a digest of all preceding bytes as the archive's comment.
 
-``torch.load`` does not compare a member with its stored CRC, so a damaged file would be loaded with other numbers.
+The digest is necessary because ``torch.load`` does not verify the CRCs of the members.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from .. import atomic_files
 
 _MARK = b"sha256:"
 _COMMENT_SIZE = len(_MARK) + hashlib.sha256().digest_size * 2
-_LENGTH = struct.Struct("<H")  # of the comment: the last field of a zip archive
+_LENGTH = struct.Struct("<H")  # length of the comment, in front of it at the end of a zip archive
 
 
 class DamagedError(Exception):
-    """A file is not what was written; the message gives the reason."""
+    """File with other bytes than were written; the message gives the reason."""
 
 
 def write(path: Path, content: dict[str, Any], previous: Path) -> None:
-    """Replace a checkpoint file.
+    """Replace a checkpoint file atomically.
 
     Args:
         path: The file.
         content: Tensors and plain values.
-        previous: Place of the old file from then on.
+        previous: New place of the old file.
 
     Raises:
-        OSError: It cannot be written; the old file is kept.
+        OSError: The file cannot be written; the old file is kept.
     """
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -46,9 +46,9 @@ def write(path: Path, content: dict[str, Any], previous: Path) -> None:
 
 
 def read(path: Path) -> Any:
-    """Read a checkpoint file whose bytes are all as they were written.
+    """Read and verify a checkpoint file.
 
-    Files of earlier versions have no digest; the CRC of each of their members is checked instead.
+    Files of earlier versions have no digest; the CRCs of their members are verified instead.
 
     Raises:
         DamagedError: A byte differs, or the content is more than tensors and plain values.
@@ -60,12 +60,12 @@ def read(path: Path) -> Any:
         return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except DamagedError:
         raise
-    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
+    except Exception as error:  # zipfile and torch raise many kinds of errors for damaged files
         raise DamagedError(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
 
 
 def _check(data: bytes) -> None:
-    """Compare an archive with its digest, or with its CRCs if it has none."""
+    """Verify an archive by its digest, or by its CRCs if it has no digest."""
     body, comment = memoryview(data)[:-_COMMENT_SIZE], data[-_COMMENT_SIZE:]
     sealed = comment.startswith(_MARK)
     if sealed and comment != _MARK + hashlib.sha256(body).hexdigest().encode():

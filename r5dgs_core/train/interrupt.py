@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while training: long phases end at once, steps end after the one that runs."""
+"""Handling of SIGINT and SIGTERM during training: long phases stop at once, loops stop after the current step."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def at_once(message: str) -> Iterator[None]:
-    """End the block where it is when a signal comes; for work that is begun again from its start.
+    """Stop the block immediately on a signal; for work that is repeated from its start on resume.
 
     Args:
-        message: How to go on.
+        message: Message of the error, with the command that resumes.
 
     Raises:
-        Interrupted: A signal came.
+        Interrupted: A signal was received.
     """
 
     def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt  # not an Exception, so that no code on the way takes it for a fault of its own
+        raise KeyboardInterrupt  # not an Exception, so that no handler on the way catches it
 
     with _handled_by(stop):
         try:
@@ -35,7 +35,7 @@ def at_once(message: str) -> Iterator[None]:
 
 @contextmanager
 def collected() -> Iterator[list[int]]:
-    """The numbers of the signals that came, for a loop to look at; a second signal of one kind has its usual effect."""
+    """Collect the numbers of received signals, for a loop to poll. A second signal of a kind has its usual effect."""
     asked: list[int] = []
 
     def note(number: int, frame: Any) -> None:
@@ -48,7 +48,7 @@ def collected() -> Iterator[list[int]]:
 
 @contextmanager
 def _handled_by(handler: Callable[[int, Any], None]) -> Iterator[dict[int, Any]]:
-    """Install a handler for both signals; yields the previous ones and puts them back."""
+    """Install a handler for both signals, yield the previous handlers and restore them at the end."""
     previous: dict[int, Any] = {}
     try:
         for number in SIGNALS:

@@ -1,4 +1,4 @@
-"""Learning curves of a run as a picture: loss, PSNR of held-out views and Gaussians, over steps and seconds."""
+"""Plot of a run's learning curves: loss, PSNR of held-out views and number of Gaussians, over steps and seconds."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from .checkpoint import CURVES_FILE, LOG_FILE
 
 log = logging.getLogger(__name__)
 
-EVERY_S = 30.0  # between two pictures of a run that goes on
-SHARE = 0.02  # of the time since the last picture that the next one may take
+EVERY_S = 30.0  # shortest interval between two plots during a run, s
+SHARE = 0.02  # largest share of the run's time that plots may take
 PANELS = (("loss", "loss", "log"), ("val_psnr", "held-out views, dB", "linear"), ("gaussians", "Gaussians", "linear"))
 
 
 class Curves:
-    """The picture in a run folder, drawn anew now and then; a picture that cannot be drawn is a warning.
+    """Learning curves in a run folder, redrawn from time to time. A failure to draw is logged as a warning.
 
     Args:
         folder: The run folder, with its log.
@@ -32,7 +32,7 @@ class Curves:
         self._last, self._cost, self._failed = time.monotonic(), 0.0, False
 
     def update(self, *, finished: bool = False) -> None:
-        """Draw what the log holds: always where ``finished``, else only where it costs next to nothing."""
+        """Redraw the curves: always if ``finished``, else only if the cost is small relative to the time since."""
         waited = time.monotonic() - self._last
         if self._failed or (not finished and waited < max(EVERY_S, self._cost / SHARE)):
             return
@@ -41,7 +41,7 @@ class Curves:
             rows = read_log(self.path.with_name(LOG_FILE))
             if len(rows) > 1:
                 atomic_files.write(self.path, draw(rows))
-        except Exception as error:  # matplotlib may be absent, the disk full, ...: no reason to lose a run
+        except Exception as error:  # a missing matplotlib or a full disk must not end the run
             self._failed = True
             log.warning("%s: the learning curves cannot be drawn: %s: %s", self.path, type(error).__name__, error)
         self._last = time.monotonic()
@@ -49,7 +49,7 @@ class Curves:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The lines of a run's log, a torn last one left out."""
+    """Return the lines of a run's log, without an incomplete last line."""
     rows = []
     for line in path.read_bytes().splitlines():
         try:
@@ -60,10 +60,10 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def draw(rows: Sequence[dict[str, Any]]) -> bytes:
-    """Loss, PSNR of held-out views (where there are any) and Gaussians over steps and over seconds, as PNG.
+    """Plot loss, PSNR of held-out views (if there are any) and number of Gaussians; returns a PNG.
 
     Args:
-        rows: Lines of the log (docs/reference/run_folder.md).
+        rows: Lines of the log (docs/training.md).
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

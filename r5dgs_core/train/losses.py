@@ -21,7 +21,7 @@ C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 
 
 def photometric(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """(1 - w) L1 + w (1 - SSIM) between two images.
+    """Return the loss (1 - w) L1 + w (1 - SSIM) between two images.
 
     Args:
         image: Rendered image. [H, W, 3] float32
@@ -62,7 +62,7 @@ class _Photometric(torch.autograd.Function):
 
 @kernels.kernel
 def _moments(worker, workers, x, y, window, moments):
-    """x, y, x^2, y^2 and xy blurred along their rows; channels are interleaved, so neighbours lie 3 floats apart."""
+    """Blur x, y, x^2, y^2 and xy along the rows. Channels are interleaved: neighbours are 3 floats apart."""
     height, length = x.shape
     raw = np.empty((5, length), np.float32)
     for r in range(worker * height // workers, (worker + 1) * height // workers):
@@ -78,7 +78,7 @@ def _moments(worker, workers, x, y, window, moments):
 
 @kernels.kernel
 def _compare(worker, workers, x, y, window, moments, slopes, sums):
-    """SSIM of each pixel from the moments blurred both ways, and its slopes by them, blurred along the rows."""
+    """Compute SSIM per pixel from the blurred moments, and its derivatives by them, blurred along the rows."""
     height, length = x.shape
     full = np.empty((5, length), np.float32)
     raw = np.empty((3, length), np.float32)
@@ -109,7 +109,7 @@ def _compare(worker, workers, x, y, window, moments, slopes, sums):
 
 @kernels.kernel
 def _gather(worker, workers, x, y, window, slopes, weight, gradient):
-    """Gradient of the loss by x from the slopes, blurred along the columns."""
+    """Compute the gradient of the loss by x from the derivatives, blurred along the columns."""
     height, length = x.shape
     full = np.empty((3, length), np.float32)
     n = np.float32(height * length)

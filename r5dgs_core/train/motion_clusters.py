@@ -1,9 +1,9 @@
-"""Rigidly moving parts among paths of points: what moves as one body, without masks.
+"""Segmentation of point trajectories into rigidly moving parts, without masks.
 
-Points that are neighbours at all times and keep their distances are likely of one body. Small neighbourhoods propose
-rigid motions; the proposal that explains most points connected with it is fitted again to all of them and taken away,
-until too few are left. Parts that one rigid motion explains are then joined, and points near a part that move with it
-are added.
+Points that are neighbours at all times and keep their distances are likely to belong to one body. Small neighbourhoods
+propose rigid motions. The proposal with the largest weight of connected inliers is refitted to them, and they are
+removed, until too few points are left. Then parts that one rigid motion explains are merged, and points near a part
+that move with it are added.
 
 Notation: R points, S times, H proposals, K neighbours.
 """
@@ -18,40 +18,40 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-SHARE = 0.12  # residual that is allowed, as a share of how far a point travels: fields bend rigid motions a little
+SHARE = 0.12  # allowed residual / travel of a point; fields bend rigid motions slightly
 PROPOSALS = 48  # per part
-NEIGHBOURHOOD = 24  # points that propose a motion
-LINKS = 8  # neighbours of a point that it may be connected with
-REACH = 4.0  # longest connection, in median distances of a point to its nearest ones
+NEIGHBOURHOOD = 24  # points per proposal
+LINKS = 8  # nearest neighbours that a point may be connected with
+REACH = 4.0  # longest connection / median distance of nearest neighbours
 REFITS = 4
-JOINT = 0.7  # share of both parts that one motion must explain for them to be joined
-LOOSE = 1.5  # how much more residual it is allowed then
-LATE = 1.5  # how much more residual is allowed to points that are added in the end
-MOST = 4000  # points that are looked at; a spread of them where there are more
+JOINT = 0.7  # smallest share of inliers in both parts for a merge
+LOOSE = 1.5  # factor on the allowed residual for a merge
+LATE = 1.5  # factor on the allowed residual for points that are added at the end
+MOST = 4000  # largest number of sampled points
 
 
 @dataclass(frozen=True)
 class RigidPath:
-    """A rigid motion x -> R_s x + t_s of the points at the reference time: rotations [S, 3, 3], shifts [S, 3]."""
+    """Rigid motion x -> R_s x + t_s of points at the reference time: rotations [S, 3, 3] and shifts [S, 3]."""
 
     rotmats: np.ndarray
     shifts: np.ndarray
 
     def residuals(self, paths: np.ndarray, reference: int) -> np.ndarray:
-        """Root mean squared distance over the times of points from where the motion puts them. [R, S, 3] -> [R]"""
+        """Return the root mean squared distance over time of points from this motion. [R, S, 3] -> [R]"""
         put = np.einsum("sij,rj->rsi", self.rotmats, paths[:, reference]) + self.shifts
         return np.sqrt(((put - paths) ** 2).sum(-1).mean(-1))
 
 
 def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, rng: np.random.Generator) -> np.ndarray:
-    """Label points by the rigid part that they belong to.
+    """Label points by rigid part.
 
     Args:
-        paths: Places of the points over time. [R, S, 3]
-        weights: How much each counts. [R]
-        tolerance: Residual that is allowed to points that hardly travel, units of the paths.
-        fewest: Smaller parts are dropped, in points.
-        rng: Source of the draws.
+        paths: Positions of the points over time. [R, S, 3]
+        weights: Weights of the points. [R]
+        tolerance: Residual allowed for points that hardly move, units of the paths.
+        fewest: Smallest number of points of a part; smaller parts are dropped.
+        rng: Random generator.
 
     Returns:
         Part of each point, 0 for the heaviest, -1 for none. [R]
@@ -73,13 +73,13 @@ def find(paths: np.ndarray, weights: np.ndarray, tolerance: float, fewest: int, 
 
 
 def attach(paths: np.ndarray, weights: np.ndarray, tolerance: float, labels: np.ndarray) -> np.ndarray:
-    """The labels of `find`, with those of points that it was not asked about and that move about as a part near them.
+    """Extend the labels of `find` to points that were not in its input and that move with a part near them.
 
     Args:
-        paths: Places of the points over time. [R, S, 3]
-        weights: How much each counts. [R]
-        tolerance: Residual that is allowed to points that hardly travel, units of the paths.
-        labels: Part of each point, -1 for none; parts of fewer than four points take no others. [R]
+        paths: Positions of the points over time. [R, S, 3]
+        weights: Weights of the points. [R]
+        tolerance: Residual allowed for points that hardly move, units of the paths.
+        labels: Part of each point, -1 for none; parts of fewer than four points are not extended. [R]
     """
     reference = paths.shape[1] // 2
     motions = []
@@ -90,12 +90,12 @@ def attach(paths: np.ndarray, weights: np.ndarray, tolerance: float, labels: np.
 
 
 def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
-    """Least-squares rigid motion of points from their places at one time to those at each (Kabsch).
+    """Fit rigid motions from the points at one time to those at each time (least squares, Kabsch).
 
     Args:
-        paths: Places over time. [..., R, S, 3]
-        weights: Of the points, with a positive sum. [..., R]
-        reference: Index of the time that the motion starts from.
+        paths: Positions over time. [..., R, S, 3]
+        weights: Weights of the points, with a positive sum. [..., R]
+        reference: Index of the time at which the motion starts.
 
     Returns:
         The motion, with the leading dimensions of ``paths``.
@@ -112,14 +112,14 @@ def fit(paths: np.ndarray, weights: np.ndarray, reference: int) -> RigidPath:
 
 
 def _allowed(paths: np.ndarray, tolerance: float) -> np.ndarray:
-    """Residual that each point may have in its part's motion. [R]"""
+    """Largest residual at which a point is an inlier. [R]"""
     return tolerance + SHARE * np.linalg.norm(paths - paths.mean(1, keepdims=True), axis=-1).max(1)
 
 
 def _parts(
     paths: np.ndarray, weights: np.ndarray, allowed: np.ndarray, reference: int, fewest: int, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Connected sets of points that one rigid motion explains, one after the other. Rows of each."""
+    """Extract connected sets of inliers of one rigid motion, one after another. Returns the rows of each."""
     features = _features(paths)
     graph = _graph(features)
     left = np.ones(len(paths), bool)
@@ -152,12 +152,12 @@ def _parts(
 
 
 def _features(paths: np.ndarray) -> np.ndarray:
-    """Points of which the distances are the root mean squared ones over time. [R, S * 3]"""
+    """Return points whose distances are the root mean squared distances of the paths over time. [R, S * 3]"""
     return paths.reshape(len(paths), -1) / np.sqrt(paths.shape[1])
 
 
 def _graph(features: np.ndarray) -> sparse.csr_matrix:
-    """Which points are neighbours at all times. [R, R]"""
+    """Adjacency of points that are neighbours at all times. [R, R]"""
     count = min(LINKS + 1, len(features))
     found = KDTree(features).query(features, k=count)
     distance, index = np.asarray(found[0]), np.asarray(found[1])
@@ -181,7 +181,7 @@ def _connected(graph: sparse.csr_matrix, members: np.ndarray, seed: int) -> np.n
 def _joined(
     paths: np.ndarray, weights: np.ndarray, allowed: np.ndarray, reference: int, parts: list[np.ndarray]
 ) -> list[np.ndarray]:
-    """The parts, those joined that are near each other and that one motion explains."""
+    """Merge neighbouring parts that one motion explains."""
     parts = list(parts)
     features = _features(paths)
     spacing = REACH * np.median(KDTree(features).query(features, k=2)[0][:, 1])
@@ -207,7 +207,7 @@ def _joined(
 def _attached(
     paths: np.ndarray, allowed: np.ndarray, reference: int, labels: np.ndarray, motions: Sequence[RigidPath | None]
 ) -> np.ndarray:
-    """The labels, with those of points near a part that move about as it does. [R]"""
+    """Return the labels, extended to points near a part that move with it. [R]"""
     labels = labels.copy()
     open_rows, features = np.flatnonzero(labels < 0), _features(paths)
     if len(open_rows) == 0 or not motions:

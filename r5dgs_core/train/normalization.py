@@ -1,7 +1,7 @@
-"""Normalised coordinates: the cameras' focus at the origin, their typical distance to it four units.
+"""Normalised coordinates: the origin is the cameras' focus, and their typical distance to it is four units.
 
-Training runs there, so that learning rates and thresholds mean the same in a scene of any size and place, and float32
-keeps its precision far from the data set's origin.
+In these coordinates, learning rates and thresholds have the same meaning in scenes of any size, and float32 keeps its
+precision far from the data set's origin.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ class Normalization:
     scale: float
 
     def camera(self, camera: Camera) -> Camera:
-        """The same camera in normalised coordinates."""
+        """Return the camera in normalised coordinates."""
         T = camera.T_cam_world.copy()
         T[:3, 3] = (T[:3, 3] + T[:3, :3] @ self.origin) / self.scale
         return dataclasses.replace(camera, T_cam_world=T)
 
     def points_to_world(self, points: np.ndarray) -> np.ndarray:
-        """Points back to the world. [..., 3]"""
+        """Convert points to world coordinates. [..., 3]"""
         return np.asarray(points, np.float64) * self.scale + self.origin
 
 
 def from_cameras(cameras: Sequence[Camera]) -> Normalization:
-    """Find the focus and the scale of a set of cameras.
+    """Estimate the focus and the scale of a set of cameras.
 
-    The focus is the point nearest to all optical axes (least squares). Where it is not determined or lies behind most
-    cameras (parallel cameras, cameras that look outwards), the centroid of the cameras takes its place, and their
-    spread sets the scale.
+    The focus is the point nearest to all optical axes (least squares). If it is not determined or lies behind most
+    cameras (parallel or outward-facing cameras), it is placed in front of the cameras' centroid, and the spread of the
+    cameras sets the scale.
 
     Args:
         cameras: At least one camera.

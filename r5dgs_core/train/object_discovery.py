@@ -1,7 +1,7 @@
-"""Objects without masks: a short run of a field shows what moves, and what moves rigidly together is an object.
+"""Discovery of objects without masks: a short run of a field, whose rigidly moving parts become the objects.
 
-The field's Gaussians that move are sorted into rigidly moving parts (`motion_clusters.py`), and each part's picture in
-each view is its mask. From there a run of tracks starts as one with masks does; the masks found serve its start alone.
+The moving Gaussians of the field are segmented into rigidly moving parts (`motion_clusters.py`), and the rendering of a
+part in a view is its mask. A run of tracks then starts from these masks, and uses them only for its initialisation.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from .trainer import Trainer
 
 log = logging.getLogger(__name__)
 
-JUDGES = 20  # views that say whether a part has to move
-GAIN = 2.0  # by how much worse they are drawn where it rests, dB
-OPAQUE = 0.3  # fainter Gaussians do not say what moves
-TOLERANCE = 0.02  # distance from a rigid motion that points which hardly travel may have, normalised units
-SPECK = 0.1  # smaller pieces of a mask are dropped, as a share of its largest piece
-NAME = "discovery"  # of its events
-CAP = 12000  # Gaussians of the short run
+JUDGES = 20  # views that decide if a part must move
+GAIN = 2.0  # smallest gain in PSNR by the motion of a part, dB
+OPAQUE = 0.3  # opacity below which Gaussians do not define parts
+TOLERANCE = 0.02  # residual allowed for points that hardly move, normalised units
+SPECK = 0.1  # smallest piece of a mask / its largest piece
+NAME = "discovery"  # name of the progress events
+CAP = 12000  # largest number of Gaussians in the short run
 
 
 def find(
     dataset: Dataset, config: Config, progress: Callable[[dict[str, Any]], None] | None = None
 ) -> list[np.ndarray] | None:
-    """Masks of what moves, for the training views.
+    """Find masks of the moving objects in the training views.
 
     Args:
         dataset: The data set.
         config: Configuration of the run that the masks are for.
-        progress: Called with an event when it begins, now and then, and when it ends.
+        progress: Called with events at the start, during the run and at the end.
 
     Returns:
-        Ids per pixel, 0 for what rests [H, W], for each training view; None where `training_needs.discovery`
-        says no or nothing moves.
+        Ids per pixel, 0 for the background [H, W], for each training view. None if discovery does not apply
+        (`training_needs.discovery`) or nothing moves.
 
     Raises:
-        DatasetError, TrainingError: As of a run.
+        DatasetError, TrainingError: As from a training run.
     """
     if not training_needs.discovery(dataset, config):
         return None
@@ -75,11 +75,11 @@ def find(
 
 
 def _short(config: Config, last: float) -> Config:
-    """The configuration of the short run: a small field on few Gaussians, without what only pictures need.
+    """Return the configuration of the short run: a small field of few Gaussians, without features for image quality.
 
     Args:
-        config: That of the run that it is for.
-        last: The last observed time, up to which the field reaches.
+        config: Configuration of the run that the masks are for.
+        last: The last observed time, used as the field's horizon.
     """
     cap = config.densify.max_gaussians
     return config.replace(
@@ -108,14 +108,16 @@ def _short(config: Config, last: float) -> Config:
 
 
 def parts(trainer: Trainer, config: Config) -> np.ndarray:
-    """Rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
+    """Return the rigidly moving part of each opaque Gaussian of a field, -1 for none. [N]"""
     rows, opacities = _movers(trainer)
     rows, opacities = rows[opacities > OPAQUE], opacities[opacities > OPAQUE]
     return _labelled(trainer, config, rows, opacities, _paths(trainer, rows))
 
 
 def sort(trainer: Trainer) -> np.ndarray:
-    """Rigidly moving part of each Gaussian of a trained field, -1 for none: `parts`, with faint ones that go along. [N]
+    """Return the rigidly moving part of each Gaussian of a trained field, -1 for none. [N]
+
+    Faint Gaussians, which `parts` excludes, join the part that they move with.
 
     Args:
         trainer: A finished run of a field.
@@ -130,7 +132,7 @@ def sort(trainer: Trainer) -> np.ndarray:
 def _labelled(
     trainer: Trainer, config: Config, rows: np.ndarray, opacities: np.ndarray, paths: np.ndarray
 ) -> np.ndarray:
-    """Part of each Gaussian of a field, by the paths of some rows; -1 for others and for none. [N]"""
+    """Return the part of each Gaussian from the paths of ``rows``; -1 for other Gaussians and for none. [N]"""
     rng = np.random.default_rng(config.train.seed)
     labels = np.full(len(trainer.gaussians), -1)
     labels[rows] = motion_clusters.find(paths, opacities, TOLERANCE, config.discovery.fewest, rng)
@@ -139,7 +141,7 @@ def _labelled(
 
 @torch.no_grad()
 def _movers(trainer: Trainer) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians that a field moves, and their opacities. [R], [R]"""
+    """Return the rows of Gaussians that a field moves, and their opacities. [R], [R]"""
     motion, gaussians = trainer.motion, trainer.gaussians
     assert isinstance(motion, FieldRepresentation)
     rows = motion.movers(gaussians)
@@ -148,7 +150,7 @@ def _movers(trainer: Trainer) -> tuple[np.ndarray, np.ndarray]:
 
 @torch.no_grad()
 def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
-    """Where a field's Gaussians are at the observed times. [R, S, 3]"""
+    """Return the positions of a field's Gaussians at the observed times. [R, S, 3]"""
     motion = trainer.motion
     assert isinstance(motion, FieldRepresentation)
     means = trainer.gaussians.means[torch.from_numpy(rows)]
@@ -159,9 +161,9 @@ def _paths(trainer: Trainer, rows: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
-    """The labels without parts that might as well rest: fields also move what looks the same wherever it is. [N]
+    """Remove parts whose motion the images do not need: fields also move uniform regions. [N]
 
-    Each part is drawn as it moves and in its mean place; where it shows in either, the images decide.
+    Each part is rendered in motion and in its mean state. The errors of the pixels that show it in either decide.
     """
     count = int(labels.max(initial=-1)) + 1
     errors, parts_of = np.zeros((2, count)), torch.from_numpy(labels)
@@ -192,7 +194,7 @@ def needed(trainer: Trainer, labels: np.ndarray) -> np.ndarray:
 
 
 def _drawn(trainer: Trainer, view: TrainView, splats: Splats, parts_of: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared error of a view's pixels, and the part that each of them shows. [H, W], [H, W]"""
+    """Return the squared error of a view's pixels, and the part that each of them shows. [H, W], [H, W]"""
     shown = rasterize_splats(
         splats.means,
         splats.quats,
@@ -210,7 +212,7 @@ def _drawn(trainer: Trainer, view: TrainView, splats: Splats, parts_of: Tensor) 
 
 @torch.no_grad()
 def masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
-    """Picture of the parts in each training view: the part k shows as k + 1, what rests as 0. [H, W]"""
+    """Render the masks of the training views: k + 1 for part k, 0 for the background. [H, W]"""
     kind = np.uint8 if labels.max() < 255 else np.uint16
     result = []
     for view in trainer.views:
@@ -220,7 +222,7 @@ def masks(trainer: Trainer, labels: np.ndarray) -> list[np.ndarray]:
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
-    """The mask without small pieces that lie apart from the largest of their id. [H, W]"""
+    """Remove pieces of an object's mask that are much smaller than its largest piece. [H, W]"""
     kept = np.zeros_like(mask)
     for k in range(1, int(mask.max()) + 1):
         pieces = np.zeros(mask.shape, np.int32)

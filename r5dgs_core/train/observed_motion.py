@@ -1,4 +1,4 @@
-"""Motion groups as a trained representation hands them to baking: poses at the knots, and what they belong to."""
+"""Observed motion of a trained representation, as passed to baking: motion groups with poses at the knots."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 
 @dataclass(frozen=True)
 class GroupTrack:
-    """One motion group over the knots, in training coordinates: x -> c + R (x - c) + d from the canonical state.
+    """Poses of one motion group at the knots, in training coordinates: x -> c + R (x - c) + d from the canonical state.
 
     Attributes:
-        object_id: Object that it belongs to; a shadow's caster.
+        object_id: Object of the group; for a shadow, its caster.
         role: "pinned", "body" or "shadow".
         center: The fixed centre c. [3]
         quats: Rotations at the knots, unit wxyz. [S, 4]
         displacements: Displacements at the knots. [S, 3]
-        observed: Knots at which the object was seen well enough to be placed. [S] bool
-        follows: Group whose displacement it takes through ``follow_matrix``, or None.
-        follow_matrix: That map. [3, 3]
+        observed: Knots at which the object was visible enough to be located. [S] bool
+        follows: Group whose displacement it follows through ``follow_matrix``, or None.
+        follow_matrix: Linear map from that group's displacement to its own. [3, 3]
     """
 
     object_id: int
@@ -34,15 +34,15 @@ class GroupTrack:
 
 @dataclass(frozen=True)
 class PointMotion:
-    """Motion of single Gaussians at the knots, in training coordinates; for what their groups do not explain.
+    """Motion of single Gaussians at the knots that their groups do not explain, in training coordinates.
 
     Attributes:
-        rows: Which ones. [R]
-        means: Their centres. [R, S, 3]
-        quats: Their rotations, unit wxyz. [R, S, 4]
-        log_scales: Their log scales. [R, S, 3]
-        dynamics: Velocity, angular velocity and the rates of both at the last knot, about each Gaussian's own centre,
-            per unit of scene time; None where Gaussians have no dynamics of their own. [N, 12]
+        rows: Rows of the Gaussians. [R]
+        means: Centres. [R, S, 3]
+        quats: Rotations, unit wxyz. [R, S, 4]
+        log_scales: Log scales. [R, S, 3]
+        dynamics: Velocity, angular velocity and their rates at the last knot, about each Gaussian's own centre, per
+            unit of scene time. None if Gaussians have no dynamics of their own. [N, 12]
         canonical: Centres in the canonical state. [N, 3] or None
     """
 
@@ -54,7 +54,7 @@ class PointMotion:
     canonical: np.ndarray | None = None
 
     def keep(self, kept: np.ndarray) -> PointMotion:
-        """The same for the Gaussians that are kept. [N] bool"""
+        """Return the motion of the kept Gaussians only. [N] bool"""
         mine = kept[self.rows]
         rows = (np.cumsum(kept) - 1)[self.rows[mine]]
         dynamics = None if self.dynamics is None else self.dynamics[kept]
@@ -64,14 +64,14 @@ class PointMotion:
 
 @dataclass(frozen=True)
 class Moves:
-    """What became of the Gaussians that move.
+    """Counts of Gaussians that regrouping moved to another group.
 
     Attributes:
-        to_bodies: How many went to another body.
-        to_shadows: How many went to a shadow.
-        to_rest: How many were found to rest.
-        resting_shadows: Shadows that stayed where they were in the last observed times though their casters moved.
-        moving: Of how many.
+        to_bodies: Gaussians moved to another body.
+        to_shadows: Gaussians moved to a shadow.
+        to_rest: Gaussians that were found to be at rest.
+        resting_shadows: Shadows that stayed at rest in the last observed times although their casters moved.
+        moving: Number of moving Gaussians in total.
     """
 
     to_bodies: int = 0
@@ -82,23 +82,24 @@ class Moves:
 
     @property
     def moved(self) -> int:
-        """How many changed their group."""
+        """Number of Gaussians that changed their group."""
         return self.to_bodies + self.to_shadows + self.to_rest
 
 
 @dataclass(frozen=True)
 class ObservedMotion:
-    """What a trained representation hands to baking.
+    """Observed motion of all Gaussians.
 
     Attributes:
         times: Knots. [S]
         groups: Motion groups by id.
-        light: Light of the shading. [3]
-        gaussians: Parameters by name that the groups' tracks start from, where they are not the canonical ones.
-        motion_ids: Group of each Gaussian, where it is not that of the training. [N]
-        points: Motion of single Gaussians, or None where all move with their groups.
-        moves: How many Gaussians went to groups that explain them better; None where none was asked.
-        smooth: Whether the tracks go on smoothly before their objects are seen; else they hold the first observed pose.
+        light: Light vector of the shading. [3]
+        gaussians: Parameters by name that the tracks start from; None if they are the canonical ones.
+        motion_ids: Group of each Gaussian; None if unchanged since training. [N]
+        points: Motion of single Gaussians; None if all move with their groups.
+        moves: Counts of regrouped Gaussians; None if regrouping did not run.
+        smooth: True if tracks continue smoothly before their objects are first seen; otherwise they hold the first
+            observed pose.
     """
 
     times: np.ndarray

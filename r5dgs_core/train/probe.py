@@ -1,6 +1,6 @@
-"""A look at a few held-out views while training runs, and at the training views after it.
+"""PSNR on held-out views during training, and on the training views after it.
 
-The run's numbers do not depend on it.
+Probing does not affect the results of the run.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from .train_views import spread
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-TRAINING_VIEWS = 150  # that are compared at most
+TRAINING_VIEWS = 150  # largest number of compared training views
 
 
 class Probe:
-    """Some views of the split ``val``, evenly over their order, in the trainer's coordinates.
+    """Views of the split ``val``, spread evenly, in the trainer's coordinates.
 
     Args:
-        trainer: The run; its ``dataset`` gives the views.
+        trainer: The run; its ``dataset`` provides the views.
         count: Largest number of views.
 
     Raises:
@@ -44,7 +44,7 @@ class Probe:
 
     @torch.no_grad()
     def psnr(self) -> float:
-        """Mean PSNR of the views as they are now, dB, colours in 8 bits; no draw of the run is used up."""
+        """Return the current mean PSNR on the views, dB, for colours of 8 bits. The run's random state is preserved."""
         state = self._trainer.generator.get_state()
         with torch.random.fork_rng(devices=[]):
             found = [psnr(self._trainer.render(camera, t).numpy(), image) for _, camera, t, image in self._views]
@@ -55,12 +55,12 @@ class Probe:
 def training_psnr(
     dataset: datasets.Dataset, behind: np.ndarray | None, draw: Callable[[datasets.View], np.ndarray]
 ) -> float:
-    """Mean PSNR on the training views, or on `TRAINING_VIEWS` of them spread evenly, dB.
+    """Return the mean PSNR on the training views, or on `TRAINING_VIEWS` of them spread evenly, dB.
 
     Args:
         dataset: The data set.
         behind: Background of transparent pixels, as for `train_views.load`. [3] or None
-        draw: Gives the picture of a view. [H, W, 3]
+        draw: Renders a view. [H, W, 3]
 
     Raises:
         DatasetError: An image is missing or cannot be read.
@@ -70,12 +70,12 @@ def training_psnr(
 
 
 def _load(view: datasets.View, behind: np.ndarray | None) -> np.ndarray:
-    """Image of a view on the background of the run. [H, W, 3] uint8"""
+    """Return the image of a view on the run's background. [H, W, 3] uint8"""
     return np.round(datasets.load_image(view, behind) * 255).astype(np.uint8)
 
 
 def psnr(image: np.ndarray, target: np.ndarray) -> float:
-    """PSNR of colours in [0, 1] against 8 bits, dB; at most 99, which equal images have. [H, W, 3]"""
+    """Return the PSNR of colours in [0, 1] against 8-bit colours, dB; 99 for equal images. [H, W, 3]"""
     rounded = np.round(np.clip(image, 0, 1) * 255)
     error = float(np.mean(((rounded - target) / 255) ** 2))
     return min(99.0, -10 * math.log10(max(error, 1e-12)))

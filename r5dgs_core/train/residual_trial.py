@@ -1,10 +1,9 @@
-"""Bodies that are not rigid, found by trying: residuals are given to all bodies for a while and kept where they help.
+"""Trial of residual motion: non-rigid bodies are found by training all bodies with residuals for a short time.
 
-Once every time takes part and the tracks have settled, the run goes on for some steps with a residual field on all
-bodies. Then each body's residuals are left out in turn: views that these steps did not use say by how much the error
-on the body grows. After that the run goes back to where it was, and bodies that lost more than a threshold keep
-their residuals. Those that did not are left without a trace: where none is flexible, the run goes on to the same bits
-as one that never tried.
+Once all times have entered and the tracks have settled, training continues for some steps with a residual field on all
+bodies. Then the residuals of each body are left out in turn, and the increase of the error on that body is measured on
+views that these steps did not use. The run then returns to its state before the trial, and only bodies with an increase
+above a threshold keep their residuals. If no body does, the run continues with the same bits as one without a trial.
 """
 
 from __future__ import annotations
@@ -30,15 +29,15 @@ log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
 
-MARGIN = 2  # pixels around a mask that count to its object: what bends crosses its edge
-HELD_SHARE, MAX_HELD = 0.2, 20  # views that the trial leaves for the comparison
-MIN_PIXELS = 50  # on these together, below which nothing is said of a body
-TRIAL = "trial"  # name of its events
-SEED_STEP = 2  # the trial draws from a generator of its own
+MARGIN = 2  # dilation of masks in the comparison, px; non-rigid parts cross the edge
+HELD_SHARE, MAX_HELD = 0.2, 20  # share and largest number of views held out for the comparison
+MIN_PIXELS = 50  # pixels of a body in the held-out views below which its gain is unknown
+TRIAL = "trial"  # name of the progress events
+SEED_STEP = 2  # added to the run's seed for the trial's generator
 
 
 def decision_step(config: Config, all_entered: int) -> int | None:
-    """Step after which bodies are tried, None for never.
+    """Return the step after which bodies are tried, None for never.
 
     Args:
         config: The run's configuration.
@@ -52,11 +51,11 @@ def decision_step(config: Config, all_entered: int) -> int | None:
 
 
 def decide(trainer: Trainer, progress: Progress) -> None:
-    """Try residuals on all bodies, and go on from where the run was with those that help.
+    """Try residuals on all bodies, then restore the state before the trial with the residuals that help.
 
     Args:
         trainer: A run of tracks with several observed times.
-        progress: Called with an event now and then.
+        progress: Called with events during the trial.
     """
     before = trainer.state()
     field, gains = _try(trainer, progress)
@@ -70,19 +69,19 @@ def decide(trainer: Trainer, progress: Progress) -> None:
 
 
 def flexible(gains: np.ndarray, field: ResidualField, config: Config) -> list[int]:
-    """Bodies that keep their residuals: those that gain more than the threshold, or all where you say so."""
+    """Return the bodies that keep their residuals: those with enough gain, or all if ``needs.residuals`` is "on"."""
     if config.needs.residuals == "on":
         return field.bodies
     return [body for body in field.bodies if gains[body - 1] > config.residual.threshold]
 
 
 def trial_steps(config: Config) -> int:
-    """Length of the trial; shorter in runs that are too short for it, as the curriculum."""
+    """Return the number of steps of the trial; like the curriculum, it is shortened in short runs."""
     return max(1, int(config.residual.trial_steps * min(1.0, config.train.iterations / 2000)))
 
 
 def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarray]:
-    """The field after the trial, and what each body gains by it, dB, nan where that cannot be said. [B - 1]"""
+    """Return the field after the trial, and each body's gain from it, dB, nan if unknown. [B - 1]"""
     config, g, ids = trainer.config, trainer.gaussians, trainer.object_ids[1:]
     opacities = torch.sigmoid(g.params["opacity_logits"].detach())
     bodies = list(range(1, len(ids) + 1))
@@ -117,14 +116,17 @@ def _shows(mask: np.ndarray | None, ids: np.ndarray) -> bool:
 
 
 def split(order: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Views for the comparison and views for the trial, out of shuffled ones; none held where there are too few."""
+    """Split shuffled views into held-out views for the comparison and views for the trial.
+
+    There are no held-out views if ``order`` has too few.
+    """
     count = min(MAX_HELD, int(HELD_SHARE * len(order)))
     return list(order[:count]), list(order[count:])
 
 
 @torch.no_grad()
 def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.ndarray:
-    """By how much the error on each body grows when it alone is without residuals, dB. [B - 1]"""
+    """Return the increase of the error on each body if only its residuals are left out, dB. [B - 1]"""
     ids = trainer.object_ids[1:]
     errors, pixels = np.zeros((2, len(ids))), np.zeros(len(ids))
     for index in held:
@@ -146,7 +148,7 @@ def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.nd
 
 
 def _squares(trainer: Trainer, field: ResidualField, index: int, truth: Tensor) -> np.ndarray:
-    """Squared error of each pixel with a field in place of the trial's. [H, W] float64"""
+    """Return the squared error of each pixel with ``field`` in place of the trial's field. [H, W] float64"""
     view = trainer.views[index]
     trainer.motion.residuals = field  # type: ignore[reportAttributeAccessIssue]: `tracks` alone is tried
     return ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)

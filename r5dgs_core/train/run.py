@@ -1,4 +1,4 @@
-"""A whole training run: steps, log, checkpoints, identity encodings; interrupted and resumed without a trace."""
+"""Training run: steps, log, checkpoints and identity encodings. A resumed run equals an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from .trainer import Trainer
 log = logging.getLogger(__name__)
 
 Progress = Callable[[dict[str, Any]], None]
-# Costs of steps relative to those of training, as measured on the kitchen: what the estimate of the time begins with.
+# Costs of steps relative to training steps, measured on the kitchen scene; initial values of the time estimate.
 DISCOVERY_COST = 1.9
-TRIAL_COST = 2.5  # with the comparison of the bodies after it
+TRIAL_COST = 2.5  # including the comparison of the bodies afterwards
 
 
 def train(
@@ -51,26 +51,29 @@ def train(
 
     Args:
         dataset_root: The data set.
-        folder: Run folder; made, or gone on with.
-        config: Configuration; with ``resume`` the folder's own is used.
-        resume: Go on from the last checkpoint; where training is finished, nothing is done.
-        overwrite: Begin again where the folder holds a run; its files stay until the first step can be taken.
-        go_on: The command that resumes this run, for messages; by default that of ``r5dgs train``.
-        progress: Called with a dictionary per event (docs/reference/run_folder.md). The time left of a `Timed`
-            includes the phases that the caller has added.
+        folder: Run folder; created if it is missing.
+        config: Configuration; ignored with ``resume``, which uses that of the folder.
+        resume: Continue from the last checkpoint. Does nothing if training is finished.
+        overwrite: Start again if the folder contains a run. Its files are kept until training is ready for the first
+            step.
+        go_on: Command that resumes this run, for messages; by default a call of ``r5dgs train``.
+        progress: Called with a dictionary per event (docs/training.md). If it is a `Timed`, its estimate of the time
+            left also counts phases that the caller has added.
 
     Returns:
         The run.
 
     Raises:
-        DatasetError, CheckpointError, TrainingError: As their messages say.
-        Interrupted: SIGINT or SIGTERM came; everything is kept that is needed to go on.
+        DatasetError: The data set cannot be read or used.
+        CheckpointError: The folder cannot be used, or its checkpoint is damaged or belongs to other data.
+        TrainingError: A value is no longer finite, or no Gaussians are left.
+        Interrupted: SIGINT or SIGTERM was received; the run can be resumed.
     """
     folder = Path(folder)
     with contextlib.ExitStack() as stack:
 
         def claim() -> None:
-            if stack.enter_context(folder_lock.hold(folder)):  # what is half-written is of processes that are dead
+            if stack.enter_context(folder_lock.hold(folder)):  # no other process is writing to these files
                 checkpoint.remove_leftovers(folder)
 
         timed = progress if isinstance(progress, Timed) else Timed(progress or (lambda event: None))
@@ -87,7 +90,7 @@ def _train(
     progress: Timed,
     claim: Callable[[], None],
 ) -> checkpoint.Run:
-    """As `train`; ``claim`` locks the folder."""
+    """Implementation of `train`; ``claim`` locks the folder."""
     is_new = not folder.is_dir()
     if not is_new:
         claim()
@@ -99,17 +102,17 @@ def _train(
     settled = checkpoint.open_run(folder).config if resume else config
     dataset = datasets.read(dataset_root, settled.data.masks, settled.data.min_registered)
     dataset.require_one_numbering()
-    if is_new:  # made only now, so that a data set that cannot be read leaves no folder
+    if is_new:  # created only now, so that an unreadable data set leaves no folder
         checkpoint.plan_run(folder, dataset, config)
         claim()
         if not overwrite:
-            checkpoint.refuse_to_lose(folder)  # another process may have trained there meanwhile
+            checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
     go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
     state, replaces = None, False
     if resume:
         run = checkpoint.open_run(folder)
         state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
-        if run.digest != dataset.digest and state is None:  # nothing of the other data is in it
+        if run.digest != dataset.digest and state is None:  # no step has used the other data yet
             run = checkpoint.create_run(folder, dataset, run.config)
         if run.digest != dataset.digest:
             raise CheckpointError(
@@ -154,11 +157,11 @@ def _train(
 def _found_masks(
     dataset: datasets.Dataset, config: Config, state: checkpoint.Checkpoint | None, progress: Timed
 ) -> list[np.ndarray] | None:
-    """Masks of what moves where the data set has none: those that the run began with, or found now."""
+    """Return masks of moving objects for data without masks: those of the checkpoint, or newly discovered ones."""
     if state is None:
         if not training_needs.discovery(dataset, config):
             return None
-        from . import object_discovery  # with the networks of its short run, which others do without
+        from . import object_discovery  # imported late: it loads the networks of the field
 
         progress.estimate.add(Phase(object_discovery.NAME, config.discovery.iterations, DISCOVERY_COST))
         progress.estimate.add(Phase("step", config.train.iterations))
@@ -168,9 +171,9 @@ def _found_masks(
 
 
 def _plan(trainer: Trainer, progress: Timed) -> None:
-    """Add what training does from here on to the estimate of the time that is left."""
+    """Add the remaining phases of training to the estimate of the time left."""
     config, estimate = trainer.config, progress.estimate
-    estimate.finish("discovery")  # `object_discovery.NAME`, without its networks
+    estimate.finish("discovery")  # `object_discovery.NAME`, without importing its networks
     estimate.add(Phase("step", config.train.iterations))
     estimate.at("step", trainer.iteration)
     decision = decision_step(trainer)
@@ -182,17 +185,17 @@ def _plan(trainer: Trainer, progress: Timed) -> None:
 
 
 def decision_step(trainer: Trainer) -> int | None:
-    """Step after which residuals are tried, or None for never: with one observed time nothing can bend."""
+    """Return the step after which residuals are tried; None if never, as with a single observed time."""
     if trainer.motion.name != representation.TRACKS or len(trainer.times) < 2:
         return None
-    from . import residual_trial  # which scenes at rest do not load
+    from . import residual_trial  # static scenes do not need it
 
     config = trainer.config
     return residual_trial.decision_step(config, config.curriculum.steps(config.train.iterations)[1])
 
 
 def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> None:
-    """Take a step, and try residuals after the step ``decision`` (see `decision_step`)."""
+    """Take a step; if it is the step ``decision`` (see `decision_step`), try residuals after it."""
     trainer.step()
     if trainer.iteration == decision:
         from . import residual_trial
@@ -201,7 +204,7 @@ def take_step(trainer: Trainer, decision: int | None, progress: Progress) -> Non
 
 
 def _probe(trainer: Trainer) -> probe.Probe | None:
-    """Held-out views to look at while training runs; None where there are none or none are wanted."""
+    """Return the probe of the held-out views; None if there are none or ``train.probe_every`` is 0."""
     section = trainer.config.train
     if section.probe_every == 0 or not trainer.dataset.val:
         return None
@@ -217,7 +220,7 @@ def _optimise(
     probe: probe.Probe | None,
     pictures: learning_curves.Curves,
 ) -> None:
-    """Take all steps that are left, with a line in the log and a checkpoint now and then."""
+    """Take the remaining steps, and write the log and checkpoints."""
     section = trainer.config.train
     path = run.folder / checkpoint.LOG_FILE
     decision = decision_step(trainer)
@@ -247,7 +250,7 @@ def _optimise(
 
 
 def _identity_steps(trainer: Trainer) -> int:
-    """Steps that the identity encodings will take after the run; each costs about what one of training does."""
+    """Return the number of steps for identity encodings after the run; each costs about as much as a training step."""
     if trainer.config.identity.training != "after":
         return 0
     masked = any(view.mask is not None for view in trainer.views)
@@ -270,7 +273,7 @@ def _append(path: Path, stream: TextIO, event: dict[str, Any]) -> None:
 
 
 def _clean_up(folder: Path, iteration: int) -> None:
-    """Drop the log's lines of steps that will be taken again, and a torn line."""
+    """Drop incomplete lines of the log, and lines of steps that will be taken again."""
     path = folder / checkpoint.LOG_FILE
     kept = []
     try:
@@ -287,7 +290,7 @@ def _clean_up(folder: Path, iteration: int) -> None:
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:
-    """A line of the log, None where a kill tore it."""
+    """Return the event of a line of the log; None if the line is incomplete."""
     try:
         event = json.loads(line)
     except ValueError:
@@ -296,7 +299,7 @@ def _parse(line: bytes) -> dict[str, Any] | None:
 
 
 def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed) -> None:
-    """Labels and identity encodings on the finished geometry, then the last checkpoint."""
+    """Compute labels and identity encodings on the final geometry, and save the last checkpoint."""
     classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
     group_classes = trainer.motion.group_classes(trainer.motion.tensors())
     fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
@@ -319,7 +322,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
                 if step % trainer.config.train.log_every == 0 or step == steps:
                     progress({"event": "identity", "iteration": step, "iterations": steps, "loss": loss})
 
-            # A generator of its own: a run resumed here draws what an unbroken one draws.
+            # A separate generator, so that a run resumed here draws the same numbers.
             draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
             encodings, weight, bias = identity_training.train_encodings(
                 trainer.views,
@@ -333,7 +336,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
             )
             extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
         if trainer.config.identity.hygiene and len(classes) > 1:
-            # After the encodings, which follow the masks' edges by themselves: the labels say what goes with what.
+            # After the encodings, which follow the edges of the masks; cleaned labels follow motion, too.
             extra |= _cleaned(trainer, votes, extra["labels"])
     elif trainer.motion.name == representation.FIELD and training_needs.sorting(trainer.dataset, trainer.config):
         from . import object_discovery
@@ -354,7 +357,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
 
 
 def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Labels after hygiene, and what it changed, by the names of the checkpoint."""
+    """Return the cleaned labels and the counts of changes, by their names in the checkpoint."""
     given, ids = labels.numpy(), trainer.gaussians.motion_ids
     params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
     tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
@@ -387,7 +390,7 @@ def _save(
 ) -> None:
     state = trainer.state()
     tensors = {**state.tensors, **(extra or {})}
-    if packed_masks.LABELS in tensors:  # objects that nobody placed are taken to be there all the time
+    if packed_masks.LABELS in tensors:  # objects found after the run count as observed at all times
         shape = len(tensors["object_ids"]) - 1, len(trainer.times)
         state = dataclasses.replace(state, observed=torch.ones(shape, dtype=torch.bool))
     values = {

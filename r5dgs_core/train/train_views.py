@@ -20,15 +20,15 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class TrainView:
-    """One image of the training split.
+    """Image of the training split.
 
     Attributes:
         name: Name in the data set.
         camera: Camera in normalised coordinates.
         t: Scene time.
         image: sRGB. [H, W, 3] uint8
-        mask: Object ids, or None. [H, W] uint8 where they fit, else uint16
-        alpha: Opacity of the pixels, or None where the image has none. [H, W] uint8
+        mask: Object ids, or None. [H, W] uint8 if they fit, else uint16
+        alpha: Opacity of the pixels; None if the image has no alpha. [H, W] uint8
     """
 
     name: str
@@ -44,8 +44,8 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
 
     Args:
         dataset: The data set.
-        normalization: From world to training coordinates.
-        background: Colour behind transparent pixels, or None where images are opaque. [3]
+        normalization: World coordinates to training coordinates.
+        background: Colour behind transparent pixels; None if images are opaque. [3]
 
     Raises:
         DatasetError: There is no training view.
@@ -67,7 +67,7 @@ def load(dataset: datasets.Dataset, normalization: Normalization, background: np
 
 
 def behind(dataset: datasets.Dataset, config: Config) -> np.ndarray | None:
-    """Colour behind transparent pixels that a run trains with, or None where it learns what lies behind. [3]"""
+    """Return the colour behind transparent pixels; None if the run learns its background. [3]"""
     kind = config.train.background
     if kind == "auto":
         kind = "white" if dataset.has_alpha else "learned"
@@ -75,17 +75,17 @@ def behind(dataset: datasets.Dataset, config: Config) -> np.ndarray | None:
 
 
 def with_masks(views: Sequence[TrainView], masks: Sequence[np.ndarray]) -> list[TrainView]:
-    """The views with other masks. Of [H, W]"""
+    """Return the views with other masks. Each [H, W]"""
     return [dataclasses.replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
 
 
 def spread(items: Sequence[Item], limit: int) -> list[Item]:
-    """The items, or ``limit`` of them evenly over their order where there are more."""
+    """Return all items, or ``limit`` of them spread evenly if there are more."""
     if len(items) <= limit:
         return list(items)
     return [items[i] for i in np.linspace(0, len(items) - 1, limit).round().astype(int)]
 
 
 def nearest_knot(times: np.ndarray, t: float) -> int:
-    """Index of the observed time that is nearest to ``t``. [S]"""
+    """Return the index of the observed time [S] nearest to ``t``."""
     return int(np.argmin(np.abs(times - t)))

@@ -1,8 +1,8 @@
-"""Training: canonical Gaussians and their motion, from posed images with masks.
+"""Trainer of canonical Gaussians and their motion, from posed images with masks.
 
-One view per step: pose the Gaussians at the view's time, rasterize, compare, step. Times enter from a first, well-seen
-one outwards; Gaussians grow where the image asks for it. Everything that a step depends on is in `Trainer.state`, so a
-resumed run ends with the numbers of an unbroken one.
+Each step poses the Gaussians at the time of one view, rasterizes and compares. Training starts at one well-seen time
+and adds the others outwards; densification adds Gaussians. `Trainer.state` contains everything that a step depends on,
+so a resumed run gives the same numbers as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from .representations import fused_posing, registry, representation, static
 log = logging.getLogger(__name__)
 
 TARGET_BYTES = 1 << 30
-EYES = 256  # cameras that count for what a single camera sees
-HOLD_EVERY = 100  # steps after which it is decided anew which Gaussians are held
-HELD = "held"  # a tensor of the state
+EYES = 256  # largest number of cameras in tests of visibility
+HOLD_EVERY = 100  # steps between updates of the held Gaussians
+HELD = "held"  # name of a tensor of the state: mask of the Gaussians whose centres are frozen
 GEOMETRY = ("means", "translations", "rotvecs", "light", "slope", "residual")
 NETWORKS = ("field", "trd")
 APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
 
 class Trainer:
-    """One run: data in normalised coordinates, parameters, optimizer and the draws' generator.
+    """State of one run: normalised data, parameters, optimizer and random generator.
 
     Args:
         dataset: The data set.
         config: The run's configuration.
-        found: Masks that were found for the training views where the data set has none; they serve the start alone.
+        found: Discovered masks of the training views, if the data set has none; used for the initialisation only.
 
     Raises:
-        DatasetError: The training split is empty or cannot be read.
+        DatasetError: The training split is empty or cannot be read, or no Gaussian can be placed.
     """
 
     def __init__(
@@ -128,14 +128,14 @@ class Trainer:
         self._targets: dict[int, Tensor] = {}
 
     def _cloud(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Points of the data set's reconstruction in normalised coordinates and their colours, where it has one."""
+        """Return points (normalised coordinates) and colours of the data set's reconstruction; None if it has none."""
         points, colors = self.dataset.points, self.dataset.point_colors
         if points is None or colors is None or len(points) == 0:
             return None
         return (points - self.normalization.origin) / self.normalization.scale, colors
 
     def _mean_color(self) -> np.ndarray:
-        """Coefficients of one colour, the median of all pixels, where no sky was found. [1, 3]"""
+        """Coefficients of the median colour of all pixels, for scenes in which no sky was found. [1, 3]"""
         color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
         return sh_color.rgb_to_dc(color)[None]
 
@@ -154,7 +154,7 @@ class Trainer:
 
     @property
     def done(self) -> bool:
-        """Whether all steps are taken."""
+        """True if all steps are taken."""
         return self.iteration >= self.config.train.iterations
 
     def step(self) -> float:
@@ -191,7 +191,7 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         value = float(loss.detach())
-        # A sum is quick, and not finite as soon as one term is not; only then is the culprit looked for.
+        # Sums are cheap and become non-finite if any gradient is; the parameter is searched for only then.
         sums = [p.grad.sum() for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
         if not math.isfinite(value + float(torch.stack(sums).sum())):
             self._check_finite(value, view.name)
@@ -205,7 +205,7 @@ class Trainer:
         return value
 
     def _hold_places(self) -> None:
-        """Keep background Gaussians that a single camera sees where they are, as one view does not tell their depth."""
+        """Freeze the centres of background Gaussians that only one camera sees, as their depth is not determined."""
         if self.iteration % HOLD_EVERY == 0 or len(self.held) != len(self.gaussians):
             self.held = densifier.single_view(self.gaussians, self.eyes)
         gradient = self.gaussians.params["means"].grad
@@ -215,7 +215,7 @@ class Trainer:
     def _draw_all(
         self, view: train_views.TrainView, stats: RasterStats
     ) -> tuple[Tensor, Tensor | None, fused_posing.Splats]:
-        """A training view's image, its blended encodings where they are drawn in the same pass, and the splats."""
+        """Render a training view: image, blended encodings (None if rendered separately) and splats."""
         splats = self.splats(view.camera, view.t, self.generator)
         colors, background = splats.colors, self.background.image(view.camera)
         together = self.identity is not None and self.identity.with_geometry
@@ -234,7 +234,7 @@ class Trainer:
         return (image[..., :3].contiguous(), image[..., 3:], splats) if together else (image, None, splats)
 
     def render(self, camera: Camera, t: float) -> Tensor:
-        """Image of a camera in normalised coordinates at a time. [H, W, 3]"""
+        """Render a camera in normalised coordinates at a time. [H, W, 3]"""
         splats = self.splats(camera, t)
         return rasterize_splats(
             splats.means,
@@ -247,17 +247,17 @@ class Trainer:
         ).image
 
     def splats(self, camera: Camera, t: float, draw: torch.Generator | None = None) -> fused_posing.Splats:
-        """Activated Gaussians in normalised coordinates at a time, as a camera sees them."""
+        """Return activated Gaussians in normalised coordinates at a time, as seen by a camera."""
         return self.motion.splats(self.gaussians, camera, t, draw)
 
     def _labels(self) -> Tensor:
-        """Class of each Gaussian: the classifier's answer where it is trained already, else that of its group. [N]"""
+        """Class of each Gaussian by the classifier if it is already trained, else by its motion group. [N]"""
         if self.identity is not None:
             return self.identity.labels(self.gaussians)
         return torch.from_numpy(self.motion.group_classes(self.motion.tensors()))[self.gaussians.motion_ids]
 
     def _leave_tracks(self) -> None:
-        """Go on with a field where the configuration asks for one and its share of tracks is over."""
+        """Switch from tracks to a field once the run has passed ``field.tracks_share``."""
         if self.config.train.representation != representation.FIELD or self.motion.name != representation.TRACKS:
             return
         if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
@@ -267,7 +267,7 @@ class Trainer:
             self.optimizer = self._make_optimizer()
 
     def _target(self, index: int) -> Tensor:
-        """The view's image in [0, 1]; kept as long as all of them fit, converted each time where they do not."""
+        """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""
         if index in self._targets:
             return self._targets[index]
         target = torch.from_numpy(self.views[index].image).float() / 255
@@ -276,7 +276,7 @@ class Trainer:
         return target
 
     def _base_rate(self, name: str) -> float:
-        """Learning rate that a parameter begins with, by the part of its name before the first dot."""
+        """Initial learning rate of a parameter, by the part of its name before the first dot."""
         group = name.partition(".")[0]
         if self.identity is not None and group in self.identity.rates:
             return self.identity.rates[group]
@@ -289,7 +289,9 @@ class Trainer:
         if name == "shading" and not self.config.train.shading:
             return 0.0
         progress = self.iteration / self.config.train.iterations
-        begin = self.config.residual.start if name == "residual" else rates.decay_from  # later learned, later settled
+        begin = (
+            self.config.residual.start if name == "residual" else rates.decay_from
+        )  # residuals start later, so they decay later
         if progress <= begin or name not in GEOMETRY + APPEARANCE + NETWORKS:
             return base
         decay = rates.decay_networks if name in NETWORKS else rates.decay
@@ -297,7 +299,7 @@ class Trainer:
         return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
 
     def _curriculum(self) -> tuple[int, int]:
-        """Steps on the first time alone, and step at which all times have entered."""
+        """Return the number of steps on the first time alone, and the step at which all times have entered."""
         return self.config.curriculum.steps(self.config.train.iterations)
 
     def _grow_times(self) -> None:
@@ -338,7 +340,7 @@ class Trainer:
         return int(pool[min(int(pick * len(pool)), len(pool) - 1)])
 
     def _hide_harmonics(self) -> None:
-        """Keep harmonics whose degree is not trained yet at zero: their gradients, and so their moments, are."""
+        """Keep untrained degrees of the harmonics at zero by zeroing their gradients, and so Adam's moments."""
         every, rest = self.config.train.sh_every, self.gaussians.params["sh_rest"]
         if every > 0 and rest.grad is not None:
             rest.grad[:, (self.iteration // every + 1) ** 2 - 1 :] = 0.0
@@ -353,7 +355,7 @@ class Trainer:
             )
 
     def _check_finite(self, value: float, view: str) -> None:
-        """Raise TrainingError where the loss, a parameter or a gradient is not finite."""
+        """Raise `TrainingError` if the loss, a parameter or a gradient is not finite."""
         named = {**self.gaussians.params, **self.motion.params, **self.background.params}
         named |= {} if self.identity is None else self.identity.params
         bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
@@ -369,7 +371,7 @@ class Trainer:
             )
 
     def state(self) -> Checkpoint:
-        """Everything that the next step depends on."""
+        """Return everything that the next step depends on."""
         tensors: dict[str, Tensor] = {f"gaussians.{n}": p.detach() for n, p in self.gaussians.params.items()}
         tensors["gaussians.motion_ids"] = self.gaussians.motion_ids
         tensors |= self.motion.tensors()
@@ -401,9 +403,9 @@ class Trainer:
         )
 
     def restore(self, state: Checkpoint) -> None:
-        """Go on from a `state`: the inverse, on a trainer made with the same data set and configuration."""
+        """Restore a `state` of a trainer with the same data set and configuration."""
         self.motion = registry.for_state(self.motion, state.representation, self.first_time, self.config)
-        tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training changes them in place
+        tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training modifies them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
         self.motion.restore(tensors)

@@ -1,4 +1,4 @@
-"""Compiling the kernels of training beside those of the rasterizer, or loading them where an earlier process did."""
+"""Compilation of the training and rasterizer kernels, or their loading from the cache."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from .representations import fused_posing
 
 
 def warm_up(progress: Callable[[str], object] | None = None) -> float:
-    """Make every kernel of training ready, those of the rasterizer included.
+    """Compile or load all kernels of training, including those of the rasterizer.
 
     Args:
-        progress: Called with the name of each stage before it begins.
+        progress: Called with the name of each stage before it starts.
 
     Returns:
-        The seconds it took.
+        Seconds taken.
 
     Raises:
-        BackendError: There is no numba.
+        BackendError: Numba is not installed.
     """
     start = time.perf_counter()
     render_warm_up.warm_up(progress=progress)

@@ -1,9 +1,9 @@
-"""Densification: the face that all strategies keep, and the moves that they are made of.
+"""Densification: interface of the strategies, and operations that they share.
 
-A strategy sees what each step drew, adds a penalty to the loss where it has one, and after each step changes the
-Gaussians in place, optimizer state included. What its next step depends on is in named tensors, so that a resumed run
-ends with the same numbers. Sizes are in normalised units, gradients per half image width, so that thresholds hold at
-any resolution.
+A strategy observes each step, may add a penalty to the loss, and after each step may change the Gaussians in place,
+including their optimizer state. Named tensors hold the state that its next step depends on, so that a resumed run gives
+the same numbers. Sizes are in normalised units and gradients per half image width, so that thresholds hold at any
+resolution.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ SPLIT_SHRINK = 1.6  # the two halves of a split Gaussian are smaller by this fac
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a run tells its strategy.
+    """Properties of the run that a strategy depends on.
 
     Attributes:
-        cap: Largest number of Gaussians; a run starts with no more, and no step leaves more.
+        cap: Largest number of Gaussians, from the start and after each step.
         iterations: Steps of the whole run.
         pixel_size: Typical size of a pixel at the objects, normalised units.
         image_width: Typical width of an image, px.
         extent: Radius of the cameras, normalised units (`extent_of`).
-        eyes: The distinct training cameras, in normalised coordinates.
-        generator: Source of the draws; its state is kept by the run.
-        white: Whether a fixed white background is behind everything.
+        eyes: Distinct training cameras, in normalised coordinates.
+        generator: Random generator; its state belongs to the run.
+        white: True if the background is fixed to white.
     """
 
     cap: int
@@ -49,14 +49,14 @@ class Conditions:
 
 
 class Strategy(Protocol):
-    """How the number of Gaussians changes while they are trained."""
+    """Interface of densification strategies."""
 
     def penalty(self, gaussians: Gaussians) -> Tensor | None:
-        """What is added to the loss of the coming step, or None."""
+        """Return a term for the loss of the current step, or None."""
         ...
 
     def observe(self, stats: RasterStats, camera: Camera) -> None:
-        """Take note of what a step drew, after its backward pass."""
+        """Record the statistics of a step, after its backward pass."""
         ...
 
     def after_step(
@@ -66,16 +66,16 @@ class Strategy(Protocol):
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that its next step depends on, by name (``gradients.NAME``)."""
+        """Return the state that the next step depends on, by name (``gradients.NAME``)."""
         ...
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `tensors`."""
+        """Restore the state from `tensors`."""
         ...
 
 
 class ScreenGradients:
-    """Running mean of the screen gradient of each Gaussian over the views that show it, and its largest radius, px."""
+    """Mean screen-space gradient of each Gaussian over the views that show it, and its largest radius, px."""
 
     def __init__(self, count: int):
         self.total = torch.zeros(count)
@@ -90,21 +90,21 @@ class ScreenGradients:
             self.radii = torch.maximum(self.radii, torch.where(visible, radii.to(self.radii.dtype), 0.0))
 
     def observe(self, stats: RasterStats, camera: Camera) -> None:
-        """Add the view that a step drew."""
+        """Add the view of a training step."""
         if stats.grad_norm is not None and stats.visible is not None:
             self.add(0.5 * camera.width * stats.grad_norm, stats.visible, stats.radii)
 
     def mean(self) -> Tensor:
-        """Mean screen gradient. [N]"""
+        """Mean screen-space gradient. [N]"""
         return self.total / self.views.clamp(min=1)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its state by ``gradients.NAME``."""
+        """Return the state by ``gradients.NAME``."""
         return {f"gradients.{name}": getattr(self, name) for name in ("total", "views", "radii")}
 
     @classmethod
     def of(cls, tensors: dict[str, Tensor]) -> ScreenGradients:
-        """From `tensors`; radii that an earlier version did not keep start at 0."""
+        """Create from `tensors`; radii, which earlier versions did not store, default to 0."""
         made = cls(len(tensors["gradients.total"]))
         for name in ("total", "views", "radii"):
             setattr(made, name, tensors.get(f"gradients.{name}", getattr(made, name)))
@@ -112,7 +112,7 @@ class ScreenGradients:
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """1.1 times the largest distance of a camera to the mean of all, the extent of 3DGS; units of the cameras."""
+    """Return the extent of 3DGS: 1.1 times the largest distance of a camera from the mean of all, in their units."""
     centers = torch.stack([torch.from_numpy(camera.center) for camera in cameras])
     return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
 
@@ -121,17 +121,17 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 def grow(
     gaussians: Gaussians, optimizer: torch.optim.Optimizer, chosen: Tensor, split: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Clone some Gaussians, split others: each adds one once those that were split are removed.
+    """Clone some Gaussians and split others; each adds one Gaussian once the split ones are removed.
 
     Args:
-        gaussians: Changed in place, optimizer state included; new ones are appended and inherit the motion group.
-        optimizer: The optimizer that holds their parameters.
+        gaussians: Changed in place, including optimizer state; new ones are appended and inherit the motion group.
+        optimizer: Optimizer of their parameters.
         chosen: Rows that grow. [G]
-        split: Which of them are split: two smaller ones drawn from the Gaussian replace it. [G] bool
-        generator: Source of the draws.
+        split: True for rows to split: two smaller Gaussians drawn from the Gaussian replace it. [G] bool
+        generator: Random generator.
 
     Returns:
-        Rows that the split ones leave to be removed, of all after growing. [N] bool
+        Mask of the split Gaussians, which the caller must remove, over all Gaussians after growing. [N] bool
 
     Source: 3DGS (Kerbl et al. 2023), section 5.2.
     """
@@ -152,7 +152,7 @@ def grow(
 
 
 def forget(gaussians: Gaussians, optimizer: torch.optim.Optimizer, names: Sequence[str], rows: Tensor | None) -> None:
-    """Set the optimizer's moments of some parameters to zero, at some rows (None: at all)."""
+    """Reset the optimizer's moments of some parameters to zero, for some rows or for all (None)."""
     for name in names:
         state = optimizer.state.get(gaussians.params[name], {})
         for key in ("exp_avg", "exp_avg_sq"):

@@ -1,4 +1,4 @@
-"""Strategies of densification that follow the screen gradient: `Share`, and `Adaptive`, that of 3DGS; the choice.
+"""Densification by screen-space gradients: `Share` and `Adaptive` (3DGS). Factory of all strategies.
 
 Source: 3D Gaussian Splatting (Kerbl et al. 2023), section 5.2.
 """
@@ -20,10 +20,10 @@ from .densifier import Conditions, ScreenGradients
 
 
 class _Gradients:
-    """What both strategies keep of the steps since their last round.
+    """Base of both strategies: accumulates screen-space gradients since the last round.
 
     Args:
-        conditions: What the run tells.
+        conditions: Properties of the run.
         count: Number of Gaussians.
     """
 
@@ -49,14 +49,14 @@ class _Gradients:
 
 
 class Share(_Gradients):
-    """The largest gradients grow, at most a share of all in a round; no opacity resets. The default.
+    """Default strategy: the Gaussians with the largest gradients grow, up to a share of all per round; no resets.
 
-    A small weight on the mean opacity lets fade what no image needs: Gaussians that no camera sees, or that repeat the
-    sky before the sky, would otherwise stay as chance left them, and show in views from elsewhere.
+    A small weight on the mean opacity lets Gaussians fade that no image needs. Otherwise those that no camera sees, or
+    that repeat the sky in front of it, would keep their random initial state and be visible in other views.
 
     Args:
         section: Thresholds.
-        conditions: What the run tells.
+        conditions: Properties of the run.
         count: Number of Gaussians.
     """
 
@@ -66,7 +66,7 @@ class Share(_Gradients):
         self.width_limit = section.prune_width * conditions.image_width * conditions.pixel_size
 
     def penalty(self, gaussians: Gaussians) -> Tensor | None:
-        """Mean opacity, weighted."""
+        """Return the weighted mean opacity, or None if its weight is 0."""
         if self.section.opacity <= 0 or len(gaussians) == 0:
             return None
         return self.section.opacity * torch.sigmoid(gaussians.params["opacity_logits"]).mean()
@@ -81,7 +81,7 @@ class Share(_Gradients):
 
     @torch.no_grad()
     def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Grow where the image asks for it, then prune; Gaussians and optimizer are changed in place."""
+        """Grow Gaussians with large gradients, then prune; Gaussians and optimizer are changed in place."""
         section, conditions, n = self.section, self.conditions, len(gaussians)
         score = self.gradients.mean()
         room = max(0, conditions.cap - n)
@@ -99,13 +99,13 @@ class Share(_Gradients):
 
 
 class Adaptive(_Gradients):
-    """The default strategy of 3DGS, adaptive density control, under a hard cap; opacities are reset now and then.
+    """Default strategy of 3DGS (adaptive density control with opacity resets), with a hard cap.
 
-    Before a white background they are reset once more as growth begins, so that white Gaussians before white fade.
+    With a white background, opacities are also reset when growth begins, so that white Gaussians in front of it fade.
 
     Args:
         section: Thresholds.
-        conditions: What the run tells.
+        conditions: Properties of the run.
         count: Number of Gaussians.
     """
 
@@ -128,12 +128,12 @@ class Adaptive(_Gradients):
 
     @torch.no_grad()
     def round(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer, *, sizes: bool) -> None:
-        """Clone and split all whose gradient exceeds the threshold, largest first, then prune.
+        """Clone and split all Gaussians with a gradient above the threshold, largest first, then prune.
 
         Args:
             gaussians: Changed in place.
-            optimizer: Changed with them.
-            sizes: Whether large ones are removed too; not before opacities were reset for the first time.
+            optimizer: Changed in place, too.
+            sizes: True to also remove large Gaussians; False until the first reset of the opacities.
         """
         section, conditions, n = self.section, self.conditions, len(gaussians)
         score, radii = self.gradients.mean(), self.gradients.radii
@@ -152,19 +152,19 @@ class Adaptive(_Gradients):
 
     @torch.no_grad()
     def reset(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Lower all opacities to ``reset_opacity``, so that only those that the images need come back."""
+        """Lower all opacities to ``reset_opacity``; only those that the images need recover."""
         limit = self.section.reset_opacity
         gaussians.params["opacity_logits"].clamp_(max=math.log(limit / (1 - limit)))
         densifier.forget(gaussians, optimizer, ("opacity_logits",), None)
 
 
 def make(config: Config, conditions: Conditions, count: int) -> densifier.Strategy:
-    """The strategy that the configuration asks for.
+    """Create the strategy that the configuration selects.
 
     Args:
         config: The run's configuration.
-        conditions: What the run tells.
-        count: Number of Gaussians that it starts with.
+        conditions: Properties of the run.
+        count: Initial number of Gaussians.
     """
     if config.densify.strategy == "mcmc":
         return mcmc.MCMC(config.densify_mcmc, conditions)

@@ -1,6 +1,6 @@
-"""Densification as a Markov chain: dead Gaussians move onto live ones, a few are added each round, noise explores.
+"""Densification as Markov Chain Monte Carlo: relocation of dead Gaussians, gradual growth and exploration by noise.
 
-Notation: o opacity, s standard deviation, N the number of Gaussians that take the place of one.
+Notation: o opacity, s standard deviation, N the number of Gaussians that replace one.
 
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024).
 """
@@ -18,25 +18,25 @@ from ...scene.cameras import Camera
 from . import densifier
 from .densifier import Conditions
 
-MOST = 51  # Gaussians that one may be divided into at a time
-GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # the noise fades over 1 / slope as the opacity rises past this one
+MOST = 51  # largest number of Gaussians that replace one
+GATE_SLOPE, GATE_OPACITY = 100.0, 0.005  # sigmoid gate of the noise over opacity
 
 
 def divided(
     opacities: Tensor,  # [R]
     counts: Tensor,  # [R]
 ) -> tuple[Tensor, Tensor]:
-    """Opacity and size of N equal Gaussians that together look like one.
+    """Return opacity and size of N equal Gaussians that together look like one.
 
-    At the centre they cover what the one covered, 1 - (1 - o')^N = o; and so they do along any line through it in
-    total: the integral of 1 - (1 - o' g')^N equals that of o g, with g the falloff of the one and g' that of the N.
+    At the centre they cover as much as the one, 1 - (1 - o')^N = o; and along any line through it the total is equal:
+    the integral of 1 - (1 - o' g')^N equals that of o g, with g the falloff of the one and g' that of the N.
 
     Args:
         opacities: Opacity o of the one, in (0, 1). [R]
-        counts: How many take its place, 1 to `MOST`. [R] integers
+        counts: Number N of replacements, 1 to `MOST`. [R] integers
 
     Returns:
-        Opacity o' of each of the N, and the factor by which its standard deviations change. [R], [R]
+        Opacity o' of each of the N, and the factor on its standard deviations. [R], [R]
 
     Source: Kheradmand et al. 2024, Eq. 9; its double sum of binomials taken over i first, sum_i C(i-1, k) = C(N, k+1).
     """
@@ -53,11 +53,11 @@ def divided(
 
 
 class MCMC:
-    """Relocation, growth up to the cap, noise, and the penalties that let Gaussians die.
+    """Strategy ``mcmc``: relocation, growth up to the cap, noise, and penalties that let Gaussians die.
 
     Args:
         section: Thresholds.
-        conditions: What the run tells.
+        conditions: Properties of the run.
     """
 
     def __init__(self, section: DensifyMcmcSection, conditions: Conditions):
@@ -65,21 +65,21 @@ class MCMC:
         self.conditions = conditions
 
     def penalty(self, gaussians: Gaussians) -> Tensor | None:
-        """Mean opacity and mean standard deviation, weighted."""
+        """Return the weighted mean opacity and mean standard deviation."""
         if len(gaussians) == 0:
             return None
         opacity = self.section.opacity * torch.sigmoid(gaussians.params["opacity_logits"]).mean()
         return opacity + self.section.scale * gaussians.params["log_scales"].exp().mean()
 
     def observe(self, stats: RasterStats, camera: Camera) -> None:
-        """Nothing: opacities say all that this strategy wants to know."""
+        """Do nothing: the strategy depends on opacities only."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Nothing: the draws' generator belongs to the run."""
+        """Return no tensors: the strategy is stateless, and its generator belongs to the run."""
         return {}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Nothing is kept."""
+        """Do nothing: the strategy is stateless."""
 
     @torch.no_grad()
     def after_step(
@@ -96,7 +96,7 @@ class MCMC:
 
     @torch.no_grad()
     def relocate(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Move each dead Gaussian onto a live one drawn by opacity; both become what the live one looked like."""
+        """Move each dead Gaussian onto a live one drawn by opacity; both together replace the live one."""
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
         dead = opacities <= self.section.dead_opacity
         live = torch.where(dead, 0.0, opacities)
@@ -114,7 +114,7 @@ class MCMC:
 
     @torch.no_grad()
     def add(self, gaussians: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-        """Add a share of new ones, drawn by opacity, as far as the cap allows."""
+        """Add a share of new Gaussians, drawn by opacity, up to the cap."""
         n = len(gaussians)
         count = min(self.conditions.cap, int((1 + self.section.grow) * n)) - n
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
@@ -127,7 +127,7 @@ class MCMC:
 
     @torch.no_grad()
     def shake(self, gaussians: Gaussians, size: float) -> None:
-        """Move centres by noise of the shape of the covariance; opaque ones stay.
+        """Add noise in the shape of the covariance to the centres; opaque Gaussians stay.
 
         Args:
             gaussians: Changed in place.
@@ -145,14 +145,16 @@ class MCMC:
         params["means"] += size * gate[:, None] * noise
 
     def _draw(self, weights: Tensor, count: int) -> Tensor:
-        """Rows drawn by weight, with repetition. [count]"""
+        """Draw rows by weight, with replacement. [count]"""
         edges = weights.double().cumsum(0)
         draws = torch.rand(count, generator=self.conditions.generator, dtype=torch.float64) * edges[-1]
         rows = torch.searchsorted(edges, draws, right=True)
         return rows.clamp(max=int(torch.nonzero(weights).max()))
 
     def _divide(self, gaussians: Gaussians, source: Tensor) -> None:
-        """Give each drawn Gaussian the opacity and size that it has once all that were drawn share its place."""
+        """Set opacity and size of each drawn Gaussian to those of its share, for as many Gaussians as were drawn from
+        it.
+        """
         opacities = torch.sigmoid(gaussians.params["opacity_logits"])
         rows, times = source.unique(return_counts=True)
         each, factor = divided(opacities[rows].clamp(max=1 - 1e-6), (times + 1).clamp(max=MOST))

@@ -1,7 +1,7 @@
-"""Losses of identity encodings: pixels follow the masks, neighbours in space agree.
+"""Losses of identity encodings: cross-entropy of pixels with the masks, and agreement of spatial neighbours.
 
 Notation: C classes, M queried Gaussians with k neighbours each; probabilities are softmaxes of the classifier's
-answers, so that they sum to one over the classes.
+outputs.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 LOG_FLOOR = 1e-10  # added to probabilities before the logarithm
-BLOCK_BYTES = 1 << 24  # of the answers that are held at once
+BLOCK_BYTES = 1 << 24  # classifier outputs per block
 
 
 def pixel_cross_entropy(features: Tensor, weight: Tensor, bias: Tensor, target: Tensor) -> Tensor:
-    """Mean cross-entropy of the classified pixels, divided by ln C so that guessing costs 1 for any C.
+    """Return the mean cross-entropy of the classified pixels, divided by ln C so that guessing costs 1 for any C.
 
-    Value and gradients are found in one pass over blocks of pixels: no array of all pixels and classes is held.
+    Value and gradients are computed together in blocks of pixels, so that no array of all pixels and classes is needed.
 
     Args:
         features: Blended encodings of the pixels. [..., D]
-        weight: Of the classifier. [C, D]
-        bias: Of the classifier. [C]
-        target: Class of each pixel, -1 where it does not count. [...] int64
+        weight: Weight of the classifier. [C, D]
+        bias: Bias of the classifier. [C]
+        target: Class of each pixel, -1 for ignored pixels. [...] int64
 
     Returns:
-        The loss, a scalar; 0 where no pixel counts. Differentiable once, in all but ``target``.
+        The loss, a scalar; 0 if all pixels are ignored. Differentiable once, in all but ``target``.
 
     Source: Gaussian Grouping (Ye et al. 2024), section 3.2.
     """
@@ -69,13 +69,13 @@ class _PixelCrossEntropy(torch.autograd.Function):
 
 
 def spatial_divergence(probabilities: Tensor, neighbours: Tensor, *, include_self: bool = False) -> Tensor:
-    """How much the classes of Gaussians differ from those of their neighbours: L_3d.
+    """Return the mean divergence between the classes of Gaussians and of their neighbours, L_3d.
 
     Args:
-        probabilities: Of the queried Gaussians. [M, C]
-        neighbours: Of the nearest other Gaussians of each, nearest first. [M, k, C]
+        probabilities: Class probabilities of the queried Gaussians. [M, C]
+        neighbours: Class probabilities of the nearest other Gaussians of each, nearest first. [M, k, C]
         include_self: Count a Gaussian as its own nearest neighbour in place of the farthest one, as Gaussian Grouping
-            does: one of its k divergences is then always 0.
+            does. One of its k divergences is then always 0.
 
     Returns:
         Mean over queries and neighbours of the Kullback-Leibler divergence of the query from the neighbour, divided by
@@ -94,11 +94,11 @@ def spatial_divergence(probabilities: Tensor, neighbours: Tensor, *, include_sel
 
 
 def majority_distance(probabilities: Tensor, neighbours: Tensor) -> Tensor:
-    """How far the classes of Gaussians are from the mean of their neighbours': L_major.
+    """Return the mean distance between the classes of Gaussians and the mean of their neighbours, L_major.
 
     Args:
-        probabilities: Of the queried Gaussians. [M, C]
-        neighbours: Of the nearest other Gaussians of each. [M, k, C]
+        probabilities: Class probabilities of the queried Gaussians. [M, C]
+        neighbours: Class probabilities of the nearest other Gaussians of each. [M, k, C]
 
     Returns:
         Mean squared Euclidean distance, a scalar, 0 without queries or neighbours. Gradients reach both sides.
@@ -111,7 +111,7 @@ def majority_distance(probabilities: Tensor, neighbours: Tensor) -> Tensor:
 
 
 class Neighbourhood:
-    """The nearest others of points that stay where they are.
+    """Nearest neighbours among fixed points.
 
     Args:
         points: The points. [N, 3]
@@ -122,21 +122,21 @@ class Neighbourhood:
         self._tree = KDTree(self.points.numpy())
 
     def nearest(self, rows: Tensor, count: int) -> Tensor:
-        """Rows of the nearest other points, nearest first; fewer columns where there are fewer others.
+        """Return the rows of the nearest other points, nearest first.
 
         Args:
-            rows: Whose neighbours are wanted. [M] int64
+            rows: Queried points. [M] int64
             count: Neighbours of each, k.
 
         Returns:
-            Their rows. [M, min(k, N - 1)] int64
+            Rows of the neighbours. [M, min(k, N - 1)] int64
         """
         count = min(count, len(self.points) - 1)
         if count < 1 or len(rows) == 0:
             return rows.new_zeros(len(rows), max(count, 0))
         asking = rows.cpu()
         found = np.asarray(self._tree.query(self.points[asking].numpy(), count + 1)[1])
-        # Of points in one place the tree may name others before the one that asks, or not name it at all.
+        # If points coincide, the tree may return others before the queried one, or not return it at all.
         own = found == asking.numpy()[:, None]
         own[~own.any(1), -1] = True
         return torch.from_numpy(found[~own].reshape(len(rows), count).astype(np.int64)).to(rows.device)

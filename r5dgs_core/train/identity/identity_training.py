@@ -1,8 +1,8 @@
-"""Which object each Gaussian belongs to: a vote of the masks, and identity encodings with their classifier.
+"""Object identities of Gaussians: a vote of the masks, and identity encodings with their classifier.
 
-The vote gives one label per Gaussian; the encodings, rendered and classified per pixel, follow the masks' edges more
-closely than labels can (Gaussian Grouping). Both run on finished, frozen geometry; encodings also beside the training
-of the geometry (`JointIdentity`).
+The vote gives one label per Gaussian. The encodings, rendered and classified per pixel, follow the edges of the masks
+more closely than labels can (Gaussian Grouping). Both are computed on finished, frozen geometry; encodings can also be
+trained together with the geometry (`JointIdentity`).
 
 Notation: N Gaussians, C classes: class 0 is the background, class k the k-th object.
 """
@@ -27,16 +27,16 @@ from ..train_views import TrainView, spread
 from . import identity_losses
 
 VOTE_VIEWS = 80
-NEIGHBOURS_EVERY = 300  # steps after which neighbours are looked for anew, where the Gaussians are still the same
+NEIGHBOURS_EVERY = 300  # steps between searches for neighbours while the Gaussians' rows do not change
 
 
 def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: dict[int, int], count: int) -> Tensor:
-    """What each Gaussian contributes to the mask pixels of each class.
+    """Return the contribution of each Gaussian to the mask pixels of each class.
 
     Args:
-        views: Training views; those without a mask are passed over, and a spread of 80 of the rest is used.
-        pose: Splats of a view.
-        classes: Class of each object id; ids that are not in it do not vote.
+        views: Training views; at most `VOTE_VIEWS` with a mask are used, spread evenly.
+        pose: Returns the splats of a view.
+        classes: Class of each object id; other ids do not vote.
         count: Number of Gaussians, N.
 
     Returns:
@@ -54,7 +54,7 @@ def votes(views: list[TrainView], pose: Callable[[TrainView], Splats], classes: 
 
 
 def elect(weights: Tensor, fallback: Tensor) -> Tensor:
-    """Class of each Gaussian, that with most of its `votes`, and the ``fallback`` [N] where it has none. [N] int64"""
+    """Return the class with most `votes` for each Gaussian, or its ``fallback`` [N] without votes. [N] int64"""
     return torch.where(weights.amax(1) > 1e-3, weights.argmax(1), fallback)
 
 
@@ -68,25 +68,26 @@ def train_encodings(
     generator: torch.Generator,
     progress: Callable[[int, float], None] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Train identity encodings and their linear classifier against the masks.
+    """Train identity encodings and their linear classifier on the masks.
 
-    The encodings start at their label's row of the classifier, so that the first rendered map is already the labels'.
+    Encodings are initialised with their label's row of the classifier, so that the first rendered map equals that of
+    the labels.
 
     Args:
         views: Training views with masks.
-        pose: Splats of a view.
+        pose: Returns the splats of a view.
         classes: Class of each object id.
-        labels: Class of each Gaussian to start from. [N]
-        config: Of the run: steps, rates and the weights of the losses.
-        means: Centres whose neighbours should agree. [N, 3]
-        generator: Source of the draws.
+        labels: Initial class of each Gaussian. [N]
+        config: The run's configuration: steps, rates and weights of the losses.
+        means: Centres of the Gaussians, for the losses between neighbours. [N, 3]
+        generator: Random generator.
         progress: Called with step and loss.
 
     Returns:
         Encodings [N, 16], classifier weight [C, 16] and bias [C].
 
-    Source: Gaussian Grouping (Ye et al. 2024), Eq. 2 to 4: pixel cross-entropy divided by ln C. Its 3D losses weigh
-        nothing unless asked for: where masks are clean they cost accuracy.
+    Source: Gaussian Grouping (Ye et al. 2024), Eq. 2 to 4: pixel cross-entropy divided by ln C. Its 3D losses are off
+        by default, as they cost accuracy if masks are clean.
     """
     section = config.identity
     agreement = Agreement(config)
@@ -124,13 +125,13 @@ def train_encodings(
 
 
 class Agreement:
-    """L_3d and L_major of some Gaussians with their neighbours, weighted.
+    """Weighted sum of L_3d and L_major for sampled Gaussians.
 
     Args:
         config: The run's configuration.
 
     Attributes:
-        counts: Whether either weighs anything.
+        counts: True if at least one of the two has a positive weight.
     """
 
     def __init__(self, config: Config):
@@ -148,14 +149,14 @@ class Agreement:
         neighbourhood: identity_losses.Neighbourhood,
         generator: torch.Generator,
     ) -> Tensor:
-        """What it adds to a step's loss; the classifier is asked of the drawn Gaussians and their neighbours alone.
+        """Return the term for a step's loss; only the sampled Gaussians and their neighbours are classified.
 
         Args:
-            encodings: Of all Gaussians. [N, 16]
-            weight: Of the classifier. [C, 16]
-            bias: Of the classifier. [C]
-            neighbourhood: Of all Gaussians.
-            generator: Source of the draws.
+            encodings: Encodings of all Gaussians. [N, 16]
+            weight: Weight of the classifier. [C, 16]
+            bias: Bias of the classifier. [C]
+            neighbourhood: Neighbourhood of all Gaussians.
+            generator: Random generator.
         """
         rows = torch.randint(len(encodings), (self._section.samples,), generator=generator)
         found = neighbourhood.nearest(rows, self._section.neighbours)
@@ -174,7 +175,7 @@ class Agreement:
 
 
 def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -> JointIdentity | None:
-    """Identities that are trained with the geometry, or None: not asked for, or no mask tells objects apart.
+    """Return identities to train with the geometry; None if not configured or if no mask distinguishes objects.
 
     Args:
         views: Training views.
@@ -184,26 +185,28 @@ def joint(views: Sequence[TrainView], classes: dict[int, int], config: Config) -
     asked = config.identity.training in ("joint", "detached") and config.identity.iterations > 0
     if not asked or max(classes.values(), default=0) == 0 or all(view.mask is None for view in views):
         return None
-    # A generator of its own: the other draws of a run are the same with identities and without.
+    # A separate generator, so that identities do not change the other random numbers of a run.
     return JointIdentity(classes, config, torch.Generator().manual_seed(config.train.seed + 1))
 
 
 class JointIdentity:
-    """Encodings and classifier that are trained with the geometry.
+    """Encodings and classifier that are trained together with the geometry.
 
-    With ``identity.training`` "joint" (the paper) the trainer draws the encodings beside the colours, and the pixel
-    loss reaches the geometry, too. With "detached" every few steps the encodings alone are drawn, and the geometry is
-    what it would be without. The encodings are the Gaussians' parameter ``identities`` and grow and shrink with them.
+    With ``identity.training`` "joint" (the paper), the trainer renders the encodings together with the colours, and the
+    pixel loss also trains the geometry. With "detached", the encodings are rendered separately every few steps, and the
+    geometry is the same as without them. The encodings are the Gaussians' parameter ``identities`` and take part in
+    densification.
 
     Args:
-        classes: Class of each object id, 0 the background's.
+        classes: Class of each object id, 0 for the background.
         config: The run's configuration.
-        generator: Source of all draws; nobody else's.
+        generator: Random generator, used for nothing else.
 
     Attributes:
-        params: What the optimizer moves beside the encodings: ``classifier.weight`` [C, 16], ``classifier.bias`` [C].
+        params: Parameters for the optimizer beside the encodings: ``classifier.weight`` [C, 16], ``classifier.bias``
+            [C].
         rates: Learning rates of ``identities`` and ``classifier``, constant over the run.
-        with_geometry: Whether the trainer draws the encodings beside the colours.
+        with_geometry: True if the trainer must render the encodings together with the colours.
     """
 
     def __init__(self, classes: dict[int, int], config: Config, generator: torch.Generator):
@@ -225,7 +228,7 @@ class JointIdentity:
         self.rates = {"identities": self._section.rate, "classifier": self._section.classifier_rate}
         self._neighbourhood: identity_losses.Neighbourhood | None = None
         self._found_at = 0
-        # The tensors `means` and `motion_ids` then: new ones have other rows, or stand for Gaussians that were moved.
+        # `means` and `motion_ids` at that time; densification replaces these tensors.
         self._found_for: tuple[Tensor, Tensor] | None = None
 
     def _set_classifier(self, weight: Tensor, bias: Tensor) -> None:
@@ -233,10 +236,10 @@ class JointIdentity:
         self.params = {n: t.detach().clone().contiguous().requires_grad_(True) for n, t in named.items()}
 
     def begin(self, gaussians: Gaussians) -> None:
-        """Give the Gaussians their first encodings.
+        """Initialise the encodings of the Gaussians.
 
-        "joint" draws them as Gaussian Grouping does, harmonics of random colours; "detached" gives each the row of the
-        class that its motion group was made for (a group past the classes, a shadow, is background).
+        "joint" draws them as Gaussian Grouping does (harmonics of random colours). "detached" uses the classifier row
+        of the class of each Gaussian's motion group, or of the background if the group has no class (shadows).
         """
         if self.with_geometry:
             draws = torch.rand(len(gaussians), IDENTITY_DIM, generator=self._generator)
@@ -248,7 +251,7 @@ class JointIdentity:
         gaussians.add("identities", encodings)
 
     def channels(self, gaussians: Gaussians, colors: Tensor, background: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """What the trainer draws in one pass: colours and encodings [N, 3 + 16], and the background of both."""
+        """Return colours and encodings [N, 3 + 16] for one rasterizer pass, and the background of both."""
         if background is not None:
             zeros = background.new_zeros((*background.shape[:-1], IDENTITY_DIM))
             background = torch.cat([background, zeros], dim=-1)
@@ -262,14 +265,14 @@ class JointIdentity:
         iteration: int,
         features: Tensor | None = None,
     ) -> Tensor | None:
-        """What identities add to the loss of a step, or None.
+        """Return the term of the identities in a step's loss, or None.
 
         Args:
             gaussians: The Gaussians with their encodings.
-            splats: Of the view; "detached" draws them, without gradient.
-            view: The view; without a mask it has no pixel loss, and pixels of ids without a class do not count.
+            splats: Splats of the view; "detached" renders them without gradient.
+            view: The view. Without a mask it has no pixel loss; pixels of ids without a class are ignored.
             iteration: The step.
-            features: Blended encodings out of the pass that drew the colours; of "joint". [H, W, 16]
+            features: Blended encodings from the pass that rendered the colours ("joint"). [H, W, 16]
         """
         section = self._section
         weight, bias = self.params["classifier.weight"], self.params["classifier.bias"]
@@ -293,17 +296,17 @@ class JointIdentity:
         return self._neighbourhood
 
     def _current(self, gaussians: Gaussians) -> bool:
-        """Whether the neighbours were found for these Gaussians, row by row."""
+        """True if the neighbours were computed for these Gaussians, row by row."""
         known = self._found_for
         return known is not None and known[0] is gaussians.means and known[1] is gaussians.motion_ids
 
     @torch.no_grad()
     def labels(self, gaussians: Gaussians) -> Tensor:
-        """Class of each Gaussian: the classifier's answer to its encoding. [N] int64"""
+        """Return the class of each Gaussian by the classifier. [N] int64"""
         return (gaussians.identities @ self.params["classifier.weight"].T + self.params["classifier.bias"]).argmax(1)
 
     def outcome(self, gaussians: Gaussians) -> dict[str, Tensor]:
-        """What a finished run hands to baking, by the names of the checkpoint."""
+        """Return the tensors of a finished run that baking needs, by their names in the checkpoint."""
         named = {
             "identities": gaussians.identities,
             "classifier.weight": self.params["classifier.weight"],
@@ -312,7 +315,7 @@ class JointIdentity:
         return {name: tensor.detach().clone() for name, tensor in named.items()}
 
     def tensors(self, gaussians: Gaussians) -> dict[str, Tensor]:
-        """Everything that the next step depends on beside the Gaussians, by name."""
+        """Return the state that the next step depends on, except for the Gaussians, by name."""
         named = {f"identity.{name}": tensor.detach() for name, tensor in self.params.items()}
         named["identity.generator"] = self._generator.get_state()
         if self._neighbourhood is not None and self._current(gaussians):
@@ -321,7 +324,7 @@ class JointIdentity:
         return named
 
     def restore(self, tensors: dict[str, Tensor], gaussians: Gaussians) -> None:
-        """Go on from `tensors`, with the Gaussians of the same state; before the optimizer is made."""
+        """Restore the state from `tensors` and the Gaussians of that state. Call it before the optimizer is created."""
         self._set_classifier(tensors["identity.classifier.weight"], tensors["identity.classifier.bias"])
         self._generator.set_state(tensors["identity.generator"])
         self._neighbourhood, self._found_for = None, None
@@ -332,7 +335,7 @@ class JointIdentity:
 
 
 def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:
-    """Class of each pixel, -1 where the mask's id has none. [H, W] int64"""
+    """Return the class of each pixel, -1 for ids without a class. [H, W] int64"""
     assert view.mask is not None
     table = np.full(max(int(view.mask.max(initial=0)), *classes) + 1, -1, np.int64)
     table[list(classes)] = list(classes.values())
@@ -340,10 +343,10 @@ def class_map(view: TrainView, classes: dict[int, int]) -> Tensor:
 
 
 def _distinct_classes(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """A classifier, weight [C, 16] and bias [C], that names a pixel after the row that fills more than half of it."""
+    """Return a classifier (weight [C, 16], bias [C]) that selects the class whose row fills over half of the pixel."""
     directions = torch.randn(max(count, IDENTITY_DIM), IDENTITY_DIM, generator=generator)
     weight = torch.linalg.qr(directions).Q[:count].clone() if count <= IDENTITY_DIM else directions[:count]
-    # The bias is half of what a solid pixel of an object answers: with less than half, or nothing, it is background.
+    # Half of the output for a fully covered pixel, so that pixels covered by less are background.
     bias = torch.zeros(count)
     bias[0] = 2.0
     return 2 * weight / weight.norm(dim=1, keepdim=True), bias

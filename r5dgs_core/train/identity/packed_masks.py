@@ -1,4 +1,4 @@
-"""Masks that were found rather than given, as one compressed tensor: a checkpoint keeps what a run began with."""
+"""Discovered masks, packed into one compressed tensor for the checkpoint."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from torch import Tensor
 
 from ...errors import CheckpointError
 
-NAME = "discovery.masks"  # of the tensor in a checkpoint
-LABELS = "discovery.labels"  # of the one that stands there where Gaussians were sorted after the run instead
+NAME = "discovery.masks"  # name of the tensor in a checkpoint
+LABELS = "discovery.labels"  # name of the tensor of labels that were found after the run instead
 
 
 def pack(masks: Sequence[np.ndarray]) -> Tensor:
-    """Masks as one row of bytes. [H, W] each -> [B] uint8"""
+    """Pack masks into bytes. [H, W] each -> [B] uint8"""
     content = b"".join(np.ascontiguousarray(mask, "<u2").tobytes() for mask in masks)
     return torch.from_numpy(np.frombuffer(zlib.compress(content), np.uint8).copy())
 
 
 def unpack(packed: Tensor, sizes: Sequence[tuple[int, int]]) -> list[np.ndarray]:
-    """Masks out of `pack`.
+    """Unpack masks from `pack`.
 
     Args:
         packed: The bytes. [B] uint8
         sizes: Height and width of each mask.
 
     Returns:
-        Object ids per pixel. [H, W] uint8 where they fit, else uint16
+        Object ids per pixel. [H, W] uint8 if they fit, else uint16
 
     Raises:
-        CheckpointError: The bytes are damaged, or are of masks of other sizes.
+        CheckpointError: The bytes are damaged, or belong to masks of other sizes.
     """
     ends = np.cumsum([0, *(height * width for height, width in sizes)])
     try:
         inflate = zlib.decompressobj()
-        # One pixel more than expected is enough to notice that there are too many.
+        # Decompress at most one pixel more than expected, which is enough to detect a surplus.
         values = np.frombuffer(inflate.decompress(packed.numpy().tobytes(), 2 * int(ends[-1]) + 2), "<u2")
         if not inflate.eof and not inflate.unconsumed_tail:
             raise ValueError("incomplete")
