@@ -18,7 +18,7 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
     """Plot PSNR against the seconds of training, in the observed time and past it, and against the time of a frame.
 
     Args:
-        records: Cases in their modes, with figures (docs/user/bench.md): one colour per method, one marker per scene.
+        records: Cases in their modes, with figures (docs/user/bench.md); colour: method and mode, marker: scene.
         path: The PNG file.
 
     Returns:
