@@ -1,8 +1,8 @@
-"""The families of motion that `model_selection` chooses from, and their robust least-squares fit to a pose track.
+"""Candidate motion families for `model_selection`, and their robust least-squares fit to a pose track.
 
-Everything here is dimensionless: times in units of the observed span and zero at t_max, lengths in units of the group's
-radius. A candidate is a list of free blocks; the pose at t_max (r, e of `models`) is always free. Notation: S poses,
-P parameters, B parameter vectors evaluated at once.
+All quantities are dimensionless: times in units of the observed span and zero at t_max, lengths in units of the group's
+radius. A candidate is a list of free blocks; the pose at t_max (r, e of `models`) is always free. Notation: S poses, P
+parameters, B parameter vectors evaluated at once.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import numpy as np
 from ..motion import free_top, models, rotations, se3
 
 _SIZES = {"r": 3, "e": 3, "v": 3, "a": 3, "w": 3, "eps": 3, "kappa": 1, "u": 3, "swing": 3, "phase": 1, "pace": 1}
-# Priors as standard deviations, in radii and spans: far wider than what observed motions show; they only close
-# directions that the poses leave open (a centre along its own axis, the centre of a body that does not turn).
+# Standard deviations of weak priors, in radii and spans, far wider than observed motions. They only constrain
+# directions that the poses leave undetermined (a centre along its own axis, the centre of a body that does not rotate).
 _PRIORS = {"a": 100.0, "eps": 100.0, "kappa": 30.0, "u": 10.0, "swing": 10.0, "phase": 10.0, "pace": 5.0}
 _DIFFERENCE = 1e-5
 _STEPS = 30
-_STEPS_AGAIN = 4  # per round of reweighting, which starts near its end
+_STEPS_AGAIN = 4  # steps per reweighting round, which starts near the minimum
 _ROUNDS = 8
-_PACES = 25  # frequencies tried for a first guess
-_STARTS = 2  # of them that are refined
-_GAIN = 9.0  # variances: a frequency three standard deviations from none
+_PACES = 25  # number of frequencies tried for an initial guess
+_STARTS = 2  # number of these that are refined
+_GAIN = 9.0  # variances; a frequency that differs from zero by three standard deviations
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class Candidate:
     """A family of motions.
 
     Attributes:
-        name: As in the score table.
-        kind: Kind of `models.MotionModel` that it becomes.
+        name: Name in the score table.
+        kind: Kind of the resulting `models.MotionModel`.
         blocks: Free blocks besides the pose at t_max: "v", "a", "w", "eps", "u" as in `models`; "kappa" is the relative
             rate of a spin about a fixed axis: w(tau) = w_mid (1 + kappa (tau - tau_mid)). "swing" q and "phase" f are
-            an angle about a fixed axis, q sin(W tau + f), which stays determined where w or eps is zero; "pace" is the
+            an angle about a fixed axis, q sin(W tau + f), which stays determined if w or eps is zero; "pace" is the
             logit of W in `frequencies`.
         tau_mid: Middle of the window, for "kappa".
-        frequencies: Lowest and highest W of a motion with "pace". Less than a quarter of a period in the window cannot
-            be told from a steady acceleration.
-        inertia: Of a "free_top", in the bind state. [3, 3]
+        frequencies: Lowest and highest W of a motion with "pace". Less than a quarter period in the window cannot be
+            distinguished from a constant acceleration.
+        inertia: Inertia of a "free_top" in the bind state. [3, 3]
     """
 
     name: str
@@ -52,11 +52,11 @@ class Candidate:
 
     @property
     def parameters(self) -> int:
-        """Free parameters, the six of the pose at t_max included."""
+        """Number of free parameters, including the six of the pose at t_max."""
         return 6 + sum(_SIZES[b] for b in self.blocks)
 
     def unpack(self, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """Vectors r, e, v, a, w, eps, u [B, 3] and frequency [B, 1] of parameters [B, P]; zero where not free."""
+        """Vectors r, e, v, a, w, eps, u [B, 3] and frequency [B, 1] of parameters [B, P]; zero if not free."""
         parts = {name: np.zeros((*theta.shape[:-1], 3)) for name in ("r", "e", "v", "a", "w", "eps", "u")}
         parts["frequency"] = np.zeros((*theta.shape[:-1], 1))
         start = 0
@@ -78,16 +78,16 @@ class Candidate:
 
     @property
     def oscillates(self) -> bool:
-        """Whether a frequency is free."""
+        """True if a frequency is free."""
         return "pace" in self.blocks
 
     def index(self, block: str) -> int:
-        """Where a free block starts in the parameters."""
+        """Index of a free block's first parameter."""
         free = ("r", "e", *self.blocks)
         return sum(_SIZES[b] for b in free[: free.index(block)])
 
     def pace(self, frequency: float) -> float:
-        """The parameter "pace" of a frequency between the lowest and the highest."""
+        """Value of the parameter "pace" for a frequency between the lowest and the highest."""
         low, high = self.frequencies
         share = min(max((frequency - low) / (high - low), 1e-3), 1 - 1e-3)
         return float(np.log(share / (1 - share)))
@@ -107,7 +107,7 @@ class Candidate:
         return rotations.multiply(quats, rotations.rotvecs_to_quats(p["r"])), d + p["e"]
 
     def _tumbling(self, theta: np.ndarray, tau: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`poses` of a free top, whose inertia turns with the pose at t_max: R = exp(r) R_top(exp(-r) w)."""
+        """`poses` of a free top, whose inertia rotates with the pose at t_max: R = exp(r) R_top(exp(-r) w)."""
         assert self.inertia is not None
         p = self.unpack(theta)
         first = rotations.rotvecs_to_quats(p["r"])
@@ -120,7 +120,7 @@ class Candidate:
 
 
 def _world_twist(p: dict[str, np.ndarray], tau: np.ndarray) -> se3.Pose:
-    """Sixteen Magnus-4 steps over each time: enough to tell candidates apart; evaluation chooses its own steps."""
+    """Poses from sixteen Magnus-4 steps to each time, accurate enough to compare candidates."""
     steps = 16
     h = (tau / steps)[:, None]
     middles = np.arange(steps)[:, None, None, None] + 0.5
@@ -129,7 +129,7 @@ def _world_twist(p: dict[str, np.ndarray], tau: np.ndarray) -> se3.Pose:
     return se3.product(*se3.exp(h * mw - h**3 / 12 * bracket[0], h * mv - h**3 / 12 * bracket[1]))
 
 
-# Ordered by the number of parameters, the plainer motion first where it is equal.
+# Ordered by the number of parameters; among equals, the simpler motion first.
 FAMILY = (
     Candidate("static", "static", ()),
     Candidate("translation", "translation", ("v",)),
@@ -147,8 +147,9 @@ FAMILY = (
     Candidate("ballistic + spin, free centre", "ballistic_spin", ("v", "a", "w", "u")),
     Candidate("full, free centre", "ballistic_spin", ("v", "a", "w", "eps", "u")),
 )
-# The world twist is no member: a falling body that spins is none, as its centre's rate would be quadratic in time, and
-# the hinges and screws that are one are members already. The free top is tried where `model_selection` finds reason to.
+# The world twist is excluded: it cannot describe a falling body that spins, because the rate of its centre would be
+# quadratic in time, and the hinges and screws that it can describe are members already. `model_selection` tries the
+# free top separately.
 FREE_TOP = Candidate("free top", "free_top", ("v", "a", "w"))
 EXTRA = (Candidate("world twist", "world_twist", ("v", "a", "w", "eps")), FREE_TOP)
 BY_NAME = {candidate.name: candidate for candidate in (*FAMILY, *EXTRA)}
@@ -161,8 +162,8 @@ class Track:
     Attributes:
         tau: Times, <= 0 at t_max or before. [S]
         quats: Unit wxyz relative to the bind state. [S, 4]
-        displacements: Of the pivot. [S, 3]
-        weights: Of the poses, > 0. [S]
+        displacements: Displacements of the pivot. [S, 3]
+        weights: Pose weights, > 0. [S]
     """
 
     tau: np.ndarray
@@ -171,7 +172,7 @@ class Track:
     weights: np.ndarray
 
     def rows(self, index: np.ndarray | slice) -> Track:
-        """The poses with these indices."""
+        """Select poses by index."""
         return Track(self.tau[index], self.quats[index], self.displacements[index], self.weights[index])
 
 
@@ -180,10 +181,10 @@ class Solution:
     """A fitted candidate.
 
     Attributes:
-        candidate: Which.
+        candidate: The candidate.
         theta: Parameters. [P]
-        robust: Weights that the loss gave to the poses, in [0, 1]. [S]
-        jacobian: Of the scaled residuals, weighted, priors included. [6 S + P, P]
+        robust: Robust weights of the poses, in [0, 1]. [S]
+        jacobian: Jacobian of the weighted scaled residuals, priors included. [6 S + P, P]
         chi2: Weighted mean of the squared scaled residuals per component.
     """
 
@@ -202,7 +203,7 @@ def residuals(candidate: Candidate, theta: np.ndarray, track: Track, sigmas: tup
 
 
 def start(candidate: Candidate, track: Track) -> np.ndarray:
-    """First guess: the displacements' parabola and the turns between neighbours. [P]"""
+    """Initial guess from a parabola through the displacements and the rotations between neighbouring poses. [P]"""
     tau, s = track.tau, len(track.tau)
     degree = min(2 if "a" in candidate.blocks else 1, s - 1)
     powers = np.stack([tau**k / (1, 1, 2)[k] for k in range(degree + 1)], -1)
@@ -220,20 +221,21 @@ def start(candidate: Candidate, track: Track) -> np.ndarray:
         trend = np.linalg.lstsq(np.stack([np.ones_like(middles), middles], -1), rates, rcond=None)[0]
         guesses["w"], guesses["eps"] = trend[0], trend[1]
     if "u" in candidate.blocks and "v" not in candidate.blocks:
-        # The axis nearest to the pivot about which its velocity is a turn: w x (-u) = v.
+        # The centre nearest to the pivot whose rotation gives the pivot's velocity: w x (-u) = v.
         guesses["u"] = np.cross(spin, line[1]) / max(float(spin @ spin), 1e-6) if degree >= 1 else np.zeros(3)
     return np.concatenate([guesses[b] for b in ("r", "e", *candidate.blocks)])
 
 
 @dataclass(frozen=True)
 class _Sweep:
-    """A path fitted at each of F frequencies, where it is linear in place, rate and its rate.
+    """Linear fits of a path, one at each of F frequencies.
 
     Attributes:
-        frequencies: [F]
-        rates: Place, rate and its rate at t_max. [F, 3, 3]
-        misses: Weighted sum of squares that remains. [F]
-        gain: How much more the parabola leaves than the best frequency, in variances of the residuals of the latter.
+        frequencies: Tried frequencies. [F]
+        rates: Position, velocity and acceleration at t_max. [F, 3, 3]
+        misses: Remaining weighted sum of squares. [F]
+        gain: Excess of the parabola's sum of squares over that of the best frequency, in residual variances of the
+            latter.
     """
 
     frequencies: np.ndarray
@@ -243,7 +245,7 @@ class _Sweep:
 
 
 def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
-    """Two rounds, the second with the poses weighed by the residuals of the first as in `solve`. path: [S, 3]"""
+    """Fit a path at all frequencies in two rounds, the second with robust pose weights as in `solve`. path: [S, 3]"""
     frequencies = np.r_[0.0, np.geomspace(*candidate.frequencies, _PACES)[1:-1]]
     clocks = models.clocks(frequencies[:, None, None], track.tau[:, None])
     columns = np.concatenate([np.ones_like(clocks[0]), *clocks], axis=-1)
@@ -264,21 +266,21 @@ def _sweep(candidate: Candidate, track: Track, path: np.ndarray) -> _Sweep:
 
 
 def _turned(track: Track) -> np.ndarray:
-    """Sum of the turns between neighbours: about a fixed axis, the rotation vector without its ambiguity. [S, 3]"""
+    """Cumulative sum of the rotations between neighbours: an unwrapped rotation vector if the axis is fixed. [S, 3]"""
     turns = rotations.quats_to_rotvecs(rotations.multiply(track.quats[1:], rotations.conjugate(track.quats[:-1])))
     return np.concatenate([np.zeros((1, 3)), np.cumsum(turns, axis=0)])
 
 
 def may_swing(candidate: Candidate, track: Track) -> bool:
-    """Whether a swing explains the turns or the displacements so much better than a parabola that fitting it pays."""
+    """Return True if an oscillation fits the rotations or displacements significantly better than a parabola."""
     paths = [track.displacements] + ([_turned(track)] if "swing" in candidate.blocks else [])
     return any(_sweep(candidate, track, path).gain > _GAIN for path in paths)
 
 
 def swinging_starts(candidate: Candidate, track: Track) -> list[np.ndarray]:
-    """First guesses of a motion with a frequency, the most promising first. [P] each
+    """Initial guesses of a motion with a free frequency, most promising first. [P] each
 
-    They are the frequencies that fit the displacements or the turns better than their neighbours do.
+    They are the local minima of the misfit of the displacements or rotations over frequency.
     """
     path = _turned(track) if "swing" in candidate.blocks else track.displacements
     sweep = _sweep(candidate, track, path)
@@ -289,10 +291,10 @@ def swinging_starts(candidate: Candidate, track: Track) -> list[np.ndarray]:
 
 
 def _swinging(candidate: Candidate, track: Track, frequency: float, rates: np.ndarray) -> np.ndarray:
-    """Parameters from the rates [3, 3] of a fit at one frequency: place, rate and its rate at t_max. [P]"""
+    """Parameters from the rates of a fit at one frequency: position, velocity, acceleration at t_max. [3, 3] -> [P]"""
     guesses = {"r": np.zeros(3), "e": rates[0], "v": rates[1], "a": rates[2], "pace": candidate.pace(frequency)}
     if "swing" in candidate.blocks:
-        # The axis and phase nearest to both rates: their matrix of rank one.
+        # Axis and phase nearest to both rates: the rank-one approximation of their matrix.
         left, sizes, right = np.linalg.svd(np.stack([rates[1] / frequency, -rates[2] / frequency**2]).T)
         guesses["swing"] = left[:, 0] * sizes[0]
         guesses["phase"] = np.arctan2(right[0, 1], right[0, 0])
@@ -313,12 +315,12 @@ def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first
     Args:
         candidate: The family.
         track: The poses.
-        sigmas: Noise of displacements (radii) and rotations (rad): sets their relative weight.
-        first: First guess, or None for `start`; with a frequency, the best of `swinging_starts`. [P]
+        sigmas: Noise of displacements (radii) and rotations (rad), which sets their relative weight.
+        first: Initial guess, or None for `start`; with a free frequency, for the best of `swinging_starts`. [P]
 
     Returns:
         The solution. Weights per pose are 1 / (1 + (rho / c)^2), rho the root mean square of its six scaled residuals
-        and c twice 1.4826 times their median; no reweighting where the largest is under four medians.
+        and c twice 1.4826 times their median; no reweighting if the largest is below four medians.
     """
     if first is None and candidate.oscillates:
         solutions = [solve(candidate, track, sigmas, guess) for guess in swinging_starts(candidate, track)]
@@ -344,7 +346,7 @@ def solve(candidate: Candidate, track: Track, sigmas: tuple[float, float], first
 
 
 def _prior_precision(candidate: Candidate) -> np.ndarray:
-    """Inverse standard deviation of the weak priors. [P]"""
+    """Inverse standard deviations of the weak priors. [P]"""
     parts = [np.full(_SIZES[b], 1 / _PRIORS[b] if b in _PRIORS else 0.0) for b in ("r", "e", *candidate.blocks)]
     return np.concatenate(parts)
 
@@ -358,7 +360,7 @@ def _levenberg(
     precision: np.ndarray,
     steps: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Minimise for fixed weights; returns parameters [P], unweighted residuals [S, 6] and the Jacobian."""
+    """Minimise with fixed weights; return parameters [P], unweighted residuals [S, 6] and the Jacobian."""
     count = len(theta)
     root = np.sqrt(track.weights * robust)[:, None]
     offsets = np.concatenate([np.zeros((1, count)), _DIFFERENCE * np.eye(count), -_DIFFERENCE * np.eye(count)])

@@ -1,8 +1,8 @@
-"""Choose how a group moves past t_max from its poses in the observed time.
+"""Select the motion model of a group past t_max from its observed poses.
 
-A family of motions (`candidates`) is fitted to the noisy poses; the simplest whose error on held-out last poses is near
-the best is taken, unless the body has come to rest. Notation: S poses, tau = t - t_max <= 0, radius the size that
-rotations are weighed with.
+Every candidate family (`candidates`) is fitted to the noisy poses. The simplest one with a held-out error near the best
+is selected, unless the body has come to rest. Notation: S poses, tau = t - t_max <= 0; radius weights rotations against
+displacements.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ FADE_PER_SPAN = 0.1 / 0.75
 _RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration")
 _FREE_AXIS = families.BY_NAME["ballistic + spin, free axis"]
 _LARGEST = families.BY_NAME["full, free centre"]
-FREQUENCY_ERROR = 0.25  # relative standard deviation above which a motion is not called a swing
-PARALLEL_RAD = math.radians(15.0)  # a spin whose rate lies nearer to it needs no tumbling
+FREQUENCY_ERROR = 0.25  # largest relative standard deviation of a determined frequency
+PARALLEL_RAD = math.radians(15.0)  # largest angle between a spin and its rate without tumbling
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Score:
     """One row of the score table.
 
     Attributes:
-        name: Candidate.
-        parameters: Its free parameters, six of the pose included.
-        held_out: Root mean square of the held-out residuals in units of the noise; infinite where not fitted, and for a
-            swing whose frequency the poses do not determine.
-        fit: The same over all poses after the final fit, NaN where that was not made.
+        name: Name of the candidate.
+        parameters: Number of its free parameters, including the six of the pose.
+        held_out: Root mean square of the held-out residuals in units of the noise; infinite if not fitted, or if the
+            poses do not determine the frequency of an oscillation.
+        fit: The same over all poses after the final fit, or NaN if there was no final fit.
     """
 
     name: str
@@ -51,18 +51,18 @@ class Score:
 
 @dataclass(frozen=True)
 class Fit:
-    """A chosen motion model with the evidence for it.
+    """A selected motion model with the evidence for it.
 
     Attributes:
         model: The motion past t_max.
         scores: The score table, in the order of the candidates.
         chosen: Name of the candidate in `model`.
-        rested: Whether the body was found to have come to rest, so that `chosen` is "static" for that reason.
+        rested: True if the body has come to rest, in which case `chosen` is "static".
         sigma_t: Noise of the displacements, per component, world units.
         sigma_r: Noise of the rotations, per component, rad.
         band_tau: Times past t_max of `band`. [H]
-        band: Two standard deviations of the position of a point of the body, world units; wider by the held-out error
-            of the chosen candidate where that is above the noise. [H]
+        band: Two standard deviations of the position of a point of the body, world units; scaled by the held-out error
+            of the chosen candidate if that exceeds the noise. [H]
     """
 
     model: models.MotionModel
@@ -86,26 +86,26 @@ def fit(
     inertia: np.ndarray | None = None,  # [3, 3]
     least_noise: tuple[float, float] = (0.0, 0.0),
 ) -> Fit:
-    """Fit the family to a pose track and choose.
+    """Fit all candidates to a pose track and select one.
 
     Args:
         times: Increasing, any spacing; the last is t_max. [S]
         quats: Rotations relative to the bind state, unit wxyz, any sign. [S, 4]
-        displacements: Of the pivot, relative to the bind state, world units. [S, 3]
-        radius: Of the group, world units, > 0.
-        weights: How well each pose was seen, >= 0; 0 leaves a pose out. None for equal ones. [S]
-        candidates: Names out of `candidates.BY_NAME` to choose from; None for `candidates.FAMILY`.
-        inertia: Of the group in the bind state, up to a factor (`free_top.inertia`), or None. With it a body that spins
-            about a changing axis may be a free top: tried only where one of the best others has such a spin, and taken
-            where it predicts the held-out poses better. [3, 3]
-        least_noise: Noise of displacements (per component, world units) and rotations (rad) that the poses have at
-            least, where more is known of it than their scatter about a smooth motion shows.
+        displacements: Displacements of the pivot relative to the bind state, world units. [S, 3]
+        radius: Radius of the group, world units, > 0.
+        weights: Confidence of each pose, >= 0; 0 excludes a pose. None for equal weights. [S]
+        candidates: Names of candidates in `candidates.BY_NAME`; None for `candidates.FAMILY`.
+        inertia: Inertia of the group in the bind state, up to a factor (`free_top.inertia`), or None. If given, the
+            free top is tried when one of the best candidates spins about a changing axis, and selected if it predicts
+            the held-out poses better. [3, 3]
+        least_noise: Lower bounds of the noise of displacements (per component, world units) and rotations (rad), if
+            more is known than the scatter about a smooth motion shows.
 
     Returns:
-        The fit. With fewer than four poses of positive weight it is at most a velocity and a spin; with one, static.
+        The fit. With fewer than four poses of positive weight, at most a velocity and a spin; with one, static.
 
-    Source: selection by held-out error with the simplest within 1.5 of the best, rest test, band from the covariance
-        inflated for correlated residuals and from the spread of the candidates that are about as good.
+    Source: selection by held-out error (the simplest within 1.5 times the best), rest test, band from the covariance
+        inflated for correlated residuals and from the spread of the near-best candidates.
     """
     times = np.asarray(times, np.float64)
     quats = np.asarray(quats, np.float64)
@@ -134,7 +134,7 @@ def fit(
     sigmas = (max(sigmas[0], least_noise[0] / radius), max(sigmas[1], least_noise[1]))
     scores = {c.name: _held_out(c, track, sigmas, outliers) if c in tried else math.inf for c in family}
     solutions = {c.name: families.solve(c, track, sigmas) for c in _near(family, scores)}
-    # Without a frequency that the poses determine, no swing: then others may be near the best.
+    # Reject oscillations with an undetermined frequency; other candidates may then be near the best.
     for name, solution in list(solutions.items()):
         if not _determined(solution, track, sigmas):
             scores[name] = math.inf
@@ -148,7 +148,7 @@ def fit(
         free = replace(families.FREE_TOP, inertia=np.asarray(inertia, np.float64))
         held, whole = _held_out(free, track, sigmas, outliers), families.solve(free, track, sigmas)
         tops = [Score(free.name, free.parameters, held, math.sqrt(whole.chi2))]
-        # A plainer motion gives way as among the others; one with a spin that changes freely has more parameters.
+        # A simpler motion is replaced only if clearly worse; one with a free angular acceleration has more parameters.
         if held * (1.0 if "eps" in chosen.blocks else WITHIN) < scores[chosen.name]:
             chosen, solutions[free.name] = free, whole
     solution, evidence = solutions[chosen.name], track
@@ -162,16 +162,16 @@ def fit(
     model = _to_model(solution, radius, span, evidence, sigmas)
     near_solutions = [] if rested else list(solutions.values())
     band_tau, band = _band(solution, near_solutions, evidence, sigmas, radius, span)
-    if rested:  # a body that came to rest may go on: twice the variance
+    if rested:  # a resting body may move again: twice the variance
         band = math.sqrt(2.0) * band
-    else:  # what was held out was missed by so many times the noise: so will be what follows
+    else:  # assume that the extrapolation errs like the held-out poses
         missed = next(row.held_out for row in (*tops, *table) if row.name == chosen.name)
         band = max(1.0, missed if math.isfinite(missed) else 1.0) * band
     return Fit(model, (*table, *tops), solution.candidate.name, rested, sigmas[0] * radius, sigmas[1], band_tau, band)
 
 
 def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
-    """Whether the picked motion needs a spin that changes its axis, and a body of this inertia could do so freely."""
+    """Return True if the selected motion has a spin of changing axis that a free body of this inertia can have."""
     if "eps" not in picked.candidate.blocks or picked.candidate.kind != "ballistic_spin":
         return False
     p = picked.candidate.unpack(picked.theta)
@@ -181,19 +181,19 @@ def _may_tumble(picked: Solution, inertia: np.ndarray) -> bool:
 
 
 def _near(family: Sequence[Candidate], scores: dict[str, float]) -> list[Candidate]:
-    """Candidates whose held-out error is within `WITHIN` of the best; the first where none could be fitted."""
+    """Candidates with a held-out error within `WITHIN` of the best, or the first candidate if none could be fitted."""
     finite = [s for s in scores.values() if np.isfinite(s)]
     best = max(min(finite), 1e-3) if finite else math.inf
     return [c for c in family if scores[c.name] <= WITHIN * best and finite] or [family[0]]
 
 
 def _frequencies(track: Track) -> tuple[float, float]:
-    """Range of frequencies that can be seen: from a quarter of a period in the window to four poses a period."""
+    """Observable frequencies: from a quarter of a period in the window to four poses per period."""
     return 0.5 * math.pi / float(track.tau[-1] - track.tau[0]), 0.5 * math.pi / float(np.median(np.diff(track.tau)))
 
 
 def _determined(solution: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
-    """Whether a frequency lies inside its range and is known to `FREQUENCY_ERROR`; True where none is free."""
+    """Return True if the frequency is inside its range and known to `FREQUENCY_ERROR`, or if none is free."""
     candidate = solution.candidate
     if not candidate.oscillates:
         return True
@@ -236,7 +236,7 @@ def _static(radius: float) -> Fit:
 
 
 def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float) -> Fit:
-    """Two or three poses: the plainest of static, translation, spin and both that explains them to a hundredth."""
+    """Fit two or three poses: the simplest of static, translation, spin and both with errors below a hundredth."""
     sigmas = (1e-2, 1e-2)
     allowed = [c for c in family if c.parameters <= 12 and not {"a", "kappa", "u"} & set(c.blocks)] or [
         rest_detection.STATIC
@@ -252,9 +252,9 @@ def _few(track: Track, family: tuple[Candidate, ...], radius: float, span: float
 
 
 def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, float], np.ndarray]:
-    """Noise of displacements and rotations from the residuals of the largest models, and their weights per pose. [S]
+    """Noise of displacements and rotations from the residuals of the largest models, and their pose weights. [S]
 
-    Errors common to the members of a group do not show in its own rigid fit, so that fit's spread would be too small.
+    The spread within a group's own rigid fit would be too small, because it misses errors common to all members.
     """
     swings = (c for c in family if c.oscillates)
     wide = [c for c in (_FREE_AXIS, _LARGEST, *swings) if c.parameters <= 6 * len(track.tau) - 6] or [
@@ -290,10 +290,10 @@ def _noise(track: Track, family: tuple[Candidate, ...]) -> tuple[tuple[float, fl
 
 
 def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], outliers: np.ndarray) -> float:
-    """Root mean square of the residuals on the last poses of a fit to the first ones, in units of the noise."""
+    """Root mean square residual of the last poses after a fit to the first ones, in units of the noise."""
     count = len(track.tau)
     held = max(3, math.ceil(HELD_OUT * count)) if count >= 8 else max(1, count // 4)
-    # Six numbers a pose would determine more, but a third of them must be left to tell noise from motion.
+    # At least a third of the six numbers per pose must remain to separate noise from motion.
     if candidate.parameters > 4 * (count - held):
         return math.inf
     solution = families.solve(candidate, track.rows(slice(0, count - held)), sigmas)
@@ -305,7 +305,7 @@ def _held_out(candidate: Candidate, track: Track, sigmas: tuple[float, float], o
 
 
 def _rates(solution: Solution, theta: np.ndarray, radius: float, span: float) -> dict[str, np.ndarray]:
-    """Parameters in world units and units of time. [..., P] -> [..., 3] each"""
+    """Parameters converted to world units and units of time. [..., P] -> [..., 3] each"""
     p = solution.candidate.unpack(theta)
     return {
         "velocity": p["v"] * radius / span,
@@ -375,8 +375,8 @@ def _band(
     slopes = np.concatenate([moved - displacements, turns], axis=-1) / step  # [P, H, 6]
     covariance = _covariance(chosen, track, sigmas)
     spread = np.einsum("phc,pq,qhc->hc", slopes, covariance, slopes)
-    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state, which
-    # all this starts from, is one of the poses and as noisy as they are.
+    # Mean over a sphere of |dd + dtheta x r|^2, r of length one radius: |dd|^2 + 2/3 |dtheta|^2. The bind state is one
+    # of the poses and as noisy as the others, hence the last two terms.
     variance = spread[:, :3].sum(-1) + 2 / 3 * spread[:, 3:].sum(-1) + 3 * sigmas[0] ** 2 + 2 * sigmas[1] ** 2
     others = [s for s in near if s.candidate.name != candidate.name]
     total = sum(1 / s.candidate.parameters**2 for s in near) or 1.0

@@ -1,4 +1,4 @@
-"""Whether a body has come to rest at the end of its observed poses.
+"""Detection of bodies that have come to rest at the end of their observed poses.
 
 Notation as in `model_selection`: a track is dimensionless, lengths in radii of the body.
 """
@@ -13,16 +13,16 @@ from .candidates import Solution, Track
 
 STATIC = families.BY_NAME["static"]
 TAIL = 5
-SIGMA_FLOOR = 1e-7  # radii and radians: below this noise means rounding
-STOP_RATIO = 8.0  # distance of the poses before a stop over the scatter of those after it
-STOP_MOTION = 0.02  # radii; less is no motion worth stopping
+SIGMA_FLOOR = 1e-7  # radii and radians; below this, noise is only rounding
+STOP_RATIO = 8.0  # least distance of the poses before a stop / scatter of those after it
+STOP_MOTION = 0.02  # radii; least motion before a stop
 
 
 def poses_at_rest(picked: Solution, track: Track, sigmas: tuple[float, float]) -> int:
-    """Number of last poses over which the body rests, 0 where it moves on.
+    """Number of final poses at which the body rests, or 0 if it is still moving.
 
     Args:
-        picked: The motion that would be taken otherwise.
+        picked: Motion selected without the rest test.
         track: The poses.
         sigmas: Noise of displacements (radii) and rotations (rad).
     """
@@ -34,9 +34,9 @@ def _tail_chi2(values: np.ndarray, parameters: int) -> float:
 
 
 def rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
-    """Whether a constant pose explains the last poses and the picked motion misses the whole window.
+    """Return True if a constant pose explains the last poses and the selected motion misfits the whole window.
 
-    Without the second condition slow movers would be frozen.
+    Without the second condition, slow bodies would count as resting.
     """
     if picked.candidate.name == "static" or len(track.tau) < 2 * TAIL:
         return False
@@ -51,11 +51,11 @@ def rests(picked: Solution, track: Track, sigmas: tuple[float, float]) -> bool:
 
 
 def stopped(track: Track) -> int:
-    """Number of last poses over which the body clearly stands still after it moved, 0 where it does not.
+    """Number of final poses at which a body clearly stands still after moving, or 0.
 
-    Needs no noise estimate, which a stop within the window spoils: the last three to five poses scatter little about
-    their mean, and the two poses before lie far from it, one farther than the other, against that scatter. Steady
-    motion gives a ratio of at most 2.4 and the apex of a throw 4.3, so that neither is taken for a stop.
+    It needs no noise estimate, which a stop within the window would bias. The last three to five poses must scatter
+    little about their mean, and the two poses before must lie far from it relative to that scatter, the earlier one
+    farther. The ratio is at most 2.4 for steady motion and 4.3 at the apex of a throw, so neither counts as a stop.
     """
     for count in (5, 4, 3):
         if len(track.tau) < count + 3:
@@ -73,6 +73,6 @@ def stopped(track: Track) -> int:
 
 
 def _pose_distance(quats: np.ndarray, displacements: np.ndarray, mean_quat: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Distance of poses from one pose over the points of a sphere of radius one, root mean square. [S]"""
+    """Root mean square distance of poses from one pose, over the points of a unit sphere. [S]"""
     angle = rotations.angle_between(quats, mean_quat)
     return np.sqrt(((displacements - mean) ** 2).sum(-1) + 2 / 3 * angle**2)

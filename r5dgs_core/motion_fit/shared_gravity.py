@@ -1,7 +1,7 @@
-"""One acceleration for all bodies that fall: each alone knows it worse than all together.
+"""Shared acceleration of falling bodies, estimated jointly from their individual fits.
 
-Notation: a_i the acceleration that the fit of body i found, C_i its covariance, in world units; B a basis of the
-accelerations that may be: all directions, or the upward one alone.
+Notation: a_i the acceleration from the fit of body i, C_i its covariance, in world units; B a basis of the allowed
+accelerations: all directions, or the vertical alone.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ import numpy as np
 
 from . import model_selection, rest_detection
 
-# Motions whose acceleration is free -> the same without it.
+# Candidates with a free acceleration -> the same without it.
 FALLING = {"translation, quadratic": "translation", "ballistic + spin": "translation + spin"}
-AGREE = 11.34  # squared distance of two accelerations over their covariance: chi2 with three degrees, 99 %
+AGREE = 11.34  # largest squared Mahalanobis distance: 99 % quantile of chi2 with three degrees of freedom
 
 
 @dataclass(frozen=True)
 class Track:
-    """What a body's fit was made of, as in `model_selection.fit`.
+    """Observed poses of one body, as passed to `model_selection.fit`.
 
     Attributes:
         times: Increasing, the last is t_max. [S]
         quats: Unit wxyz. [S, 4]
-        displacements: Of the pivot, world units. [S, 3]
-        weights: Of the poses. [S]
+        displacements: Displacements of the pivot, world units. [S, 3]
+        weights: Pose weights. [S]
     """
 
     times: np.ndarray
@@ -39,19 +39,19 @@ class Track:
 def share(
     tracks: Sequence[Track], fits: Sequence[model_selection.Fit], up: np.ndarray | None = None
 ) -> tuple[list[model_selection.Fit], tuple[int, ...]]:
-    """Give bodies that fall alike one acceleration, the weighted mean of theirs, and fit the rest of their motion anew.
+    """Replace the accelerations of bodies that fall alike by their weighted mean, and refit the rest of their motion.
 
     Args:
-        tracks: Of all bodies.
-        fits: Of all bodies, in the same order.
-        up: Direction that the acceleration lies along, or None where that is not known. [3]
+        tracks: Tracks of all bodies.
+        fits: Fits of all bodies, in the same order.
+        up: Line along which the acceleration lies, or None if unknown. [3]
 
     Returns:
-        The fits, those of others unchanged to the bit, and the indices of the bodies that share: at least two, that
-        each picked a motion of `FALLING` and agree in pairs within their covariances; none where they do not.
+        The fits, unchanged for all other bodies, and the indices of the sharing bodies: at least two whose selected
+        motion is in `FALLING` and whose accelerations agree in pairs within their covariances; else empty.
 
-    Source: generalized least squares for the mean; a motion with a fixed acceleration is one without it whose
-        displacements have a tau^2 / 2 added.
+    Source: generalized least squares for the mean; a motion with a fixed acceleration is fitted by subtracting a
+        tau^2 / 2 from the displacements.
     """
     basis = np.eye(3)
     if up is not None:
@@ -76,12 +76,12 @@ def _acceleration(fit: model_selection.Fit) -> tuple[np.ndarray, np.ndarray]:
     """Acceleration of a fit and its covariance. [3], [3, 3]"""
     assert fit.model.covariance is not None
     rows = [fit.model.covariance_names.index(f"acceleration.{axis}") for axis in "xyz"]
-    floor = (rest_detection.SIGMA_FLOOR * fit.model.radius) ** 2  # without noise nothing would agree
+    floor = (rest_detection.SIGMA_FLOOR * fit.model.radius) ** 2  # so that noise-free fits can agree
     return fit.model.acceleration, fit.model.covariance[np.ix_(rows, rows)] + floor * np.eye(3)
 
 
 def _mean(found: list[tuple[np.ndarray, np.ndarray]], basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The acceleration of the span of the basis that all say together, and its covariance. [3], [3, 3]"""
+    """Weighted mean acceleration within the span of the basis, and its covariance. [3], [3, 3]"""
     precisions = [np.linalg.inv(covariance) for _, covariance in found]
     normal = basis.T @ sum(precisions) @ basis
     right = basis.T @ sum(p @ a for p, (a, _) in zip(precisions, found, strict=True))
@@ -89,12 +89,12 @@ def _mean(found: list[tuple[np.ndarray, np.ndarray]], basis: np.ndarray) -> tupl
 
 
 def _apart(a: np.ndarray, a_cov: np.ndarray, b: np.ndarray, b_cov: np.ndarray) -> float:
-    """Squared distance of two accelerations over the covariance of their difference."""
+    """Squared Mahalanobis distance of two accelerations."""
     return float((a - b) @ np.linalg.solve(a_cov + b_cov, a - b))
 
 
 def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[int]:
-    """The largest set whose members agree with each other, the closest of equally large ones."""
+    """Largest set of bodies that agree in pairs; among equally large sets, the tightest."""
     best: tuple[int, float, list[int]] = (0, 0.0, [])
     for seed in found:
         distances = {i: _apart(*found[seed], *found[i]) for i in found if i != seed}
@@ -109,7 +109,7 @@ def _largest_agreeing(found: dict[int, tuple[np.ndarray, np.ndarray]]) -> list[i
 def _refit(
     track: Track, fit: model_selection.Fit, acceleration: np.ndarray, covariance: np.ndarray
 ) -> model_selection.Fit:
-    """The fit with a given acceleration; the same fit where the rest of the motion does not come out as before."""
+    """Refit a body with a given acceleration; returns the old fit if the new one is at rest or has no covariance."""
     tau = track.times - track.times[-1]
     without = track.displacements - 0.5 * acceleration * tau[:, None] ** 2
     again = model_selection.fit(
@@ -127,7 +127,7 @@ def _refit(
     spread = again.model.covariance.copy()
     spread[np.ix_(rows, rows)] = covariance
     model = dataclasses.replace(again.model, acceleration=acceleration, covariance=spread)
-    late = again.band_tau**4 * float(np.trace(covariance))  # four variances of a tau^2 / 2
+    late = again.band_tau**4 * float(np.trace(covariance))  # (2 sigma)^2 of the displacement a tau^2 / 2
     return dataclasses.replace(
         again, model=model, scores=fit.scores, chosen=fit.chosen, band=np.sqrt(again.band**2 + late)
     )
