@@ -1,6 +1,6 @@
-"""Gaussians carried by an affine map, with their shapes, their colours and the shading of that pose written out.
+"""Gaussians transformed by an affine map, with shapes, harmonics and shading applied.
 
-What others draw without knowing our scenes: nothing is left to be turned, tinted or shaded later.
+The result suits renderers that know nothing of our scenes: no rotation, tint or shading is left to apply.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ SIMILARITY_TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Bend:
-    """Gaussians that leave the motion of their group.
+    """Deviation of Gaussians from the motion of their group.
 
     Attributes:
-        rows: Which ones of a scene. [n]
+        rows: Rows of the scene. [n]
         offsets: Added to their centres, bind frame. [n, 3]
         turns: Rotations applied to theirs, unit wxyz. [n, 4]
         growths: Added to their log scales. [n, 3]
@@ -39,7 +39,7 @@ class Bend:
 
 
 def bend_of(residuals: Residuals, t: float, start: int, count: int) -> Bend | None:
-    """What the residuals of a scene do at a time to a range of its Gaussians; None where that is nothing."""
+    """Residuals of a range of Gaussians at a time, or None if there are none."""
     part = slice(*np.searchsorted(residuals.rows, (start, start + count)))
     found = residuals.at(t) if part.start < part.stop else None
     if found is None:
@@ -49,22 +49,21 @@ def bend_of(residuals: Residuals, t: float, start: int, count: int) -> Bend | No
 
 
 def carry(splats: Splats, matrix: np.ndarray, factor: np.ndarray | None = None) -> Splats:
-    """Gaussians after an affine map.
+    """Transform Gaussians by an affine map.
 
-    Rotation, translation, mirror and uniform scale are exact in every respect. Under any other map the ellipsoids are
-    still mapped exactly, and the harmonics are the best fit over all directions
-    (`spherical_harmonics.change_of_basis`).
+    Rotation, translation, mirroring and uniform scale are exact. Under any other map the ellipsoids are still exact,
+    and the harmonics are a least-squares fit over all directions (`spherical_harmonics.change_of_basis`).
 
     Args:
         splats: The Gaussians.
         matrix: Affine map. [4, 4]
-        factor: On their display-referred colour, >= 0; none where None. [3], [N, 1] or [N, 3]
+        factor: Factor on their display-referred colour, >= 0, or None. [3], [N, 1] or [N, 3]
 
     Returns:
-        New Gaussians; ids and identities are the given ones.
+        New Gaussians; ids and identities are shared with the input.
 
     Raises:
-        ValueError: The matrix flattens space or is not finite.
+        ValueError: The matrix is singular or not finite.
     """
     linear, offset = affine(matrix)
     means, quats, log_scales = (np.empty((len(splats.means), width), np.float32) for width in (3, 4, 3))
@@ -86,23 +85,23 @@ def place(
     tint: np.ndarray | None = None,
     bend: Bend | None = None,
 ) -> Splats:
-    """A range of a scene's Gaussians, carried from the bind state, with the shading of the pose it brings them to.
+    """Transform a range of a scene's Gaussians from the bind state, with the shading of the resulting pose.
 
     Args:
         scene: The scene.
         start: First row.
         count: Number of rows.
-        matrix: Affine map from the bind state to the wanted world. [4, 4]
-        world: Map from the scene's own world, in which its light stands, to the wanted one; None where they are the
-            same. Shading turns with the rotation nearest to ``matrix``, seen from there. [4, 4]
+        matrix: Affine map from the bind state to the target world. [4, 4]
+        world: Map from the scene's own world, in which its light is fixed, to the target world; None if they are the
+            same. Shading follows the nearest rotation of ``matrix`` relative to it. [4, 4]
         tint: Factor on the display-referred colour, or None. [3]
-        bend: What single Gaussians do in the bind state before they are carried, or None.
+        bend: Deviations applied in the bind state before the map, or None.
 
     Returns:
         The Gaussians.
 
     Raises:
-        ValueError: The range leaves the scene, or the matrix flattens space or is not finite.
+        ValueError: The range exceeds the scene, or the matrix is singular or not finite.
     """
     if not 0 <= start <= start + count <= len(scene.means):
         raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.means)} Gaussians")
@@ -119,7 +118,7 @@ def place(
 
 
 def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
-    """Rows of a scene as they are in its file, without shading."""
+    """Rows of a scene in the bind state, as stored in its file, without shading."""
     identities = scene.identities
     return Splats(
         scene.means[rows],
@@ -133,7 +132,7 @@ def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
 
 
 def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
-    """A range of the bind state that begins at a row, bent."""
+    """Apply deviations to a range of the bind state that begins at ``start``."""
     at = bend.rows - start
     means, quats, log_scales = (values.copy() for values in (splats.means, splats.quats, splats.log_scales))
     means[at] += bend.offsets
@@ -147,7 +146,7 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
 
 
 def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
-    """Write the shading of bent Gaussians that have then turned by a rotation. factor [n, 1], turn [3, 3]"""
+    """Write shading factors of deviating Gaussians, then rotated by ``turn``. factor [n, 1], turn [3, 3]"""
     if factor is None or scene.shading is None or scene.light_direction is None:
         return
     light = np.asarray(scene.light_direction, np.float64)
@@ -158,9 +157,9 @@ def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarr
 
 
 def join(parts: Sequence[Splats]) -> Splats:
-    """Several sets of Gaussians as one, in this order; the degree is the highest one, absent coefficients are zero.
+    """Concatenate sets of Gaussians. The degree is the highest one; missing coefficients are zero.
 
-    Identities are kept where all parts have them in the same width, ids where all have them.
+    Identities are kept if all parts have them in the same width, ids if all parts have them.
     """
     bases = max((part.sh.shape[1] for part in parts), default=1)
     sh = [np.pad(part.sh, ((0, 0), (0, bases - part.sh.shape[1]), (0, 0))) for part in parts]
@@ -179,7 +178,7 @@ def join(parts: Sequence[Splats]) -> Splats:
 
 
 def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Linear part and translation of a [4, 4] matrix that can be undone. Raises ValueError for any other."""
+    """Linear part and translation of an invertible [4, 4] matrix. Raises ValueError for any other matrix."""
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ValueError(f"expected a finite matrix [4, 4], got {matrix!r}")
@@ -190,12 +189,12 @@ def affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_similarity(linear: np.ndarray) -> bool:
-    """Whether a linear map only turns, mirrors and scales uniformly. [3, 3]"""
+    """Return True if a linear map is a rotation or mirror with uniform scale. [3, 3]"""
     return _even(np.linalg.svd(linear, compute_uv=False))
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a linear map; a mirror is undone along the first axis before the map.
+    """Return the rotation nearest to a linear map. A mirror is undone along the first axis before the map.
 
     [..., 3, 3] -> [..., 3, 3]
     """
@@ -216,7 +215,7 @@ def map_shapes(
     new_quats: np.ndarray,  # [N, 4]
     new_log_scales: np.ndarray,  # [N, 3]
 ) -> None:
-    """Write the shapes of ellipsoids under a linear map, exact for any, to the last two, which are float32."""
+    """Write the shapes of ellipsoids under any linear map, exactly, to the last two arguments, which are float32."""
     u, singular, vt = np.linalg.svd(linear)
     if _even(singular) and np.linalg.det(linear) > 0:
         posing.turn_quats(quats, rotations.rotmats_to_quats(u @ vt), new_quats)
@@ -229,7 +228,7 @@ def map_shapes(
 
 
 def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
-    """Factor on the colour of rows that have turned by a rotation since the bind state, or None. [3, 3] -> [n, 1]"""
+    """Colour factors of rows rotated since the bind state, or None without shading. [3, 3] -> [n, 1]"""
     if scene.shading is None or scene.light_direction is None:
         return None
     light = np.asarray(scene.light_direction, np.float64)

@@ -1,8 +1,8 @@
-"""How motion groups go on past t_max: the model fitted to their observed poses, or one twist out of their members' own.
+"""Motion of groups past t_max: the model fitted to their observed poses, or one twist from their members' own dynamics.
 
-Notation: a group turns about its pivot p; a member at y_i = p + r_i has a twist (v_i, w_i) with rates (a_i, e_i) about
-its own centre. Rewritten about the pivot (`se3.recentre`) the twists of a rigid body's members are equal, whatever the
-origin of the coordinates, so that they can be compared and averaged; about a far origin they cancel badly.
+Notation: a group rotates about its pivot p; a member at y_i = p + r_i has a twist (v_i, w_i) with rates (a_i, e_i)
+about its own centre. Expressed about the pivot (`se3.recentre`), the twists of a rigid body's members are equal and can
+be compared and averaged. About a distant origin they would lose precision to cancellation.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from ..scene.scene import MotionGroup, Scene
 from . import visibility
 from .modes import SOURCES
 
-HORIZON = 1 / 3  # of the observed span: how far past t_max members of "kabsch" are followed
-_FUTURES = 6  # times within it
-_ROUNDS = 6  # of reweighting
-_TOLERANCE = 1e-6  # of the group's radius
+HORIZON = 1 / 3  # fraction of the observed span past t_max over which "kabsch" follows the members
+_FUTURES = 6  # number of times within the horizon
+_ROUNDS = 6  # reweighting rounds
+_TOLERANCE = 1e-6  # in radii of the group
 
 
 def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
-    """Motion past t_max of every group, out of one source.
+    """Motion models of all groups past t_max, from one source.
 
     Args:
-        scene: The scene; every source but "fitted" asks for its `dynamics`.
-        source: "fitted": what was fitted to the observed poses. The others give a "world_twist" of the members'
-            dynamics about the pivot: "representative" that of the group's representative; "median" the median of all
-            by component; "least_squares" the twist that gives the members' velocities and accelerations best;
-            "kabsch" the twist whose motion best carries the members where their own dynamics bring them.
+        scene: The scene; every source but "fitted" requires its `dynamics`.
+        source: "fitted": the model fitted to the observed poses. The others combine the members' dynamics about the
+            pivot into a "world_twist": "representative" takes that of the group's representative; "median" the median
+            by component; "least_squares" the twist that best fits the members' velocities and accelerations; "kabsch"
+            the twist whose motion best fits the positions that the members' own dynamics lead to.
 
     Returns:
         One model per group; static for pinned groups and for those that follow another.
 
     Raises:
-        ValueError: There is no such source, or the scene has no dynamics.
+        ValueError: The source is unknown, or the scene has no dynamics.
 
-    Source: "representative" is the anchor of the R5DGS paper. Members fainter than
-        `visibility.SEEN_OPACITY` do not vote, and fits are weighted by opacity and robust (Cauchy).
+    Source: "representative" is the anchor of the R5DGS paper. Members fainter than `visibility.SEEN_OPACITY` are
+        excluded; fits are weighted by opacity and robust (Cauchy).
     """
     if source not in SOURCES:
         raise ValueError(f"source: expected one of {', '.join(SOURCES)}, got {source!r}")
@@ -52,11 +52,11 @@ def models_of(scene: Scene, source: str = "fitted") -> tuple[MotionModel, ...]:
 
 
 class GroupMotion:
-    """Poses of all motion groups of a scene at any time; what does not depend on the time is computed once.
+    """Poses of all motion groups of a scene at any time. Time-independent quantities are computed once.
 
     Args:
         scene: The scene.
-        source: Of the motion past t_max, of `SOURCES`.
+        source: Source of the motion past t_max, one of `SOURCES`.
     """
 
     def __init__(self, scene: Scene, source: str = "fitted"):
@@ -75,7 +75,7 @@ class GroupMotion:
 
     @functools.cached_property
     def models(self) -> tuple[MotionModel, ...]:
-        """Motion of each group past t_max."""
+        """Motion model of each group past t_max."""
         return models_of(self._scene, self._source)
 
     @functools.cached_property
@@ -85,7 +85,7 @@ class GroupMotion:
         )
 
     def poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of every group relative to the bind state, as `scene_player.group_poses`."""
+        """Pose of every group relative to the bind state, as from `scene_player.group_poses`."""
         if not np.isfinite(t):
             raise ValueError(f"t: expected a finite scene time, got {t}")
         if t < self._t_max:
@@ -110,11 +110,11 @@ class GroupMotion:
 
 
 def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-    """Poses at the observed times with signs chosen so that quaternions are continuous and end at (1, 0, 0, 0).
+    """Poses at the observed times, with sign-continuous quaternions that end at (1, 0, 0, 0).
 
     Args:
         scene: The scene.
-        groups: Motion groups to return, G of them; all by default.
+        groups: The G motion groups to return; all by default.
 
     Returns:
         Quaternions [G, S, 4] and displacements [G, S, 3], float64.
@@ -127,7 +127,7 @@ def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.nda
 
 
 def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of some Gaussians that are opaque enough to vote, all where none is, and their opacities. [n] each"""
+    """Rows that are opaque enough to represent a group, or all if none is, and their opacities. [n] each"""
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
     seen = visibility.seen(opacities)
@@ -135,7 +135,7 @@ def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def representative(scene: Scene, rows: np.ndarray) -> int:
-    """Of some Gaussians, at least one, the opaque one that is nearest to their centroid: its row."""
+    """Row of the opaque Gaussian nearest to the centroid of the given ones, at least one."""
     rows, _ = voters(scene, rows)
     points = scene.means[rows].astype(np.float64)
     return int(rows[np.argmin(((points - points.mean(0)) ** 2).sum(-1))])
@@ -166,7 +166,7 @@ def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
 
 
 def _world_twist(twist: np.ndarray, radius: float) -> MotionModel:
-    """The model of v, a, w, e about the pivot. [12]"""
+    """Motion model from v, a, w, e about the pivot. [12]"""
     v, a, w, e = np.split(twist, 4)
     return MotionModel(
         "world_twist", velocity=v, acceleration=a, angular_velocity=w, angular_acceleration=e, radius=radius
@@ -180,10 +180,10 @@ def _least_squares(
     guess: np.ndarray,  # [12]
     span: float,
 ) -> np.ndarray:  # [12]
-    """The twist v, a, w, e about the pivot whose field has the members' velocities and accelerations.
+    """Twist v, a, w, e about the pivot that best fits the members' velocities and accelerations.
 
-    A member's own spin does not tell how the body turns (only v + w x r is seen in training), so it decides only about
-    axes that the members' velocities leave open.
+    Training observes only v + w x r, so a member's own spin does not show how the body rotates. It is used only about
+    axes that the members' velocities leave undetermined.
 
     Source: velocity v + w x r, acceleration a + e x r + w x (v + w x r).
     """
@@ -197,14 +197,14 @@ def _least_squares(
 def _screw(
     arms: np.ndarray, speeds: np.ndarray, weights: np.ndarray, guess: np.ndarray, doubt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The field v + w x r nearest to vectors at points r: v and w, robust.
+    """Robust fit of a field v + w x r to vectors at points r; returns v and w.
 
     Args:
         arms: r. [n, 3]
         speeds: The vectors. [n, 3]
-        weights: > 0. [n]
-        guess: What w is about an axis that the points leave open. [3]
-        doubt: Standard deviation of w from which an axis counts as open.
+        weights: Weights, > 0. [n]
+        guess: Value of w about undetermined axes. [3]
+        doubt: Standard deviation of w above which an axis counts as undetermined.
     """
     current, center, mean, w = weights / weights.sum(), arms[0], speeds[0], guess
     for remaining in range(_ROUNDS, -1, -1):
@@ -232,7 +232,7 @@ def _screw(
 def _kabsch(
     arms: np.ndarray, states: np.ndarray, weights: np.ndarray, guess: np.ndarray, span: float, radius: float
 ) -> np.ndarray:
-    """The twist whose motion is nearest to the best rigid motions of the members at several times up to ``span``."""
+    """Twist nearest to the rigid registrations of the members at several times up to ``span``."""
     taus = span * np.arange(1, _FUTURES + 1) / _FUTURES
     quats, displacements = np.empty((_FUTURES, 4)), np.empty((_FUTURES, 3))
     future = twist_propagation.Propagator(states, _TOLERANCE * radius)
@@ -247,7 +247,7 @@ def _kabsch(
 def _fit_twist(
     taus: np.ndarray, quats: np.ndarray, displacements: np.ndarray, guess: np.ndarray, radius: float
 ) -> np.ndarray:
-    """The twist v, a, w, e whose poses are nearest to given ones, by Levenberg-Marquardt from a guess. [12]"""
+    """Fit the twist v, a, w, e to poses by Levenberg-Marquardt from an initial guess. [12]"""
     span = float(taus[-1])
     units = np.repeat([radius / span, radius / span**2, 1 / span, 1 / span**2], 3)
 

@@ -1,11 +1,11 @@
-"""Names of the playback modes: BASE or BASE/VARIANT. Needs the standard library alone.
+"""Names of the playback modes: BASE or BASE/VARIANT. Imports only the standard library.
 
-The first variant of a base is meant if none is given. `scene_player` describes what each mode does.
+Without a variant, the first one of the base applies. `scene_player` describes the modes.
 """
 
 from __future__ import annotations
 
-SOURCES = ("fitted", "representative", "median", "least_squares", "kabsch")  # of a group's motion past t_max
+SOURCES = ("fitted", "representative", "median", "least_squares", "kabsch")  # sources of a group's motion past t_max
 MODES = ("rigid", "hybrid", "standard", "rigid_paper")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "rigid": SOURCES,
@@ -16,7 +16,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 
 def split(mode: str) -> tuple[str, str]:
-    """Return base and variant of a mode; the variant is the first one if none is given, "" if the base has none.
+    """Return base and variant of a mode. The variant defaults to the first one, or "" if the base has none.
 
     Raises:
         ValueError: The mode is unknown.
@@ -32,5 +32,5 @@ def split(mode: str) -> tuple[str, str]:
 
 
 def every() -> tuple[str, ...]:
-    """Return all modes, each once; the first variant of a base goes by the name of the base."""
+    """Return all modes, each once; the first variant of a base has the name of the base."""
     return tuple(mode for base in MODES for mode in (base, *(f"{base}/{variant}" for variant in VARIANTS[base][1:])))

@@ -1,7 +1,7 @@
-"""Gaussians of a scene carried by affine maps, one per motion group.
+"""Gaussians of a scene moved by rigid maps, one per motion group.
 
-Notation: member i of a group lies at p + r_i at t_max, p the group's pivot; its place is R r_i + (p + d), computed in
-float64 relative to an origin and rounded to float32 once, so that it is as sharp as numbers near that origin are.
+Notation: member i of a group lies at p + r_i at t_max, p the group's pivot; its position is R r_i + (p + d), computed
+in float64 relative to an origin and rounded to float32 once, so that precision is highest near that origin.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..scene.scene import Scene
 
 
 class Poser:
-    """The Gaussians of a scene, ready to be carried; what does not depend on poses is computed once.
+    """The Gaussians of a scene in any poses of its groups. Pose-independent quantities are computed once.
 
     Args:
         scene: The scene.
@@ -35,11 +35,11 @@ class Poser:
         Args:
             group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
             group_displacements: Displacement of each pivot, world. [G, 3]
-            origin: [3]
+            origin: Point of the world. [3]
 
         Returns:
-            A new array; Gaussians of groups that did not move are those of the bind state to the bit where the origin
-            is zero. [N, 3] float32
+            A new array. Gaussians of groups that did not move equal the bind state exactly if the origin is zero.
+            [N, 3] float32
         """
         result = self._resting(origin).copy()
         moved = (group_quats[:, 1:] != 0).any(-1) | (group_displacements != 0).any(-1)
@@ -51,22 +51,22 @@ class Poser:
         return result
 
     def maps(self, group_quats: np.ndarray, group_displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """What `arms` are multiplied with from the right. [G, 4], [G, 3], [3] -> [G, 4, 3]"""
+        """Matrices that transform `arms` by right multiplication. [G, 4], [G, 3], [3] -> [G, 4, 3]"""
         maps = np.empty((len(group_quats), 4, 3))
         maps[:, :3] = np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
         maps[:, 3] = self.pivots + group_displacements - origin
         return maps
 
     def shift(self, offsets: np.ndarray, maps: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Centres at t_max plus what the maps of their groups make of offsets, relative to an origin.
+        """Centres at t_max plus offsets mapped by each group's matrix, relative to an origin.
 
         Args:
-            offsets: With a fourth column of ones. [N, 4]
-            maps: [G, 4, 3]
-            origin: [3]
+            offsets: Offsets with a fourth column of ones. [N, 4]
+            maps: Matrix of each group, for right multiplication. [G, 4, 3]
+            origin: Point of the world. [3]
 
         Returns:
-            A new array; groups of a zero map stay as in `means`. [N, 3] float32
+            A new array; groups with a zero matrix stay in place. [N, 3] float32
         """
         result = self._resting(origin).copy()
         for start, stop, g in self._runs:
@@ -78,7 +78,7 @@ class Poser:
         return result
 
     def quats(self, group_quats: np.ndarray) -> np.ndarray:
-        """Rotations of the Gaussians with each group turned. [G, 4] -> [N, 4] float32, the scene's where none turned"""
+        """Gaussian rotations with each group rotated; the scene's own array if none is. [G, 4] -> [N, 4] float32"""
         turned = (group_quats[:, 1:] != 0).any(-1)
         if not turned.any():
             return self._scene.quats
@@ -89,7 +89,7 @@ class Poser:
         return result
 
     def shading(self, group_quats: np.ndarray) -> np.ndarray | None:
-        """Factor on the colour of each Gaussian with each group turned, or None. [G, 4] -> [N] float32"""
+        """Colour factor of each Gaussian with each group rotated, or None without shading. [G, 4] -> [N] float32"""
         vectors, light = self._scene.shading, self._scene.light_direction
         if not self._shaded or vectors is None or light is None:
             return None
@@ -101,7 +101,13 @@ class Poser:
         return result
 
     def relight(self, factors: np.ndarray | None, rows: np.ndarray, turns: np.ndarray) -> None:
-        """Write the factors of Gaussians that turned on their own. factors [N], rows [R], turns since t_max [4, R]"""
+        """Write colour factors of individually rotated Gaussians.
+
+        Args:
+            factors: Output, or None without shading. [N]
+            rows: Rows of the Gaussians. [R]
+            turns: Their rotations since t_max, unit wxyz, by column. [4, R]
+        """
         vectors, light = self._scene.shading, self._scene.light_direction
         if factors is None or vectors is None or light is None:
             return
@@ -112,7 +118,7 @@ class Poser:
 
     @property
     def arms(self) -> np.ndarray:
-        """Places of the Gaussians from the pivots of their groups, with a fourth column of ones. [N, 4] float64"""
+        """Positions relative to the pivots of their groups, with a fourth column of ones. [N, 4] float64"""
         if self._arms is None:
             self._arms = np.ones((len(self._scene.means), 4))
             np.subtract(self._scene.means, self.pivots[self._scene.motion_ids], out=self._arms[:, :3])
@@ -127,18 +133,18 @@ class Poser:
 
 
 def rest_factors(scene: Scene) -> np.ndarray:
-    """Factor of each Gaussian's colour in the bind state, before it is bounded at 0. [N] float32"""
+    """Colour factor of each Gaussian in the bind state, before clamping at 0. [N] float32"""
     rest = scene.shading_rest
     return np.ones(len(scene.means), np.float32) if rest is None else rest
 
 
 def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Factors on the colours of Gaussians that have turned since the bind state.
+    """Colour factors of Gaussians rotated since the bind state.
 
     Args:
-        rest: Their factors there, before they are bounded at 0. [n]
-        shading: How they change with the light's direction. [n, 3]
-        light: Direction of the light. [3]
+        rest: Factors in the bind state, before clamping at 0. [n]
+        shading: Gradient of the factors with respect to the light direction. [n, 3]
+        light: Light direction. [3]
         turns: One rotation for all, or one for each. [3, 3] or [n, 3, 3]
 
     Returns:
@@ -149,7 +155,7 @@ def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndar
 
 
 def light_change(light: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """How the light's direction, seen from what has turned, has changed. [3] and [..., 3, 3] -> [..., 3]"""
+    """Change of the light direction as seen from rotated Gaussians. [3] and [..., 3, 3] -> [..., 3]"""
     return np.swapaxes(turns, -1, -2) @ light - light
 
 
@@ -157,13 +163,13 @@ def move_points(points: np.ndarray, linear: np.ndarray, shift: np.ndarray, resul
     """Write ``linear p + shift`` for each point p to ``result``, computed in float64.
 
     Args:
-        points: [N, 3] float32
-        linear: [3, 3] float64
-        shift: [3] float64
-        result: Not ``points``. [N, 3] float32
+        points: The points. [N, 3] float32
+        linear: Linear part. [3, 3] float64
+        shift: Translation. [3] float64
+        result: Output, not ``points``. [N, 3] float32
     """
     turned = points.astype(np.float64) @ linear.T
-    for axis in range(3):  # a column at a time: numpy is slow at rows of three
+    for axis in range(3):  # by column, because numpy is slow on rows of three
         np.add(turned[:, axis], shift[axis], out=result[:, axis], casting="same_kind")
 
 
@@ -173,7 +179,7 @@ def turn_quats(quats: np.ndarray, turn: np.ndarray, result: np.ndarray) -> None:
     Args:
         quats: Unit wxyz. [N, 4] float32
         turn: Unit wxyz. [4] float64
-        result: Not ``quats``. [N, 4] float32
+        result: Output, not ``quats``. [N, 4] float32
     """
     # Linear in q: row k of the matrix is the product with the k-th unit quaternion.
     np.matmul(quats, rotations.multiply(turn, np.eye(4)).astype(np.float32), out=result)

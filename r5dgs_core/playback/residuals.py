@@ -1,7 +1,7 @@
-"""Motion of single Gaussians: residuals in the observed time, dynamics of their own past t_max.
+"""Motion of individual Gaussians: residuals in the observed time, own dynamics past t_max.
 
-Notation: R rows with residuals, S knots. A residual changes a Gaussian in the bind state, x -> x + offset,
-q -> turn q, log scale -> log scale + growth; its group moves the result. Between knots each component is the curve of
+Notation: R rows with residuals, S knots. A residual changes a Gaussian in the bind state, x -> x + offset, q -> turn q,
+log scale -> log scale + growth; its group moves the result. Between knots each component is a cubic with the slopes of
 `key_reduction.slopes`, as for the tracks.
 """
 
@@ -15,18 +15,18 @@ from ..scene.scene import Scene
 from . import group_dynamics
 from .posing import Poser
 
-TOLERANCE = 1e-5  # error of `standard` motion as a share of the scene's extent
-ANGLE_TOLERANCE = 1e-3  # error of its rotations, rad
+TOLERANCE = 1e-5  # allowed error of `standard` motion / extent of the scene
+ANGLE_TOLERANCE = 1e-3  # allowed error of its rotations, rad
 Cubic = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # values and slopes at both ends
-UNEXPLAINED = 0.3  # of the group's radius: residuals from there on belong to no motion of a group
+UNEXPLAINED = 0.3  # in radii of the group; larger residuals are not explained by group motion
 
 
 class Residuals:
-    """What the residuals of a scene say at any time, by column; the ends of the last interval are kept.
+    """Residuals of a scene at any time, stored by column. The last interval is cached.
 
     Attributes:
-        rows: Gaussians that have some, increasing. [R]
-        runs: Stretches of ``rows`` of one motion group: start, stop, group.
+        rows: Gaussians with residuals, increasing. [R]
+        runs: Ranges of ``rows`` in one motion group: start, stop, group.
         bind_quats: Their rotations in the bind state, unit wxyz, by column. [4, R]
     """
 
@@ -35,7 +35,7 @@ class Residuals:
         rows = scene.residual_rows
         there = rows is not None and len(rows) > 0 and all(part is not None for part in parts)
         self.rows = np.asarray(rows, np.int64) if there and rows is not None else np.zeros(0, np.int64)
-        # [C, S, R]: what is asked for lies together.
+        # [C, S, R]: the values of one knot are contiguous.
         self._parts = [np.ascontiguousarray(part.transpose(2, 1, 0)) for part in parts if there and part is not None]
         self.runs = runs(scene.motion_ids[self.rows])
         self.bind_quats = np.ascontiguousarray(scene.quats[self.rows].T)
@@ -46,7 +46,7 @@ class Residuals:
         """Offsets [3, R], unit quaternions wxyz [4, R] and changes of log scales [3, R] at a time, float64.
 
         Returns:
-            The three, as before the first knot held, or None where there are none: from t_max on.
+            The three, constant before the first knot; None from t_max on or if there are no residuals.
         """
         if len(self.rows) == 0 or t >= self._t_max:
             return None
@@ -66,13 +66,13 @@ class Residuals:
 
 
 def _unit(quats: np.ndarray) -> np.ndarray:
-    """Quaternions by column, normalised. [4, R]"""
+    """Normalise quaternions by column. [4, R]"""
     return quats / np.sqrt(np.maximum((quats * quats).sum(0), 1e-300))
 
 
 def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
-    """Values and slopes at the ends of interval k of curves through knots. [C, S, R] -> four times [C, R] float64"""
-    window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope asks for the neighbours of its knot alone
+    """Values and slopes at both ends of interval k of curves through knots. [C, S, R] -> four times [C, R] float64"""
+    window = slice(max(k - 1, 0), min(k + 3, len(times)))  # a slope depends only on the neighbouring knots
     near = values[:, window].astype(np.float64)
     if len(values) == 4:
         near[:, 1:] *= np.cumprod(np.where((near[:, 1:] * near[:, :-1]).sum(0) < 0, -1.0, 1.0), axis=0)
@@ -81,10 +81,10 @@ def _cubic(times: np.ndarray, values: np.ndarray, k: int) -> Cubic:
 
 
 def unexplained(scene: Scene) -> np.ndarray:
-    """Gaussians that the motion of no group explains, for mode "hybrid": increasing rows. [H] int64
+    """Gaussians that no group's motion explains, for mode "hybrid": increasing rows. [H] int64
 
-    Their residuals leave the motion of their group by more than `UNEXPLAINED` of its radius (root mean square over the
-    knots). Of a group that rests by rule, every residual does.
+    Their root mean square offset over the knots exceeds `UNEXPLAINED` radii of their group. In a pinned group any
+    residual suffices.
     """
     rows, offsets = scene.residual_rows, scene.residual_offsets
     if rows is None or offsets is None or len(rows) == 0:
@@ -99,7 +99,7 @@ class OwnMotion:
 
     Args:
         scene: The scene, with `point_dynamics`.
-        rows: Those that do; all where None.
+        rows: Rows that do so, or None for all.
     """
 
     def __init__(self, scene: Scene, rows: np.ndarray | None = None):
@@ -110,7 +110,7 @@ class OwnMotion:
             scene.dynamics[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE
         )
         moving = self._propagator.rows
-        # Among all, those at rest are where no group brings them; of some, they are to stay though their group moves.
+        # If only some rows move on their own, resting ones are listed too, so that their group does not move them.
         self._resting = np.zeros(0, np.int64) if rows is None else np.setdiff1d(np.arange(len(chosen)), moving)
         self.rows = chosen[np.concatenate([moving, self._resting])]
         self._means = np.ascontiguousarray(scene.means[self.rows].T, np.float64)
@@ -129,15 +129,15 @@ class OwnMotion:
 
 
 class Literal:
-    """Eq. 6 and 7 of the paper to the letter.
+    """Literal form of Eq. 6 and 7 of the paper.
 
     x_i = y_i + (p_r - y_r) + (R - I) (x_i - x_r) with y the state at t_max, x the canonical one and r the group's
-    representative, which moves by its own dynamics and TRACE's integrator. This is not rigid where the object turned
-    between the canonical time and t_max; `scene_player` has the form that is.
+    representative, which moves by its own dynamics and TRACE's integrator. This is not rigid if the object rotated
+    between the canonical time and t_max; `scene_player` has the rigid form.
 
     Args:
         scene: The scene, with `point_dynamics` and `canonical_means`.
-        anchored: Whether what belongs to no body has a representative, too, as in the paper's text; else it stays.
+        anchored: True to give Gaussians outside bodies a representative too, as in the paper's text; else they stay.
     """
 
     def __init__(self, scene: Scene, anchored: bool = False):
@@ -163,7 +163,7 @@ class Literal:
         return quats, displacements
 
     def means(self, poser: Poser, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Centres relative to an origin, for what `at` gives. [N, 3] float32"""
+        """Centres relative to an origin, for the result of `at`. [N, 3] float32"""
         maps = np.empty((self._count, 4, 3))
         maps[:, :3] = np.swapaxes(rotations.quats_to_rotmats(quats), -1, -2) - np.eye(3)
         maps[:, 3] = displacements

@@ -1,4 +1,4 @@
-"""The summary of a scene that ``r5dgs info --json`` prints."""
+"""Summary of a scene for ``r5dgs info --json``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from . import scene_player
 
 
 def info(scene: Scene) -> dict[str, Any]:
-    """Return what `r5dgs info --json` prints, as JSON types."""
+    """Return the output of `r5dgs info --json` as JSON types."""
     return {
         "name": scene.name,
         "gaussians": len(scene.means),

@@ -1,19 +1,19 @@
-"""A scene at any time: poses of its motion groups, and its Gaussians moved by them.
+"""Playback of a scene: poses of its motion groups and its Gaussians at any time.
 
-Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots
-(the quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours.
-Blender's Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce
-playback at sub-frames. Before the first knot the pose is held; past t_max it is what the mode says.
+Between the observed times each component of displacement and quaternion is a cubic Hermite curve through the knots (the
+quaternion is normalised afterwards), with slopes of the parabola through each knot and its two neighbours. Blender's
+Bezier keys with handles at a third of the interval are the same curve, so keys at the knots reproduce playback at
+sub-frames. Before the first knot the pose is held; past t_max it depends on the mode.
 
-A mode is one string, BASE or BASE/VARIANT; the first of `VARIANTS` is meant where none is given. Up to t_max all modes
-are the same. Past it:
+A mode is one string, BASE or BASE/VARIANT; the variant defaults to the first of `VARIANTS`. All modes agree up to
+t_max. Past it:
 
 - "rigid" moves every Gaussian with its group. The variant is the source of the group's motion (`group_dynamics`).
-- "hybrid" does, too, except for Gaussians that no group's motion explains (`residuals.unexplained`): they move by their
+- "hybrid" is "rigid", except that Gaussians which no group's motion explains (`residuals.unexplained`) move by their
   own dynamics.
 - "standard" moves every Gaussian by its own dynamics.
-- "rigid_paper" is Eq. 6 and 7 to the letter; "pinned" leaves what belongs to no body in its place, "anchored" gives it
-  a representative, as the paper's text does.
+- "rigid_paper" is the literal form of Eq. 6 and 7. Gaussians outside bodies stay in place with "pinned"; with
+  "anchored" they get a representative, as in the paper's text.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ __all__ = (
 class Frame:
     """The Gaussians of a scene at time t.
 
-    `sh` stays in the frame of the bind state: a renderer turns each viewing direction back by the group's rotation
-    (`sh_rotations`), or by the Gaussian's own, instead of turning the coefficients.
+    `sh` stays in the frame of the bind state: a renderer rotates each viewing direction back by the group's rotation
+    (`sh_rotations`), or by the Gaussian's own, instead of rotating the coefficients.
 
     Attributes:
         t: Scene time.
         means: Centres relative to ``origin``, along the world's axes. [N, 3] float32
         quats: Unit wxyz. [N, 4] float32
-        log_scales: [N, 3] float32
+        log_scales: Logarithms of the scales. [N, 3] float32
         opacity_logits: As in the scene. [N] float32
         sh: As in the scene, bind frame. [N, K, 3] float32
         shading_factor: Factor on the colour, >= 0, or None without shading. [N] float32
-        object_ids: [N] int32
-        motion_ids: [N] int32
+        object_ids: As in the scene. [N] int32
+        motion_ids: As in the scene. [N] int32
         group_quats: Rotation of each motion group since the bind state, unit wxyz. [G, 4] float64
         group_displacements: Displacement of each group's pivot, world. [G, 3] float64
         origin: Point of the world that ``means`` are relative to. [3] float64
-        turned_rows: Gaussians that turned otherwise than their group, or None. [R] int64
+        turned_rows: Gaussians with a rotation other than their group's, or None. [R] int64
         turned_quats: Their rotations since the bind state, unit wxyz, or None. [R, 4] float32
     """
 
@@ -79,12 +79,12 @@ class Frame:
 
 
 def modes(scene: Scene) -> tuple[str, ...]:
-    """Those of `every` that a scene holds data for: `rigid` always, the others where it carries dynamics."""
+    """Modes of `every` that a scene has data for: `rigid` always, the others if it has dynamics."""
     return tuple(mode for mode in every() if available(scene, mode))
 
 
 def available(scene: Scene, mode: str) -> bool:
-    """Whether a scene holds data for a mode. Raises ValueError where there is no such mode."""
+    """Return True if a scene has data for a mode. Raises ValueError if the mode is unknown."""
     base, variant = split(mode)
     if base == "rigid_paper":
         return scene.dynamics is not None and scene.canonical_means is not None
@@ -92,14 +92,14 @@ def available(scene: Scene, mode: str) -> bool:
 
 
 class Player:
-    """A scene in one mode, ready for any time; what does not depend on the time is computed once, when it is needed.
+    """A scene in one mode, ready for any time. Time-independent quantities are computed lazily, once.
 
     Args:
         scene: The scene; its arrays must not change.
-        mode: Of `modes`.
+        mode: One of `modes`.
 
     Raises:
-        ValueError: There is no such mode, or the scene holds no data for it.
+        ValueError: The mode is unknown, or the scene has no data for it.
     """
 
     def __init__(self, scene: Scene, mode: str = "rigid"):
@@ -127,11 +127,11 @@ class Player:
         return Literal(self.scene, self._variant == "anchored")
 
     def group_poses(self, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of every motion group that this mode's Gaussians are moved by, relative to the bind state.
+        """Pose of every motion group in this mode, relative to the bind state.
 
         Returns:
             Unit quaternions wxyz [G, 4] and displacements of the pivots (of the representatives in mode "rigid_paper"),
-            world [G, 3], float64; those at rest in mode "standard".
+            world [G, 3], float64; the identity in mode "standard" past t_max.
         """
         if t <= self.scene.t_max or self._base in ("rigid", "hybrid"):
             return self._groups.poses(t)
@@ -144,11 +144,11 @@ class Player:
 
         Args:
             t: Scene time.
-            origin: Point of the world that the centres are to be relative to, such as the camera's; the world's own
-                where None. Single precision is sharp near it. [3]
+            origin: Point of the world that the centres are relative to, such as the camera position, near which float32
+                is most precise; None for the world origin. [3]
 
         Returns:
-            The frame. Gaussians that did not move are equal to the bind state to the bit where there is no origin.
+            The frame. Without an origin, Gaussians that did not move equal the bind state exactly.
         """
         scene, poser = self.scene, self._poser
         center = np.zeros(3) if origin is None else np.array(origin, np.float64)
@@ -183,7 +183,7 @@ class Player:
         )
 
     def _bend(self, moved: _Moved, t: float, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> None:
-        """Residuals of the observed time, in the bind state before the group moves it."""
+        """Apply residuals of the observed time in the bind state, before the group motion."""
         found = self._residuals.at(t)
         if found is None:
             return
@@ -202,7 +202,7 @@ class Player:
         self._poser.relight(moved.shading, rows, since)
 
     def _part(self, moved: _Moved, tau: float, origin: np.ndarray) -> None:
-        """Gaussians that leave their groups past t_max."""
+        """Move Gaussians by their own dynamics past t_max."""
         assert self._own is not None
         means, quats, turns = self._own.at(tau, origin)
         moved.means[self._own.rows] = means.T
@@ -212,7 +212,7 @@ class Player:
 
 @dataclass
 class _Moved:
-    """What becomes a frame. means [N, 3], quats [N, 4], log_scales [N, 3], shading [N]; rows [R], turns [R, 4]"""
+    """Mutable state of a frame. means [N, 3], quats [N, 4], log_scales [N, 3], shading [N]; rows [R], turns [R, 4]"""
 
     means: np.ndarray
     quats: np.ndarray
@@ -222,7 +222,7 @@ class _Moved:
     turns: np.ndarray | None = None
 
     def turn(self, rows: np.ndarray, since: np.ndarray, quats: np.ndarray, scene: Scene) -> None:
-        """Take rotations of some Gaussians since the bind state, and what they turned: by column, [4, R]."""
+        """Set quaternions of some Gaussians and their rotations ``since`` the bind state, by column. [4, R]"""
         if self.quats is scene.quats:
             self.quats = scene.quats.copy()
         self.quats[rows] = quats.T
@@ -230,19 +230,19 @@ class _Moved:
 
 
 def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | None = None) -> Frame:
-    """The scene's Gaussians at time t. Whoever asks for many times keeps a `Player`.
+    """The scene's Gaussians at time t. For many times, keep a `Player`.
 
     Args:
         scene: The scene.
         t: Scene time.
-        mode: How Gaussians move past t_max, of `modes`.
-        origin: Point of the world that the centres are to be relative to, or None. [3]
+        mode: Mode past t_max, one of `modes`.
+        origin: Point of the world that the centres are relative to, or None. [3]
 
     Returns:
         As `Player.frame`.
 
     Raises:
-        ValueError: There is no such mode, or the scene holds no data for it.
+        ValueError: The mode is unknown, or the scene has no data for it.
     """
     return Player(scene, mode).frame(t, origin)
 
@@ -268,7 +268,7 @@ def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sh_rotations(group_quats: np.ndarray) -> np.ndarray:
-    """Matrices that bring world directions into each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
+    """Matrices from world directions to each group's bind frame, for evaluating SH. [G, 4] -> [G, 3, 3]"""
     return np.swapaxes(rotations.quats_to_rotmats(group_quats), -1, -2)
 
 
@@ -279,7 +279,7 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         scene: The scene.
         group_quats: Rotation of each group about its pivot, unit wxyz. [G, 4]
         group_displacements: Displacement of each pivot, world. [G, 3]
-        t: Time written into the frame.
+        t: Time stored in the frame.
     """
     poser, center = posing.Poser(scene), np.zeros(3)
     return Frame(

@@ -1,13 +1,13 @@
-"""Which members of a group say where it is."""
+"""Opacity threshold for Gaussians that determine a group's position."""
 
 from __future__ import annotations
 
 import numpy as np
 
-SEEN_OPACITY = 0.3  # fainter Gaussians do not say where an object is
+SEEN_OPACITY = 0.3  # fainter Gaussians do not determine an object's position
 
 
 def seen(opacities: np.ndarray) -> np.ndarray:
-    """Members that can be seen; all, where none can. [n] -> [n] bool"""
+    """Mask of members with opacity above `SEEN_OPACITY`, or all members if none qualifies. [n] -> [n] bool"""
     visible = opacities > SEEN_OPACITY
     return visible if visible.any() else np.ones(len(opacities), bool)
