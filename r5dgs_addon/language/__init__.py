@@ -1,1 +1,1 @@
-"""Select objects by prompt: prompt state, search and phrase embeddings."""
+"""Selection of objects by prompt: prompt state, search and phrase embeddings."""

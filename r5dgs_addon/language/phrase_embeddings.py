@@ -1,7 +1,7 @@
-"""Embeddings of phrases that no scene file stores: the worker makes them with the encoder that the preferences name.
+"""Embeddings of phrases that no scene file stores, computed by the worker with the text encoder of the preferences.
 
-They are kept for the session. `fetch` waits for the worker; `begin` lets it work beside the window, and a timer takes
-its answer, unless Blender opens another file: that ends the timer.
+They are cached for the session. `fetch` blocks until the worker responds. `begin` returns immediately, and a timer
+receives the response, unless Blender opens another file, which ends the timer.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,18 +15,18 @@ from ...r5dgs_core.scene.lookup_table import EncoderCard
 from .. import preferences
 from ..worker import jobs
 
-KEY = "phrases"  # what `jobs.busy` knows its jobs by
-_LOOK_S = 0.1  # between two looks at the job
+KEY = "phrases"  # job key for `jobs.busy`
+_LOOK_S = 0.1  # timer interval
 
 
 @dataclass(frozen=True)
 class Embedded:
-    """A phrase as an encoder sees it.
+    """Embedding of a phrase.
 
     Attributes:
         digest: SHA-256 of the encoder's weights.
-        encoder: Its name.
-        vector: Unit. [D]
+        encoder: Name of the encoder.
+        vector: Unit vector. [D]
     """
 
     digest: str
@@ -34,48 +34,48 @@ class Embedded:
     vector: np.ndarray
 
 
-_known: dict[tuple[str, str], Embedded] = {}  # by the encoder's folder and phrase
+_known: dict[tuple[str, str], Embedded] = {}  # by encoder folder and phrase
 _job: jobs.Job | None = None
-_asked: tuple[str, list[str]] = ("", [])  # what the job was asked for: folder and phrases
+_asked: tuple[str, list[str]] = ("", [])  # folder and phrases of the job
 _then: Callable[[str], None] | None = None
 
 
 def of(phrase: str, card: EncoderCard) -> np.ndarray | None:
-    """The embedding of a phrase by the encoder of a table; None where it is not known, or known by another encoder."""
+    """Return the cached embedding of a phrase, or None if it is missing or from another encoder than the table's."""
     found = _known.get((preferences.text_encoder(), phrase))
     return found.vector if found is not None and found.digest == card.digest else None
 
 
 def is_there() -> bool:
-    """Whether the preferences name an encoder."""
+    """True if the preferences name an encoder."""
     return bool(preferences.text_encoder())
 
 
 def missing(asked: Sequence[str]) -> list[str]:
-    """The phrases that the encoder of the preferences has not been asked for yet; none where there is no encoder."""
+    """Phrases without a cached embedding of the preferences' encoder; empty without an encoder."""
     where = preferences.text_encoder()
     return [phrase for phrase in asked if (where, phrase) not in _known] if where else []
 
 
 def stranger(asked: Sequence[str], card: EncoderCard) -> str:
-    """Name of the encoder in the preferences, where it is another one than that of a table; else empty."""
+    """Name of the preferences' encoder if it differs from the table's, otherwise ""."""
     where = preferences.text_encoder()
     found = (_known.get((where, phrase)) for phrase in asked)
     return next((one.encoder for one in found if one is not None and one.digest != card.digest), "")
 
 
 def fetch(asked: Sequence[str]) -> None:
-    """Have phrases embedded, and wait for it. Raises as `jobs.run`."""
+    """Embed phrases and wait for the result. Raises the same errors as `jobs.run`."""
     where = preferences.text_encoder()
     _keep(where, asked, jobs.run(_steps(where, asked)))
 
 
 def begin(asked: Sequence[str], then: Callable[[str], None]) -> None:
-    """Have phrases embedded beside the window.
+    """Embed phrases without blocking the window.
 
     Args:
-        asked: The phrases; what was asked for before and has not begun is dropped.
-        then: Called in Blender's main thread when they are known, with "", or with what went wrong.
+        asked: Phrases; they replace an earlier request that has not started.
+        then: Callback in Blender's main thread, called with "" or an error message.
     """
     global _job, _asked, _then
     where = preferences.text_encoder()
@@ -85,7 +85,7 @@ def begin(asked: Sequence[str], then: Callable[[str], None]) -> None:
 
 
 def look() -> float | None:
-    """Take the worker's answer where it is there. Returns seconds to the next look, None for no more."""
+    """Receive the worker's response if it is ready. Returns the timer interval, or None to stop."""
     global _job, _then
     if _job is None:
         return None
@@ -104,7 +104,7 @@ def look() -> float | None:
 
 
 def forget() -> None:
-    """Drop what is known, and wait for nothing."""
+    """Clear the cache and stop the timer."""
     global _job, _then
     _job, _then = None, None
     _known.clear()

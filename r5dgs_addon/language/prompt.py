@@ -1,8 +1,8 @@
-"""Words to objects, by the table that the .blend keeps and by the embeddings that the scene file stores.
+"""Search for objects by words, using the .blend's object table and the embeddings of the scene file.
 
-Names and aliases need neither the scene file nor torch. Embeddings of words are read from the file when it is first
-asked, and kept until it changes. Words that the file does not know are left to the encoder of the preferences, which
-the worker opens (`phrase_embeddings`); its answers join the others.
+Names and aliases need neither the scene file nor torch. Embeddings are read from the file on first use and cached until
+it changes. Words without stored embeddings are embedded by the encoder of the preferences in the worker
+(`phrase_embeddings`), and the matches are merged.
 """
 
 import functools
@@ -18,15 +18,15 @@ from ..scene import file_cache, loaded_scenes, object_names, selection
 from ..ui import status_bar
 from . import phrase_embeddings
 
-HISTORY = 12  # prompts kept
-ASKING = "Asking the text encoder for "  # begins a note: there may be more matches soon
+HISTORY = 12  # maximum number of stored prompts
+ASKING = "Asking the text encoder for "  # prefix of the note shown while the encoder works
 STRANGER = "{}: made by the encoder {!r}; the preferences' {!r} cannot be asked: make its table again with that one"
 _meanings: file_cache.Remembered[object_search.Meanings | None] = file_cache.Remembered(scene_file.read_meanings)
 
 
 @dataclass(frozen=True)
 class Match:
-    """One answer: an object of a loaded scene, how well it matches (at most 1), and what matched."""
+    """Match of a prompt: object of a loaded scene, score (at most 1), and the reason."""
 
     scene: bpy.types.Collection
     object_id: int
@@ -37,15 +37,15 @@ class Match:
 
 @dataclass(frozen=True)
 class Answer:
-    """What there is to say to a prompt.
+    """Result of a prompt.
 
     Attributes:
-        matches: Best first.
-        meant: Names that may have been meant where nothing matches.
-        notes: Sentences: matches that were deleted, files that were not found.
-        missing: Phrases that the encoder of the preferences could answer, and was not asked for yet.
-        error: Why the prompt cannot be answered; else empty.
-        nothing: True for a prompt that asks for no object, such as "none".
+        matches: Matches, best first.
+        meant: Suggested names if nothing matches.
+        notes: Messages, for example about deleted objects or missing files.
+        missing: Phrases that the encoder of the preferences could embed but has not yet.
+        error: Reason why the prompt is invalid, or "".
+        nothing: True if the prompt asks for no object, such as "none".
     """
 
     matches: list[Match]
@@ -57,20 +57,20 @@ class Answer:
 
     @property
     def objects(self) -> list[selection.Wanted]:
-        """The objects that match, best first."""
+        """Matching objects, best first."""
         return [(match.scene, match.object_id) for match in self.matches]
 
 
 def search(loaded: list[bpy.types.Collection], text: str, threshold: float = object_search.THRESHOLD) -> Answer:
-    """Objects of loaded scenes that words name.
+    """Search objects of loaded scenes by words.
 
     Args:
-        loaded: The scenes to search.
+        loaded: Scenes to search.
         text: One or several names: "red mug", "mugs and lemon".
-        threshold: Least score of a match.
+        threshold: Minimum score of a match.
 
     Returns:
-        The answer; equal scores are in the order of ``loaded``.
+        The result; equal scores are in the order of ``loaded``.
     """
     try:
         return _search(loaded, text, threshold)
@@ -81,7 +81,7 @@ def search(loaded: list[bpy.types.Collection], text: str, threshold: float = obj
 def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> Answer:
     matches, deleted, notes, known, missing, lost = [], [], [], [], [], []
     left: list[list[str]] = []
-    kept: list[list[str]] = []  # phrases that were to be left out and match nothing
+    kept: list[list[str]] = []  # excluded phrases that match nothing
     for collection in loaded:
         labels = object_names.labels(collection)
         there = object_names.present(collection)
@@ -105,13 +105,13 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
             elif not found.why.startswith(object_search.EVERYTHING):
                 deleted.append(names[found.object_id])
     unfit = [phrase for phrase in kept[0] if all(phrase in each for each in kept)] if kept else []
-    if unfit:  # until the encoder has been asked, nobody knows what is left out
+    if unfit:  # until the encoder responds, the exclusions are unknown
         matches = []
         object_search.check_exclusions(known, text, [phrase for phrase in unfit if phrase not in missing])
     if lost and not matches:
         asked = " and ".join(repr(phrase) for phrase in dict.fromkeys(lost))
         notes.append(f"{asked}: no stored word; name the scene's encoder under Text Encoder in the preferences")
-    if matches:  # of several wishes some may have found nothing
+    if matches:  # one of several phrases may have no match
         void = [phrase for phrase in left[0] if phrase not in missing and all(phrase in each for each in left)]
         notes += [f"Nothing matches {' and '.join(map(repr, void))}"] if void else []
     if deleted:
@@ -124,7 +124,7 @@ def _search(loaded: list[bpy.types.Collection], text: str, threshold: float) -> 
 
 
 def _instances(found: set[bpy.types.Collection]) -> list[str]:
-    """Notes on scenes that are instanced: their objects are found, and cannot be selected one by one."""
+    """Notes about instanced scenes, whose objects cannot be selected individually."""
     instanced = {
         one: empties for one, empties in loaded_scenes.shown(bpy.context.scene).items() if one in found and empties
     }
@@ -135,7 +135,7 @@ def _instances(found: set[bpy.types.Collection]) -> list[str]:
 
 
 def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answer) -> str:
-    """A sentence for the user when nothing matched."""
+    """Message for the user if nothing matched."""
     there = [(object_names.labels(each), object_names.present(each)) for each in loaded]
     labels = [label for own, ids in there for label in own if label.object_id in ids]
     said = object_search.explain_nothing(labels, text)
@@ -143,10 +143,10 @@ def explain_nothing(loaded: list[bpy.types.Collection], text: str, answer: Answe
 
 
 def ask(context: bpy.types.Context, text: str) -> Answer:
-    """Search as the sidebar's settings say, show the answer there, and remember a prompt that found something.
+    """Search with the sidebar's settings, show the result there, and store a prompt with matches in the history.
 
-    Words that only an encoder knows are waited for where there is no window; in one, the answer without them is shown,
-    and theirs when it comes.
+    Without a window, this waits for the encoder. With a window, the result is shown without the words that need the
+    encoder, and updated when it responds.
     """
     text = text.strip()
     answer = _answer(context, text)
@@ -160,7 +160,7 @@ def _answer(context: bpy.types.Context, text: str) -> Answer:
 
 
 def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
-    """The answer once the encoder has said its part, or with a note that it is being asked, or why it cannot be."""
+    """Result including the encoder's matches, or with a note that it is running or why it failed."""
     asked = " and ".join(repr(phrase) for phrase in answer.missing)
     if _has_window():
         phrase_embeddings.begin(answer.missing, functools.partial(_join, text))
@@ -173,12 +173,12 @@ def _with_encoder(context: bpy.types.Context, text: str, answer: Answer) -> Answ
 
 
 def _has_window() -> bool:
-    """Whether somebody looks at a window, which must not wait."""
+    """True if there is a window, which must not be blocked."""
     return not bpy.app.background and bool(bpy.context.window_manager.windows)
 
 
 def _join(text: str, wrong: str) -> None:
-    """Show the answer again, now that the encoder has said its part."""
+    """Show the result again with the encoder's matches."""
     there = bpy.context.window_manager.windows
     if not there or bpy.context.window_manager.r5dgs_words.asked != text:
         return
@@ -189,7 +189,7 @@ def _join(text: str, wrong: str) -> None:
 
 
 def _told(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
-    """The answer, shown and remembered."""
+    """Show the result and store the prompt. Returns the result."""
     settings = context.scene.r5dgs_words
     _show(context.window_manager.r5dgs_words, text, answer)
     if answer.matches:
@@ -198,18 +198,18 @@ def _told(context: bpy.types.Context, text: str, answer: Answer) -> Answer:
 
 
 def scope(context: bpy.types.Context) -> list[bpy.types.Collection]:
-    """The scenes to search: the active one, or all where the user wants that."""
+    """Scenes to search: the active one, or all if *All Scenes* is on."""
     loaded = selection.scenes(context)
     return loaded if context.scene.r5dgs_words.all_scenes else loaded[:1]
 
 
 def forget() -> None:
-    """Drop what was read from scene files."""
+    """Clear the cache of scene file embeddings."""
     _meanings.clear()
 
 
 def _stored_meanings(collection: bpy.types.Collection) -> tuple[object_search.Meanings | None, str]:
-    """The embeddings of a scene's file, or none and why the user should know."""
+    """Embeddings of a scene's file, or None and a message for the user."""
     if not collection.r5dgs_named.meanings:
         return None, ""
     try:
@@ -219,7 +219,7 @@ def _stored_meanings(collection: bpy.types.Collection) -> tuple[object_search.Me
 
 
 def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:
-    session.asked = text  # first: the field asks where it differs
+    session.asked = text  # set first, because the update callback compares it
     session.prompt = text
     session.matches.clear()
     for match in answer.matches:
@@ -233,7 +233,7 @@ def _show(session: bpy.types.PropertyGroup, text: str, answer: Answer) -> None:
 
 
 def _keep(history: bpy.types.bpy_prop_collection, text: str) -> None:
-    """Put a prompt first, once."""
+    """Move a prompt to the front of the history."""
     known = [item.name for item in history]
     wanted = [text, *(item for item in known if item != text)][:HISTORY]
     if wanted == known:

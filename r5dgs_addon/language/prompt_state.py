@@ -1,4 +1,4 @@
-"""State of prompts and isolation: settings, old prompts and what is hidden in the .blend, answers in the session."""
+"""State of prompts and isolation: settings, history and hidden objects in the .blend, results in the session."""
 
 import bpy
 from bpy.props import (
@@ -26,44 +26,44 @@ def _search_again(_: bpy.types.PropertyGroup, context: bpy.types.Context) -> Non
 
 
 class R5DGS_PG_text(bpy.types.PropertyGroup):
-    """Some words: its `name`."""
+    """Text item; the text is its `name`."""
 
 
 class R5DGS_PG_match(bpy.types.PropertyGroup):
-    """One answer to the last prompt; `name` is the object's name."""
+    """Match of the last prompt; `name` is the object's name."""
 
-    scene: StringProperty(name="Scene", description="Collection of the scene that has it")
+    scene: StringProperty(name="Scene", description="Collection of the object's scene")
     object_id: IntProperty(name="Object Id", description="Id in the scene's table of objects")
-    score: FloatProperty(name="Score", description="How well it matches, at most 1")
-    why: StringProperty(name="Why", description="What matched")
+    score: FloatProperty(name="Score", description="Similarity to the prompt, at most 1")
+    why: StringProperty(name="Why", description="Reason for the match")
 
 
 class R5DGS_PG_words_session(bpy.types.PropertyGroup):
-    """The last prompt and its answers."""
+    """Last prompt and its result."""
 
     prompt: StringProperty(
         name="Prompt", description="Words for the objects to find, such as 'red mug'; Enter searches", update=_search
     )
-    asked: StringProperty(name="Asked", description="The last prompt that was searched")
-    matches: CollectionProperty(name="Matches", description="Answers to the last prompt", type=R5DGS_PG_match)
-    meant: CollectionProperty(name="Meant", description="What the prompt may have meant", type=R5DGS_PG_text)
-    notes: CollectionProperty(name="Notes", description="What else there is to say", type=R5DGS_PG_text)
+    asked: StringProperty(name="Asked", description="Last prompt that was searched")
+    matches: CollectionProperty(name="Matches", description="Matches of the last prompt", type=R5DGS_PG_match)
+    meant: CollectionProperty(name="Meant", description="Suggestions for a prompt without matches", type=R5DGS_PG_text)
+    notes: CollectionProperty(name="Notes", description="Messages about the last search", type=R5DGS_PG_text)
 
 
 class R5DGS_PG_hidden(bpy.types.PropertyGroup):
-    """How one object was shown before others were isolated."""
+    """Visibility of an object before isolation."""
 
     obj: PointerProperty(name="Object", description="The object", type=bpy.types.Object)
-    hide: BoolProperty(name="Hidden", description="Whether it was hidden in the view layer")
-    hide_render: BoolProperty(name="Hidden in Renders", description="Whether it was hidden in renders")
+    hide: BoolProperty(name="Hidden", description="The object was hidden in the view layer")
+    hide_render: BoolProperty(name="Hidden in Renders", description="The object was hidden in renders")
 
 
 class R5DGS_PG_words(bpy.types.PropertyGroup):
-    """What a Blender scene keeps of prompts and isolation."""
+    """Prompt and isolation settings of a Blender scene."""
 
     threshold: FloatProperty(
         name="Threshold",
-        description="Least score of a match",
+        description="Minimum score of a match",
         default=object_search.THRESHOLD,
         min=0.0,
         max=1.0,
@@ -79,12 +79,12 @@ class R5DGS_PG_words(bpy.types.PropertyGroup):
     )
     click_selects_anchor: BoolProperty(
         name="Click Selects Anchor",
-        description="A click on Gaussians in a 3D view selects the anchor that moves them",
+        description="Select the anchor when clicking its Gaussians in a 3D view",
         default=True,
         options=set(),
     )
-    history: CollectionProperty(name="History", description="Prompts that found something", type=R5DGS_PG_text)
-    hidden: CollectionProperty(name="Hidden", description="What isolating has changed", type=R5DGS_PG_hidden)
+    history: CollectionProperty(name="History", description="Earlier prompts with matches", type=R5DGS_PG_text)
+    hidden: CollectionProperty(name="Hidden", description="Visibility changed by isolation", type=R5DGS_PG_hidden)
     hidden_in: StringProperty(name="Hidden In", description="View layer in which objects are isolated")
 
 
@@ -92,7 +92,7 @@ CLASSES = (R5DGS_PG_text, R5DGS_PG_match, R5DGS_PG_words_session, R5DGS_PG_hidde
 
 
 def register():
-    """Register the groups and hang them on scenes and the window manager."""
+    """Register the property groups on scenes and the window manager."""
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.r5dgs_words = PointerProperty(type=R5DGS_PG_words)
@@ -100,7 +100,7 @@ def register():
 
 
 def unregister():
-    """Undo `register`, and drop what was read from scene files and said by the encoder."""
+    """Undo `register` and clear the caches."""
     prompt.forget()
     phrase_embeddings.forget()
     del bpy.types.WindowManager.r5dgs_words

@@ -1,1 +1,1 @@
-"""Motion of loaded objects: F-curves, editable physics, extrapolation and the exact mode."""
+"""Motion of loaded objects: F-curves, editable physics, extrapolation and Exact Mode."""

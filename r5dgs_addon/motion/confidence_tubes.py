@@ -1,7 +1,7 @@
-"""How sure the extrapolated paths are: a tube around each, as thick as one standard deviation of the object's place.
+"""Confidence tubes around extrapolated paths, with the position's standard deviation as radius.
 
-The tube is a mesh with the anchor's parent, marked as a helper: not rendered, not selectable, coloured from sure to
-unsure against the object's own size. It says what the learned motion leaves open; edited rates count as certain.
+The tube is a mesh with the anchor's parent. It is not rendered and not selectable. Its colour shows the uncertainty
+relative to the object's size. Only the uncertainty of the learned motion is shown; edited rates count as certain.
 """
 
 import bpy
@@ -13,30 +13,30 @@ from .. import compat
 from ..scene import timeline
 from . import fcurves, physics
 
-_MOST_STEPS = 1 << 16  # of integration to the end of a path: its uncertainty takes hundreds of such integrations
-STEPS = 32  # rings past t_max
+_MOST_STEPS = 1 << 16  # maximum integration steps of a path, because its uncertainty takes hundreds of integrations
+STEPS = 32  # number of rings past t_max
 SIDES = 12
-THINNEST = 0.004  # of the object's reach: what is certain is still to be seen
+THINNEST = 0.004  # minimum radius as a fraction of the object's reach, so that certain paths stay visible
 COLOR = "confidence"
-SURE, UNSURE = (0.05, 0.6, 0.3), (0.9, 0.15, 0.05)  # linear
-LOST = 0.5  # of the object's reach: a standard deviation from which on the colour is that of the unsure
+SURE, UNSURE = (0.05, 0.6, 0.3), (0.9, 0.15, 0.05)  # linear RGB
+LOST = 0.5  # standard deviation of the most uncertain colour, as a fraction of the object's reach
 
 
 def helper_of(anchor: bpy.types.Object) -> bpy.types.Object | None:
-    """The tube of an anchor, or None."""
+    """Tube of an anchor, or None."""
     return anchor.r5dgs_motion.tube
 
 
 def moves(anchor: bpy.types.Object, times: timeline.Times) -> bool:
-    """Whether an anchor has a path past t_max."""
+    """True if an anchor moves past t_max."""
     return times.t_end > times.t_max and not physics.model(physics.mover(anchor)).is_static
 
 
 def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | None:
-    """Make or renew the tube of an anchor; removes it where nothing is extrapolated or nothing moves.
+    """Create or update the tube of an anchor, or remove it if the anchor does not move past t_max.
 
     Raises:
-        ConfigError: The anchor's curves cannot be read.
+        ConfigError: The anchor's F-curves cannot be read, or the motion is too fast.
     """
     if not moves(anchor, times):
         hide(anchor)
@@ -59,18 +59,18 @@ def show(anchor: bpy.types.Object, times: timeline.Times) -> bpy.types.Object | 
     tube.matrix_parent_inverse = anchor.matrix_parent_inverse
     doubts = np.clip(sigmas / (LOST * reach), 0.0, 1.0)
     _fill(tube.data, centers, np.maximum(sigmas, THINNEST * reach), doubts)
-    tube.color = (*_color(doubts[-1:])[0], 1.0)  # of viewports that show objects by their own colour
+    tube.color = (*_color(doubts[-1:])[0], 1.0)  # for viewports with object colours
     return tube
 
 
 def refresh(anchor: bpy.types.Object, times: timeline.Times) -> None:
-    """Renew the tube of an anchor where it has one."""
+    """Update the tube of an anchor if it has one."""
     if helper_of(anchor) is not None:
         show(anchor, times)
 
 
 def hide(anchor: bpy.types.Object) -> bool:
-    """Remove the tube of an anchor. Returns whether it had one."""
+    """Remove the tube of an anchor. Returns True if it had one."""
     tube = helper_of(anchor)
     if tube is None:
         return False
@@ -84,10 +84,13 @@ def hide(anchor: bpy.types.Object) -> bool:
 
 
 def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, np.ndarray]:
-    """Places of an anchor past t_max under its motion, along the axes of its parent, and their standard deviations.
+    """Positions of an anchor past t_max in its parent's axes, and their standard deviations.
 
     Returns:
-        Centres [H, 3] and standard deviations [H], from t_max to the end.
+        Positions [H, 3] and standard deviations [H], from t_max to the end.
+
+    Raises:
+        ConfigError: The motion is too fast to integrate, or the F-curves cannot be read.
     """
     tau = np.linspace(0.0, times.t_end - times.t_max, STEPS + 1)
     start, _ = fcurves.pose_at(anchor, fcurves.place(anchor), times.frame(times.t_max))
@@ -104,7 +107,7 @@ def path(anchor: bpy.types.Object, times: timeline.Times) -> tuple[np.ndarray, n
 
 
 def _fill(mesh: bpy.types.Mesh, centers: np.ndarray, radii: np.ndarray, doubts: np.ndarray) -> None:
-    """Write a tube of rings to a mesh: centres [H, 3], radii [H], doubts from 0 (sure) to 1 (unsure) [H]."""
+    """Write a tube to a mesh: centres [H, 3], radii [H], uncertainty from 0 to 1 [H]."""
     count = len(centers)
     rings = _rings(centers)
     points = centers[:, None] + radii[:, None, None] * rings
@@ -121,12 +124,12 @@ def _fill(mesh: bpy.types.Mesh, centers: np.ndarray, radii: np.ndarray, doubts: 
 
 
 def _color(doubts: np.ndarray) -> np.ndarray:
-    """[H] -> [H, 3] linear"""
+    """Colour of an uncertainty in [0, 1]. [H] -> [H, 3] linear"""
     return (1 - doubts[:, None]) * np.array(SURE) + doubts[:, None] * np.array(UNSURE)
 
 
 def _rings(centers: np.ndarray) -> np.ndarray:
-    """Unit circles across a path, carried along it without twist. [H, 3] -> [H, SIDES, 3]"""
+    """Unit circles perpendicular to a path, transported along it without twist. [H, 3] -> [H, SIDES, 3]"""
     along = np.gradient(centers, axis=0)
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     along = np.where(length > 1e-12, along / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
@@ -135,7 +138,7 @@ def _rings(centers: np.ndarray) -> np.ndarray:
     rings = np.empty((len(centers), SIDES, 3))
     for k, axis in enumerate(along):
         across = side - (side @ axis) * axis
-        if np.linalg.norm(across) < 1e-6:  # the path turned into the last side
+        if np.linalg.norm(across) < 1e-6:  # the path turned parallel to the last side vector
             across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
         side = across / np.linalg.norm(across)
         rings[k] = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(axis, side)
@@ -143,7 +146,7 @@ def _rings(centers: np.ndarray) -> np.ndarray:
 
 
 def _material() -> bpy.types.Material:
-    """The material of all tubes: their colour, without light."""
+    """Unlit material shared by all tubes, created if missing."""
     name = "R5DGS confidence"
     found = bpy.data.materials.get(name)
     if found is not None:

@@ -1,4 +1,4 @@
-"""Whole objects with their motion: which anchors are meant, duplicates and removal."""
+"""Duplication and deletion of whole objects with their motion, and lookup of the selected anchors."""
 
 from collections.abc import Iterable
 
@@ -11,17 +11,18 @@ from . import confidence_tubes, extrapolate, fcurves, physics
 
 
 def anchor_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The anchor that an object is, or hangs from."""
+    """Anchor that an object is or is parented to, or None."""
     while obj is not None and obj.r5dgs.role != "ANCHOR":
         obj = obj.parent
     return obj
 
 
 def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Anchors of the selected objects, each once, in the order of the scene; the active one's where none is selected.
+    """Anchors of the selected objects in scene order, without duplicates; of the active object if none is selected.
 
-    A cloud that moves with another object than its own does not stand for that one: a prompt selects such clouds, and
-    who deletes 'background' keeps the mug that some of it moves with. Anchors that remember no motion are left out.
+    A point cloud that moves with another object does not select that object's anchor: deleting 'background' must keep
+    the
+    mug that some background Gaussians move with. Anchors without a learned motion are excluded.
     """
     selected = context.selected_objects or [context.view_layer.objects.active]
     found = {anchor: None for obj in selected if (anchor := anchor_of(obj)) is not None and not _strays(obj, anchor)}
@@ -29,40 +30,40 @@ def chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _strays(obj: bpy.types.Object, anchor: bpy.types.Object) -> bool:
-    """Whether an object is a cloud that hangs from the anchor of another object than its own."""
+    """True if an object is a point cloud whose anchor belongs to another object."""
     return obj.r5dgs.role == "CLOUD" and obj.r5dgs.object_id != anchor.r5dgs.object_id
 
 
 def active_anchor(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The anchor of the active object, where it remembers a motion."""
+    """Anchor of the active object, or None if it has no learned motion."""
     anchor = anchor_of(context.view_layer.objects.active)
     return anchor if anchor is not None and physics.has_motion(anchor) else None
 
 
 def clouds_of(anchor: bpy.types.Object) -> list[bpy.types.Object]:
-    """The clouds that an anchor carries."""
+    """Point clouds parented to an anchor."""
     return [child for child in anchor.children if child.r5dgs.role == "CLOUD"]
 
 
 def duplicate(
     context: bpy.types.Context, anchors: list[bpy.types.Object], offset: tuple[float, float, float], shadows: bool
 ) -> list[bpy.types.Object]:
-    """Copy anchors with their clouds, motion and, if wanted, shadows; each object in a collection of its own.
+    """Copy anchors with their point clouds, motion and, optionally, shadows, each object into a collection of its own.
 
-    The copies share the points of the originals and have actions of their own. Their offset is a delta transform, so
-    that keys do not bring them back.
+    The copies share the points of the originals and have their own actions. Their offset is a delta transform, which
+    keyframes do not overwrite.
 
     Args:
-        context: Its view layer selects the copies.
+        context: Context whose view layer selects the copies.
         anchors: Anchors of loaded scenes.
-        offset: How far the copies stand off, along the axes of the anchors' parents.
-        shadows: Whether to copy the anchors that follow these, too.
+        offset: Offset of the copies in the axes of the anchors' parents.
+        shadows: True to copy the anchors that follow these, too.
 
     Returns:
-        The new anchors, in the order of ``anchors``, those of the shadows after them.
+        The new anchors in the order of ``anchors``, followed by those of the shadows.
 
     Raises:
-        ConfigError: One of them belongs to another .blend file.
+        ConfigError: An anchor belongs to another .blend file.
     """
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
@@ -99,7 +100,7 @@ def duplicate(
 
 
 def _copy_actions(obj: bpy.types.Object) -> None:
-    """Give an object copies of the actions that it plays."""
+    """Copy all actions of an object, so that it shares none."""
     animation = obj.animation_data
     if animation is None:
         return
@@ -114,20 +115,20 @@ def _copy_actions(obj: bpy.types.Object) -> None:
 
 
 def delete(context: bpy.types.Context, anchors: list[bpy.types.Object], shadows: bool) -> tuple[int, list[str]]:
-    """Remove anchors with their clouds, actions, helpers and, if wanted, shadows; emptied collections go, too.
+    """Remove anchors with their point clouds, actions, helpers and, optionally, shadows. Empty collections are removed.
 
-    What else hangs from an anchor stays in its place, without parent. Points that no other object shows are removed.
+    Other children of an anchor are unparented and keep their world transform. Unused points are removed.
 
     Args:
-        context: Its view layer is updated.
+        context: Context whose view layer is updated.
         anchors: Anchors of loaded scenes.
-        shadows: Whether to remove the anchors that follow these, too.
+        shadows: True to remove the anchors that follow these, too.
 
     Returns:
-        Number of objects that were removed, and the names of the anchors.
+        Number of removed objects, and the names of the anchors.
 
     Raises:
-        ConfigError: One of them belongs to another .blend file; nothing was removed.
+        ConfigError: An anchor belongs to another .blend file; nothing was removed.
     """
     everyone = [*anchors, *(extrapolate.followers(anchors) if shadows else ())]
     for anchor in everyone:
@@ -162,7 +163,7 @@ def _actions(obj: bpy.types.Object) -> Iterable[bpy.types.Action]:
 
 
 def by_scene(anchors: Iterable[bpy.types.Object]) -> dict[bpy.types.Collection, list[bpy.types.Object]]:
-    """Anchors by the loaded scene that they belong to."""
+    """Group anchors by the loaded scene that they belong to."""
     found: dict[bpy.types.Collection, list[bpy.types.Object]] = {}
     for anchor in anchors:
         collection = extrapolate.scene_of(anchor)
@@ -172,7 +173,7 @@ def by_scene(anchors: Iterable[bpy.types.Object]) -> dict[bpy.types.Collection, 
 
 
 def poll_chosen(cls: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """Whether an operator has objects to act on, for its ``poll``."""
+    """``poll`` of operators that act on the selected objects."""
     if context.mode != "OBJECT":
         cls.poll_message_set("Switch to Object Mode first")
         return False

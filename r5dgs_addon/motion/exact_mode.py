@@ -1,8 +1,8 @@
-"""The exact mode: what bends while observed is played, point by point, by a handler on frame changes.
+"""Exact Mode: per-Gaussian residual motion, applied to the points by a frame change handler.
 
-Anchors move groups as a whole; residuals of the scene file say how single Gaussians leave that motion. Switched on, a
-collection's clouds keep their bind state in attributes of their own, and each frame change writes their points anew.
-Edits of points are taken over into the bind state. Nothing listens to frame changes while no scene has it on.
+Anchors move groups rigidly. Residuals of the scene file describe how single Gaussians deviate from that motion. With
+Exact Mode on, the point clouds of a scene keep their bind state in additional attributes, and each frame change writes
+the points. Edits of points are transferred to the bind state. Handlers are installed only while a scene uses the mode.
 """
 
 import logging
@@ -30,18 +30,18 @@ PARTS = (
     ("scale", "FLOAT_VECTOR", "vector", 3),
 )
 
-_WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints of what was written, and its time
+_WRITTEN = "r5dgs_exact_written"  # custom property of point clouds: fingerprints and time of the written attributes
 
 _log = logging.getLogger(__name__)
-_told: set[str] = set()  # errors that were logged
+_told: set[str] = set()  # errors already logged
 
 
 class R5DGS_PG_exact(bpy.types.PropertyGroup):
-    """Whether a loaded scene plays what bends."""
+    """Exact Mode state of a loaded scene."""
 
-    enabled: BoolProperty(name="Exact", description="Whether points that bend while observed are played", options=set())
-    locked: BoolProperty(name="Lock", description="Whether Lock Interface was on before", options={"HIDDEN"})
-    problem: StringProperty(name="Problem", description="Why nothing bends although it should", options={"HIDDEN"})
+    enabled: BoolProperty(name="Exact", description="Play the residual motion of single Gaussians", options=set())
+    locked: BoolProperty(name="Lock", description="State of Lock Interface before Exact Mode", options={"HIDDEN"})
+    problem: StringProperty(name="Problem", description="Error that prevents the residual motion", options={"HIDDEN"})
 
 
 @dataclass(frozen=True)
@@ -57,20 +57,20 @@ def _read_file(path: Path) -> _File:
     return _File(residuals.Residuals(scene), scene.means)
 
 
-# In quotes: `typing` would keep the class, and with it this module, until after Blender has ended, which crashes then.
+# Quoted: `typing` would keep the class, and thus this module, alive until after Blender's exit, which crashes.
 _files: "file_cache.Remembered[_File]" = file_cache.Remembered(_read_file)
-_turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # by session_uid, see `_turn_of`
+_turns: dict[int, tuple[str, tuple[np.ndarray, np.ndarray] | None]] = {}  # cache by session_uid, see `_turn_of`
 
 
 def residuals_of(collection: bpy.types.Collection, again: bool = False) -> Residuals:
-    """Return the residuals of a loaded scene; its file is read once for each state of it.
+    """Return the residuals of a loaded scene. The file is read once per version.
 
     Args:
-        collection: The scene.
-        again: Read a file anew that could not be read before.
+        collection: Loaded scene.
+        again: True to retry a file that could not be read before.
 
     Raises:
-        SceneFileError: The file is missing, may not be read (`trust`), cannot be read, or is of another scene.
+        SceneFileError: The file is missing, not trusted (`trust`), unreadable, or that of another scene.
     """
     return _file_of(collection, again).bending
 
@@ -87,11 +87,11 @@ def _file_of(collection: bpy.types.Collection, again: bool = False) -> _File:
 
 
 def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> int:
-    """Play what bends, from now on. Returns how many Gaussians do.
+    """Enable Exact Mode. Returns the number of Gaussians with residual motion.
 
     Raises:
         SceneFileError: The file cannot be read.
-        ConfigError: Nothing in it bends, or its points lie in another .blend file.
+        ConfigError: The scene has no residual motion, or its points belong to another .blend file.
     """
     if collection.library is not None or any(c.data.library for c in loaded_scenes.members(collection, "CLOUD")):
         raise errors.ConfigError(f"{collection.name}: its points lie in another .blend file; append the scene instead")
@@ -109,7 +109,7 @@ def switch_on(context: bpy.types.Context, collection: bpy.types.Collection) -> i
 
 
 def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-    """Bring the points back to their bind state, and listen no more where no other scene needs it."""
+    """Disable Exact Mode: restore the bind state, and remove the handlers if no other scene uses them."""
     state = collection.r5dgs_exact
     for cloud in loaded_scenes.members(collection, "CLOUD"):
         _give_back(cloud.data)
@@ -120,7 +120,7 @@ def switch_off(context: bpy.types.Context, collection: bpy.types.Collection) -> 
 
 
 def apply(collection: bpy.types.Collection, frame: float) -> None:
-    """Write the points of a scene as they are at a frame, sub-frame included. Edits of points are kept.
+    """Write the points of a scene at a frame, sub-frame included. Edits of points are kept.
 
     Raises:
         SceneFileError: The scene's file cannot be read.
@@ -146,13 +146,13 @@ def apply(collection: bpy.types.Collection, frame: float) -> None:
 
 
 def _rows(cloud: bpy.types.PointCloud) -> np.ndarray:
-    """Row of the scene file that each point is; none if the attribute is missing. [n]"""
+    """Scene file row of each point, or an empty array if the attribute is missing. [n]"""
     named = point_clouds.attribute(cloud, point_clouds.ROW, "INT")
     return np.zeros(0, np.int32) if named is None else point_clouds.read(named, "value", 1, np.int32)[:, 0]
 
 
 def _bending_points(rows: np.ndarray, bending: Residuals) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a cloud that have residuals, and which residuals those are; deleted points have none. [n], [n]"""
+    """Indices of the points with residuals, and of those residuals. [n], [n]"""
     if len(bending.rows) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     part = np.minimum(np.searchsorted(bending.rows, rows), len(bending.rows) - 1)
@@ -169,7 +169,7 @@ def _bend(
     turn: tuple[np.ndarray, np.ndarray] | None,
     back: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Bend points as they are at a time, or bend them back. Returns new arrays."""
+    """Apply the residual motion at a time to points, or undo it. Returns new arrays."""
     values, found = {name: array.copy() for name, array in values.items()}, bending.at(t)
     if found is None:
         return values
@@ -188,16 +188,16 @@ def _bend(
 def _turn_of(
     cloud: bpy.types.PointCloud, means: np.ndarray, rows: np.ndarray, position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the map that residuals follow after *Apply Transform*, as `point_edits` does for pictures.
+    """Find the linear map that residuals follow after *Apply Transform*, as `point_edits` does for rendering.
 
     Args:
-        cloud: The points.
+        cloud: Point cloud.
         means: Centres in the scene file. [N, 3]
-        rows: Row of each point. [n]
+        rows: Scene file row of each point. [n]
         position: Centres in the bind state. [n, 3]
 
     Returns:
-        The linear map [3, 3] and the points that it moves [n] bool; None if nothing was transformed.
+        Linear map [3, 3] and mask of the transformed points [n], or None if nothing was transformed.
     """
     stored = point_clouds.fingerprints(cloud)
     now = point_clouds.fingerprint(position)
@@ -216,7 +216,7 @@ def _turn_of(
 
 
 def _is_edited(cloud: bpy.types.PointCloud) -> bool:
-    """Return True if points are no longer as `apply` wrote them."""
+    """Return True if points differ from those written by `apply`."""
     written = cloud.get(_WRITTEN)
     if written is None:
         return False
@@ -235,7 +235,7 @@ def _keep_edits(
     part: np.ndarray,
     bind: dict[str, np.ndarray],
 ) -> None:
-    """Take edits of the points since `apply` over into their bind state, ``bind``, which is changed."""
+    """Transfer edits of the points since `apply` to the bind state ``bind``, in place."""
     if not _is_edited(cloud):
         return
     turn, t = _turn_of(cloud, file.means, rows, bind["position"]), cloud[_WRITTEN]["t"]
@@ -243,7 +243,7 @@ def _keep_edits(
     now = {name: point_clouds.read(cloud.attributes[name], field, width) for name, _, field, width in PARTS}
     back = _bend(now, file.bending, t, points, part, turn, back=True)
     found = point_edits.affine_between(written["position"], now["position"])
-    if found is not None:  # the offsets follow the map, too
+    if found is not None:  # offsets of the map, too
         matrix, inside = found
         back["position"][inside] = bind["position"][inside] @ matrix[:3, :3].T + matrix[:3, 3]
     for name, _, field, _ in PARTS:
@@ -253,7 +253,7 @@ def _keep_edits(
 
 
 def _bind_state(cloud: bpy.types.PointCloud) -> dict[str, np.ndarray]:
-    """The bind state of a cloud's points, kept in attributes from the first call on: position, rotation, scale."""
+    """Bind state of a point cloud's points, stored in attributes on the first call: position, rotation, scale."""
     result = {}
     for name, kind, field, width in PARTS:
         values = np.empty(width * len(cloud.points), np.float32)
@@ -293,7 +293,7 @@ def _follow_frame(scene, *_):
 
 @persistent
 def _follow_edits(scene, depsgraph=None):
-    """Keep edits of points at once, as pictures show the bind state."""
+    """Transfer edits of points immediately, because rendering uses the bind state."""
     updated = set() if depsgraph is None else {one.id.original for one in depsgraph.updates if one.is_updated_geometry}
     if not updated:
         return
@@ -304,7 +304,7 @@ def _follow_edits(scene, depsgraph=None):
 
 
 def _try(collection: bpy.types.Collection, frame: float) -> None:
-    """`apply`; an error is shown in the sidebar and logged once, as a handler cannot report it."""
+    """Run `apply`. Errors are shown in the sidebar and logged once, because handlers cannot report them."""
     try:
         apply(collection, frame)
         problem = ""
@@ -318,20 +318,20 @@ def _try(collection: bpy.types.Collection, frame: float) -> None:
 
 
 def refresh() -> None:
-    """Bring the points of all scenes to the frame, once a file can be read that could not be before."""
+    """Update the points of all scenes, for example after a file became readable."""
     for collection in _exact_scenes():
         _try(collection, bpy.context.scene.frame_current_final)
 
 
 @persistent
 def _look_again(*_):
-    """After loading, undo and redo: listen where it is on, and bring the points to the frame."""
+    """Update handlers and points after loading, undo and redo."""
     listen()
     refresh()
 
 
 def listen() -> None:
-    """Listen to frame changes and edits exactly while some scene plays what bends."""
+    """Install the handlers if any scene uses Exact Mode, otherwise remove them."""
     playing = bool(_exact_scenes())
     for events, handler in _hooks():
         if playing and handler not in events:
@@ -346,7 +346,7 @@ def _hooks():
 
 
 def register():
-    """Register the group, and look for scenes that play what bends whenever a file or a state is loaded."""
+    """Register the property group, and the handlers that check for Exact Mode after loading and undo."""
     bpy.utils.register_class(R5DGS_PG_exact)
     bpy.types.Collection.r5dgs_exact = PointerProperty(type=R5DGS_PG_exact)
     for events in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):

@@ -1,7 +1,7 @@
-"""Write what anchors do past t_max anew, from the motion that their fields describe.
+"""Extrapolation: write the keys of anchors past t_max from the motion in their fields.
 
-The new motion starts from the pose that the curves have at t_max, wherever the user has brought it: it is continuous
-there, and a rotation acts on the turned object about its own place. Where nothing was edited it is the learned motion.
+The new motion starts from the pose of the F-curves at t_max, including the user's edits. It is continuous there, and a
+rotation turns the object about its own position. Without edits it is the learned motion.
 """
 
 from collections.abc import Iterable
@@ -21,19 +21,19 @@ from .. import compat
 from ..scene import loaded_scenes, timeline
 from . import confidence_tubes, fcurves, keyframes, physics
 
-MOST_STEPS = 1024  # of integration over as long as was observed: beyond are orbits about places far out of sight
+MOST_STEPS = 1024  # maximum integration steps per observed span; exceeded only by orbits about far-away points
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What will be written for one anchor: everything that can fail is done.
+    """Keys to be written for one anchor. All checks that can fail are done.
 
     Attributes:
-        anchor: The anchor.
-        place: Where its curves lie.
-        times: Its times, with the new end.
-        tails: Keys by path, over frames.
-        too_fast: True if the motion is too fast for keys, which then are exact only at frames.
+        anchor: Anchor.
+        place: Location of its F-curves.
+        times: Times of its scene, with the new end.
+        tails: Keys over frames by data path.
+        too_fast: True if the motion is too fast for keys, which are then exact only at frames.
     """
 
     anchor: bpy.types.Object
@@ -44,7 +44,7 @@ class Plan:
 
 
 def scene_of(anchor: bpy.types.Object) -> bpy.types.Collection | None:
-    """The loaded scene that an object belongs to."""
+    """Loaded scene that an object belongs to, or None."""
     for collection in loaded_scenes.scene_collections():
         if anchor.name in collection.all_objects and collection.all_objects[anchor.name] == anchor:
             return collection
@@ -52,7 +52,7 @@ def scene_of(anchor: bpy.types.Object) -> bpy.types.Collection | None:
 
 
 def followers(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
-    """Anchors that take the path of one of these and are none of them, such as shadows."""
+    """Anchors that follow one of the given anchors and are not among them, such as shadows."""
     leaders = set(anchors)
     return [
         obj
@@ -62,7 +62,7 @@ def followers(anchors: Iterable[bpy.types.Object]) -> list[bpy.types.Object]:
 
 
 def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) -> list[bpy.types.Object]:
-    """Write the keys past t_max of anchors, and of what follows them, from their motions.
+    """Write the keys past t_max of anchors and their followers from their motions.
 
     Args:
         anchors: Anchors of loaded scenes.
@@ -72,7 +72,7 @@ def re_extrapolate(anchors: list[bpy.types.Object], t_end: float | None = None) 
         The anchors that were written.
 
     Raises:
-        ConfigError: One of them cannot be; nothing was written.
+        ConfigError: An anchor cannot be written; nothing was changed.
     """
     everyone = [*anchors, *followers(anchors)]
     for plan in _plans(everyone, t_end):
@@ -113,10 +113,10 @@ def _apply(plan: Plan) -> None:
 
 
 def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.Times:
-    """The times of the scene that an anchor belongs to, with another end if one is given.
+    """Times of the scene that an anchor belongs to, optionally with another end.
 
     Raises:
-        ConfigError: It belongs to none, or is from before motions were remembered.
+        ConfigError: The anchor belongs to no scene, or was loaded by a version that did not store motions.
     """
     collection = scene_of(anchor)
     if collection is None or not physics.has_motion(anchor):
@@ -130,10 +130,10 @@ def times_of(anchor: bpy.types.Object, t_end: float | None = None) -> timeline.T
 def _sampler(
     anchor: bpy.types.Object, location: np.ndarray, quat: np.ndarray, times: timeline.Times, most: int
 ) -> reduction.Sampler:
-    """Poses past t_max that continue one at t_max: quaternions as long as that is, as keys may be.
+    """Sampler of the poses past t_max, continuing the pose at t_max. Quaternions keep its norm, as keys may have any.
 
     Raises:
-        ConfigError: The motion cannot be, or would take minutes to integrate.
+        ConfigError: The motion is invalid, or would take minutes to integrate.
     """
     follow, mover = physics.follow_matrix(anchor.r5dgs_motion), physics.mover(anchor)
     model = physics.model(mover)
@@ -165,21 +165,21 @@ def _sampler(
 def extrapolate_until(
     context: bpy.types.Context, collection: bpy.types.Collection, t_end: float, fit_timeline: bool
 ) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
-    """Extend or shorten the future of a loaded scene.
+    """Extend or shorten the extrapolation of a loaded scene.
 
-    Anchors whose keys past t_max were edited by hand are left alone.
+    Anchors whose keys past t_max were edited by hand are not changed.
 
     Args:
-        context: Its scene has the frame range.
-        collection: The loaded scene.
-        t_end: Last scene time; one before t_max counts as t_max.
-        fit_timeline: Whether the frame range follows.
+        context: Context whose scene has the frame range.
+        collection: Loaded scene.
+        t_end: Last scene time, clamped to t_max.
+        fit_timeline: True to update the end of the frame range.
 
     Returns:
-        The anchors that were written, and those that were left alone.
+        The anchors that were written, and those that were skipped.
 
     Raises:
-        ConfigError: The end is too far, or an anchor cannot be written; nothing was.
+        ConfigError: The end is too late, or an anchor cannot be written; nothing was changed.
     """
     times = timeline.of_collection(collection)
     timeline.check_end(collection.name, replace(times, t_end=t_end))
@@ -195,13 +195,13 @@ def extrapolate_until(
 
 
 def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
-    """Bring the fields of anchors back to the learned motion, and the keys past t_max with them.
+    """Reset the fields of anchors to the learned motion, and write their keys past t_max.
 
     Returns:
         The anchors that were written.
 
     Raises:
-        ConfigError: One of them cannot be; nothing was changed.
+        ConfigError: An anchor cannot be written; nothing was changed.
     """
     check(anchors)
     for anchor in anchors:
@@ -210,11 +210,11 @@ def reset(anchors: list[bpy.types.Object]) -> list[bpy.types.Object]:
 
 
 def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
-    """Refuse, with a ConfigError, to reset anchors that cannot be written, or that something follows which cannot.
+    """Raise a ConfigError if anchors cannot be reset, or if one of their followers cannot be written.
 
     Args:
-        anchors: The anchors.
-        curves: Whether they keep their curves up to t_max, which have to be such as can be cut there.
+        anchors: Anchors.
+        curves: True if they keep their curves up to t_max, which must then be possible to split there.
     """
     for anchor in [*anchors, *followers(anchors)]:
         times, place = times_of(anchor), fcurves.place(anchor)
@@ -226,14 +226,14 @@ def check(anchors: list[bpy.types.Object], curves: bool = True) -> None:
 
 
 def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
-    """The scene that anchors were made from, for `reload`.
+    """Read the scene that anchors were made from, for `reload`.
 
     Args:
         anchors: Anchors of one loaded scene.
         path: Its file.
 
     Raises:
-        R5dgsError: The file cannot be read or is of another scene, or an anchor cannot be written.
+        R5dgsError: The file cannot be read or is that of another scene, or an anchor cannot be written.
     """
     for anchor in anchors:
         if fcurves.place(anchor).strip is not None:
@@ -248,13 +248,13 @@ def source(anchors: list[bpy.types.Object], path: Path) -> Scene:
 
 
 def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
-    """Give anchors the curves of their scene file again, those of the observed time too, up to their scene's end.
+    """Restore the curves of anchors from their scene file, including the observed time, up to the scene's end.
 
-    Curves of location and rotation that the user made are replaced; others, such as of scale, stay.
+    The user's location and rotation curves are replaced. Other curves, such as scale, are kept.
 
     Args:
         anchors: Anchors of one loaded scene.
-        scene: What `source` gave for them.
+        scene: Result of `source` for them.
     """
     for anchor in anchors:
         times = times_of(anchor)
@@ -271,7 +271,7 @@ def reload(anchors: list[bpy.types.Object], scene: Scene) -> None:
 
 
 def clear(anchor: bpy.types.Object, place: fcurves.Place) -> None:
-    """Remove an anchor's curves of location and rotation."""
+    """Remove an anchor's location and rotation curves."""
     curves = place.curves()
     if not curves:
         return
@@ -281,7 +281,7 @@ def clear(anchor: bpy.types.Object, place: fcurves.Place) -> None:
 
 
 def register():
-    """Have a change of an anchor's fields re-extrapolate it."""
+    """Re-extrapolate an anchor when its fields change."""
     physics.call_on_change(re_extrapolate)
 
 

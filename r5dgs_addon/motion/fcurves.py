@@ -1,10 +1,9 @@
-"""The F-curves of an anchor as the user left them, and how to write anew what comes after a frame.
+"""Reading of an anchor's F-curves, including the user's edits, and replacement of the keys after a frame.
 
-Frames are those of the action. Where a strip of the NLA plays it at another time or pace, it does so for what is
-written, too.
+Frames are those of the action. If an NLA strip plays it at another time or speed, this applies to the new keys, too.
 
-A curve up to that frame stays as it is: keys, handles, easing. Where no key lies at it, the segment across it is cut
-there without changing its shape.
+Up to the given frame, a curve is unchanged: keys, handles, easing. If there is no key at the frame, the segment across
+it is split there without changing its shape.
 """
 
 import hashlib
@@ -20,19 +19,19 @@ from .. import compat
 from ..scene import timeline
 from . import keyframes
 
-AT = 1e-3  # frames: a key this near counts as one at the frame
+AT = 1e-3  # tolerance in frames for a key to count as being at a frame
 COMPONENTS = (("location", 3), ("rotation_quaternion", 4))
-_CUT = ("BEZIER", "LINEAR", "CONSTANT")  # what a segment can be that is cut
+_CUT = ("BEZIER", "LINEAR", "CONSTANT")  # interpolations of segments that can be split
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where the curves that move an anchor lie.
+    """Location of the F-curves that move an anchor.
 
     Attributes:
-        action: Their action, or None where there is none yet.
-        slot: Its slot, where actions have some.
-        strip: The strip of the NLA that plays it, or None for the active action.
+        action: Action with the curves, or None.
+        slot: Slot of the action, or None if actions have no slots.
+        strip: NLA strip that plays the action, or None for the active action.
     """
 
     action: bpy.types.Action | None
@@ -40,7 +39,7 @@ class Place:
     strip: bpy.types.NlaStrip | None = None
 
     def curves(self) -> dict[tuple[str, int], bpy.types.FCurve]:
-        """Its curves of location and rotation by path and component."""
+        """Location and rotation curves by data path and component."""
         if self.action is None:
             return {}
         paths = {path for path, _ in COMPONENTS}
@@ -49,10 +48,10 @@ class Place:
 
 
 def place(anchor: bpy.types.Object) -> Place:
-    """Where the curves lie that move an anchor now.
+    """Find the curves that currently move an anchor.
 
     Raises:
-        ConfigError: They cannot be written; the message says why and what to do.
+        ConfigError: The curves cannot be written; the message gives the reason and the remedy.
     """
     name = anchor.name
     check_local(anchor)
@@ -84,7 +83,7 @@ def place(anchor: bpy.types.Object) -> Place:
 
 
 def refusal(anchor: bpy.types.Object) -> str:
-    """Why `place` refuses an anchor, "" where it does not."""
+    """Message of the error that `place` raises for an anchor, or ""."""
     try:
         place(anchor)
     except errors.ConfigError as error:
@@ -93,18 +92,18 @@ def refusal(anchor: bpy.types.Object) -> str:
 
 
 def check_local(anchor: bpy.types.Object) -> None:
-    """Refuse, with a ConfigError, an anchor that belongs to another .blend file."""
+    """Raise a ConfigError if an anchor belongs to another .blend file."""
     if anchor.library is not None or anchor.override_library is not None:
         raise errors.ConfigError(f"{anchor.name}: comes from another .blend file; open that one, or append it here")
 
 
 def _moves(strip: bpy.types.NlaStrip) -> bool:
-    """Whether an NLA strip plays curves of an anchor's motion."""
+    """True if an NLA strip plays location or rotation curves."""
     return strip.type == "CLIP" and bool(Place(strip.action, compat.slot_of(strip)).curves())
 
 
 def pose_at(anchor: bpy.types.Object, where: Place, frame: float) -> tuple[np.ndarray, np.ndarray]:
-    """Location [3] and raw quaternion [4] that an anchor's keys give at a frame; F-curve modifiers left out."""
+    """Location [3] and unnormalised quaternion [4] of an anchor's keys at a frame, without F-curve modifiers."""
     curves = {name: curve for name, curve in where.curves().items() if len(curve.keyframe_points)}
     values = []
     for path, count in COMPONENTS:
@@ -145,7 +144,7 @@ class Points:
         return values.reshape(-1, 2)
 
     def last(self, frame: float) -> int:
-        """The last key at a frame or before it, -1 where there is none."""
+        """Index of the last key at or before a frame, or -1."""
         return int(np.searchsorted(self.co[:, 0], frame + AT, side="right")) - 1
 
     def at(self, k: int, frame: float) -> bool:
@@ -153,9 +152,9 @@ class Points:
 
 
 def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: float) -> np.ndarray:
-    """What the segment that starts with key k is up to a frame: one or two segments. [n, 4, 2]
+    """One or two segments that replace, up to a frame, the segment that starts with key k. [n, 4, 2]
 
-    After the last key, what the curve holds.
+    After the last key, a segment with the curve's extrapolation.
     """
     start = points.co[k].astype(np.float64)
     if k + 1 == points.count:
@@ -180,14 +179,15 @@ def _cut(name: str, curve: bpy.types.FCurve, points: Points, k: int, frame: floa
 
 
 def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: dict[str, Keys]) -> None:
-    """Write an anchor's curves anew after a frame; what they are up to it stays.
+    """Replace an anchor's keys after a frame; the curves are unchanged up to it.
 
     Args:
-        anchor: The anchor.
-        where: Where its curves lie, from `place`.
-        frame: The frame.
-        tails: By path, keys over frames; the first lies at ``frame`` and joins what is there. Paths that
-            are not named hold from ``frame`` on what they are there.
+        anchor: Anchor.
+        where: Location of its curves, from `place`.
+        frame: Frame after which keys are replaced.
+        tails: Keys over frames by data path; the first is at ``frame`` and continues the existing curve. Other paths
+            hold
+            their value from ``frame`` on.
     """
     curves = where.curves()
     for path, count in COMPONENTS:
@@ -210,7 +210,7 @@ def replace_after(anchor: bpy.types.Object, where: Place, frame: float, tails: d
 
 
 def _component(keys: Keys, index: int) -> Keys | None:
-    """One component of keys; None where it does not change."""
+    """One component of keys, or None if it is constant."""
     column = slice(index, index + 1)
     values = keys.values[:, column]
     if not keyframes.varies(values):
@@ -219,7 +219,7 @@ def _component(keys: Keys, index: int) -> Keys | None:
 
 
 def _start(curve: bpy.types.FCurve, frame: float, value: float) -> None:
-    """Give a new curve its first key."""
+    """Add the first key to a new curve."""
     curve.keyframe_points.add(1)
     _fill(curve, 0, np.array([[frame, value]]), np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1), np.ones(1), False)
     curve.update()
@@ -229,8 +229,8 @@ def _replace(anchor: bpy.types.Object, curve: bpy.types.FCurve, frame: float, ta
     before = Points(curve)
     keep = before.last(frame) + 1
     points = curve.keyframe_points
-    if keep == 0:  # the user took all keys before it; what is held there stays held
-        still = getattr(anchor, curve.data_path)[curve.array_index]  # of a curve without any
+    if keep == 0:  # the user removed all earlier keys; hold the value at the frame
+        still = getattr(anchor, curve.data_path)[curve.array_index]  # of a curve without keys
         value = float(before.co[0, 1]) if before.count else still
         _shorten(curve, 0)
         _start(curve, frame, value)
@@ -286,7 +286,7 @@ def _fill(
     after: np.ndarray,
     extrapolated: bool,
 ) -> None:
-    """Write the last keys of a curve from key ``start`` on: places [n, 2], slopes [n, 1], gaps on both sides [n]."""
+    """Overwrite the keys of a curve from ``start`` on: points [n, 2], slopes [n, 1], gaps on both sides [n]."""
     points = curve.keyframe_points
     reach_left = np.stack([before / 3, left_slopes[:, 0] * before / 3], axis=-1)
     reach_right = np.stack([after / 3, right_slopes[:, 0] * after / 3], axis=-1)
@@ -305,7 +305,7 @@ def _fill(
 
 
 def _restore(curve: bpy.types.FCurve, before: Points, keep: int) -> None:
-    """Put handles back that Blender moved by itself (automatic ones, as their neighbours changed)."""
+    """Restore handles that Blender recomputed (automatic handles with changed neighbours)."""
     after = Points(curve)
     for k in range(keep):
         last = k == keep - 1
@@ -315,7 +315,7 @@ def _restore(curve: bpy.types.FCurve, before: Points, keep: int) -> None:
 
 
 def _stretch(strip: bpy.types.NlaStrip) -> None:
-    """Let a strip of the NLA play its whole action."""
+    """Extend an NLA strip to its whole action."""
     last = max(
         (point.co[0] for curve in Place(strip.action, compat.slot_of(strip)).curves().values()
          for point in list(curve.keyframe_points)[-1:]),
@@ -327,7 +327,7 @@ def _stretch(strip: bpy.types.NlaStrip) -> None:
 
 
 def make_own(anchor: bpy.types.Object) -> None:
-    """Give an anchor an action of its own where others play the same one."""
+    """Give an anchor a copy of its action if other objects use the same one."""
     animation = anchor.animation_data
     action = animation.action if animation is not None else None
     if action is None or action.users - action.use_fake_user <= 1:
@@ -341,7 +341,7 @@ def make_own(anchor: bpy.types.Object) -> None:
 
 
 def digest(where: Place, frame: float) -> str:
-    """A digest of all keys after a frame, to notice that somebody edited them."""
+    """Digest of all keys after a frame, for detecting manual edits."""
     found = hashlib.sha1(usedforsecurity=False)
     for (path, index), curve in sorted(where.curves().items(), key=lambda item: item[0]):
         points = Points(curve)
@@ -354,6 +354,6 @@ def digest(where: Place, frame: float) -> str:
 
 
 def frames(keys: Keys, times: timeline.Times) -> Keys:
-    """Keys over scene time as keys over frames."""
+    """Convert keys over scene time to keys over frames."""
     per = times.frames_per_unit
     return Keys(times.frame(0.0) + per * keys.times, keys.values, keys.left_slopes / per, keys.right_slopes / per)

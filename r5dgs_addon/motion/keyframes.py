@@ -1,9 +1,9 @@
-"""The motion of a group as F-curves of its anchor.
+"""Conversion of a group's motion to F-curves of its anchor.
 
-In the observed time playback is a cubic between knots, which Bezier keys with handles at a third of the interval and
-the knots' slopes repeat exactly; fewer keys are taken where they do as well within the tolerance. Past t_max few keys
-are taken from the motion model under the same tolerance; they are of another key type, and at t_max there may be a
-kink. A motion too fast for that gets a key at every frame, and its anchor is marked.
+In the observed time, playback is a cubic between knots. Bezier keys with the knots' slopes and handles at a third of
+the interval reproduce it exactly; fewer keys are used if they stay within the tolerance. Past t_max, keys are fitted to
+the motion model within the same tolerance and have another key type. There may be a kink at t_max. A motion too fast
+for this gets a key at every frame, and its anchor is marked.
 """
 
 import math
@@ -20,11 +20,11 @@ from ...r5dgs_core.scene.scene import Scene
 from .. import compat
 from ..scene import timeline
 
-# Of the scene's size. Blender may differ from playback by 1e-5: its float32 evaluation takes a share too.
+# Fraction of the scene's extent. Blender may deviate from playback by 1e-5, including its float32 evaluation.
 TOLERANCE = 3e-6
-_PER_KNOT = 4  # intervals between possible keys: where even more are needed, the knots themselves are fewer
-NEAREST = 0.011  # frames between keys of a curve: Blender takes those that are nearer than 0.01 for one
-_INTERVALS = 1 << 17  # between possible keys of all objects together, so that no file blocks Blender for minutes
+_PER_KNOT = 4  # possible keys per knot; if more were needed, the knots themselves are fewer
+NEAREST = 0.011  # minimum distance of keys in frames; Blender merges keys closer than 0.01
+_INTERVALS = 1 << 17  # limit of key intervals of all objects, so that no file blocks Blender for minutes
 OBSERVED_KEY, EXTRAPOLATED_KEY = "KEYFRAME", "EXTREME"
 
 
@@ -36,15 +36,15 @@ def animate(
     tolerance: float,
     reach: float,
 ) -> None:
-    """Key an anchor with the motion of its group; a group that stays put gets no keys.
+    """Keyframe an anchor with the motion of its group; a static group gets no keys.
 
     Args:
-        anchor: Empty at the group's pivot, rotation mode quaternion; its action has no curves of location or rotation.
-        scene: The scene.
-        motion_id: The motion group.
+        anchor: Empty at the group's pivot in rotation mode Quaternion, without location or rotation curves.
+        scene: Source scene.
+        motion_id: Motion group.
         times: Scene times and their frames.
-        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
-        reach: Of the group, from `reaches`.
+        tolerance: Maximum error of reduced keys at the group's members, as a fraction of the scene's extent.
+        reach: Reach of the group, from `reaches`.
     """
     if motion_id == 0:
         return
@@ -67,14 +67,14 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
     """Keys of a motion group from the first knot to the end, over scene time.
 
     Args:
-        scene: The scene.
-        motion_id: The motion group.
-        times: Scene times and their frames; nothing is extrapolated if the end is not past t_max.
-        tolerance: Error of reduced keys at the group's members, fraction of the scene's size.
-        reach: Of the group, from `reaches`.
+        scene: Source scene.
+        motion_id: Motion group.
+        times: Scene times and their frames; nothing is extrapolated if the end is not after t_max.
+        tolerance: Maximum error of reduced keys at the group's members, as a fraction of the scene's extent.
+        reach: Reach of the group, from `reaches`.
 
     Returns:
-        Displacement of the pivot and rotation, with a key at t_max unless they never change.
+        Displacement of the pivot and rotation, with a key at t_max unless they are constant.
     """
     allowed = tolerance * scene.extent
     observed = _observed(scene, motion_id, allowed, reach)
@@ -86,22 +86,22 @@ def curves(scene: Scene, motion_id: int, times: timeline.Times, tolerance: float
 
 
 def share(objects: int) -> int:
-    """Largest number of intervals between the keys of one of so many objects, for `few`."""
+    """Maximum number of key intervals per object for the given number of objects, for `few`."""
     return min(max(_INTERVALS // max(objects, 1), reduction.FEWEST_INTERVALS), reduction.MOST_INTERVALS)
 
 
 def few(
     sample: reduction.Sampler, start: float, times: timeline.Times, allowed: float, reach: float, most: int
 ) -> Curves:
-    """Keys from a scene time to the end.
+    """Reduced keys from a scene time to the end.
 
     Args:
         sample: Poses and slopes at scene times.
         start: First time.
         times: Scene times and their frames.
-        allowed: Error of reduced keys at the members, world units.
+        allowed: Maximum error of reduced keys at the members, world units.
         reach: Largest distance of a member from the pivot, world units.
-        most: Largest number of intervals between keys, from `share`.
+        most: Maximum number of intervals between keys, from `share`.
     """
     frames = reduction.FrameTimes(times.time(0.0), 1 / times.frames_per_unit)
     nearest = NEAREST / times.frames_per_unit
@@ -114,7 +114,7 @@ def reaches(scene: Scene) -> np.ndarray:
     for start, stop, g in row_runs.runs(scene.motion_ids):
         pivot = np.asarray(scene.groups[g].pivot, np.float64)
         squares = np.zeros(stop - start)
-        for axis in range(3):  # a column at a time: numpy is slow at rows of three
+        for axis in range(3):  # one column at a time, because numpy is slow for rows of three
             arms = scene.means[start:stop, axis] - pivot[axis]
             squares += arms * arms
         result[g] = max(result[g], math.sqrt(float(squares.max())))
@@ -122,7 +122,7 @@ def reaches(scene: Scene) -> np.ndarray:
 
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
-    """One key per knot, which is playback itself, or fewer keys where they hold the tolerance."""
+    """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
     times = np.asarray(scene.track_times, np.float64)
     own = slice(motion_id, motion_id + 1)
     quats, displacements = (values[0] for values in scene_player.knots(scene, own))
@@ -154,9 +154,10 @@ def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Cu
 
 
 def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
-    """Whether some knot could go: the cubic across it, from its left neighbour to its right one, holds the tolerance.
+    """True if some knot can be removed: the cubic between its neighbours stays within the tolerance.
 
-    Playback has a kink in its second derivative at each knot, so keys elsewhere do not help where no knot can go.
+    Playback has a kink in its second derivative at each knot. If no knot can be removed, other key positions do not
+    help.
     """
     for keys, reach in ((exact.location, 1.0), (exact.rotation, 2.0 * radius)):
         if len(keys.times) == 2 or not varies(keys.values):
@@ -168,7 +169,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
         worst = np.zeros(len(t0))
         for u in (0.2, 0.4, 0.6, 0.8):
             truth, _ = _cubic(keys, t0 + u * (t1 - t0))
-            # Quaternions that are e apart turn a point at radius r to places at most 2 r e apart, to first order.
+            # To first order, quaternions at distance e move a point at radius r by at most 2 r e.
             worst = np.maximum(worst, reach * np.linalg.norm(reduction.hermite(v0, v1, m0, m1, h, u) - truth, axis=-1))
         if (worst <= allowed).mean() > 0.05:
             return True
@@ -176,7 +177,7 @@ def _worth_reducing(exact: Curves, allowed: float, radius: float) -> bool:
 
 
 def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
-    """Motion past t_max: the group's own model, or what it follows as `scene_player.group_poses` does."""
+    """Sampler past t_max: the group's own model, or the leader's as in `scene_player.group_poses`."""
     group = scene.groups[motion_id]
     if group.follows is None or group.follow_matrix is None:
         return reduction.model_sampler(group.model, scene.t_max, most)
@@ -192,7 +193,7 @@ def _future(scene: Scene, motion_id: int, most: int) -> reduction.Sampler:
 
 
 def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values and slopes of the cubic between keys, at times within them. [S] -> [S, C], [S, C]"""
+    """Values and slopes of the cubic between keys, at times within their range. [S] -> [S, C], [S, C]"""
     k = np.clip(np.searchsorted(keys.times, at, side="right") - 1, 0, len(keys.times) - 2)
     h = (keys.times[k + 1] - keys.times[k])[:, None]
     u = (at - keys.times[k])[:, None] / h
@@ -202,12 +203,12 @@ def _cubic(keys: Keys, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
-    """Write a curve as F-curves with Bezier keys and free handles; a component that never changes gets one key.
+    """Write a curve as F-curves with Bezier keys and free handles. A constant component gets one key.
 
     Args:
-        fcurves: Where they go; the keys of those of this path are replaced.
+        fcurves: Target collection; existing keys of this data path are replaced.
         data_path: "location" or "rotation_quaternion".
-        curve: The keys.
+        curve: Keys over scene time.
         times: Scene times and their frames.
     """
     bezier = compat.keyframe_enum("interpolation", "BEZIER")
@@ -241,5 +242,5 @@ def write(fcurves, data_path: str, curve: Keys, times: timeline.Times) -> None:
 
 
 def varies(values: np.ndarray) -> bool:
-    """Whether a curve changes. [K, C]"""
+    """True if a curve is not constant. [K, C]"""
     return bool((values != values[:1]).any())

@@ -1,8 +1,8 @@
-"""How an anchor moves past t_max as numbers that a person can edit, and what was learned, kept in the .blend whole.
+"""Editable motion parameters of an anchor past t_max, and the learned motion stored in the .blend.
 
-Rates are stored per unit of scene time, as the core has them, and shown per second of Blender's time. Fields that were
-not touched keep the precision of the file: a rate counts as edited where it differs from the learned one in float32.
-Vectors are along the axes of the anchor's parent, those of its location.
+Rates are stored per unit of scene time, as in the core, and shown per second of Blender's time. Unedited fields keep
+the precision of the file: a rate counts as edited if it differs from the learned one in float32. Vectors are in the
+axes of the anchor's parent, like its location.
 """
 
 import contextlib
@@ -25,19 +25,19 @@ from ..ui import plural
 from . import fcurves
 
 KINDS = (
-    ("static", "Still", "Stays where it is"),
-    ("translation", "Slide", "Moves without turning; with a swing, to and fro as on a spring"),
+    ("static", "Still", "Does not move"),
+    ("translation", "Slide", "Moves without turning; with swings, it oscillates like a mass on a spring"),
     (
         "ballistic_spin",
         "Throw and Spin",
-        "Its center flies and it spins about that; a hinge or a pendulum where the center lies on the axis and rests",
+        "Spins about a center that flies; a hinge or a pendulum if the center is fixed",
     ),
-    ("constant_twist", "Screw", "Turns steadily and moves along with its own axes"),
-    ("world_twist", "Orbit", "Turns about a place in the world, with steadily changing rates"),
-    ("free_top", "Tumble", "Flies and spins freely, as a body of its shape does that nothing touches"),
+    ("constant_twist", "Screw", "Turns at a constant rate and moves along its own axes"),
+    ("world_twist", "Orbit", "Turns about a point in the world, with constant acceleration"),
+    ("free_top", "Tumble", "Flies and spins freely, like a rigid body of its shape without contact"),
 )
 RATES = ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset")
-FIELDS = {  # beside the point and the axis that it turns about, `pivot`
+FIELDS = {  # shown fields of each kind, in addition to `pivot`
     "static": (),
     "translation": ("velocity", "acceleration", "frequency"),
     "ballistic_spin": RATES[:4] + ("frequency",),
@@ -46,31 +46,31 @@ FIELDS = {  # beside the point and the axis that it turns about, `pivot`
     "free_top": ("velocity", "acceleration", "angular_velocity"),
 }
 _POWERS = {"velocity": 1, "acceleration": 2, "angular_velocity": 1, "angular_acceleration": 2, "frequency": 1}
-_re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by the service above this module
-_LEAST_MOMENT = 1e-3  # of the largest moment of inertia: what a flat or thin body is given
+_re_extrapolate: Callable[[list[bpy.types.Object]], object] | None = None  # set by `extrapolate`
+_LEAST_MOMENT = 1e-3  # minimum moment of inertia of flat or thin bodies, as a fraction of the largest
 
 
 def units_per_second(state: bpy.types.PropertyGroup) -> float:
-    """Units of scene time that pass in a second of Blender's time."""
+    """Units of scene time per second of Blender's time."""
     render = bpy.context.scene.render
     return render.fps / render.fps_base / state.frames_per_unit
 
 
 def write_at_once(state: bpy.types.PropertyGroup, _) -> None:
-    """Re-extrapolate an anchor whose fields have changed if its user wants that: their ``update``."""
+    """Update callback of the fields: re-extrapolate the anchor if *Write at Once* is on."""
     if state.at_once and _re_extrapolate is not None:
-        with contextlib.suppress(errors.R5dgsError):  # the panel says why
+        with contextlib.suppress(errors.R5dgsError):  # shown in the panel
             _re_extrapolate([state.id_data])
 
 
 def call_on_change(re_extrapolate: Callable[[list[bpy.types.Object]], object] | None) -> None:
-    """Set the function that `write_at_once` calls with the anchor, None for no function."""
+    """Set the function that `write_at_once` calls with a list of anchors, or None."""
     global _re_extrapolate
     _re_extrapolate = re_extrapolate
 
 
 def _vector(name: str):
-    """Getter and setter of a vector in Blender's units."""
+    """Property options with getter and setter of a vector in Blender's units."""
     power = _POWERS.get(name, 0)
 
     def read(state):
@@ -97,23 +97,31 @@ def _stored(**options):
 
 
 class R5DGS_PG_motion(bpy.types.PropertyGroup):
-    """The motion of an anchor past the last observed time."""
+    """Motion of an anchor past the last observed time."""
 
-    learned: StringProperty(name="Learned Motion", description="The motion of the scene file, as JSON", options=set())
-    taken: StringProperty(name="Taken Motion", description="That of the object it was taken from", options={"HIDDEN"})
-    written: StringProperty(name="Written Keys", description="Digest of the keys written last", options={"HIDDEN"})
+    learned: StringProperty(
+        name="Learned Motion", description="Motion stored in the scene file, as JSON", options=set()
+    )
+    taken: StringProperty(
+        name="Taken Motion", description="Motion taken from another object, as JSON", options={"HIDDEN"}
+    )
+    written: StringProperty(name="Written Keys", description="Digest of the last written keys", options={"HIDDEN"})
     frames_per_unit: FloatProperty(name="Frames per Unit", default=60.0, options={"HIDDEN"})
-    written_motion: StringProperty(name="Written Motion", description="Digest of its motion", options={"HIDDEN"})
+    written_motion: StringProperty(
+        name="Written Motion", description="Digest of the motion of the last written keys", options={"HIDDEN"}
+    )
     too_fast: BoolProperty(
         name="Too Fast for Keys",
         description="The motion turns or swings too fast for keys, which are exact only at frames",
         options={"HIDDEN"},
     )
-    at_once: BoolProperty(
-        name="Write at Once", description="Re-extrapolate whenever a number is changed here", options=set()
-    )
+    at_once: BoolProperty(name="Write at Once", description="Re-extrapolate whenever a value changes", options=set())
     kind: EnumProperty(
-        name="Motion", description="How the object moves on", items=KINDS, update=write_at_once, options=set()
+        name="Motion",
+        description="Type of motion past the last observed time",
+        items=KINDS,
+        update=write_at_once,
+        options=set(),
     )
     stored_velocity: _stored()
     stored_acceleration: _stored()
@@ -121,7 +129,7 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     stored_angular_acceleration: _stored()
     stored_center_offset: _stored()
     stored_frequency: FloatProperty(options={"HIDDEN"})
-    stored_pivot: _stored()  # point chosen on an axis, seen from the anchor
+    stored_pivot: _stored()  # point chosen on an axis, relative to the anchor
     velocity: FloatVectorProperty(
         name="Velocity",
         description="Velocity at the last observed time, per second, along the axes of the parent",
@@ -130,34 +138,34 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     )
     acceleration: FloatVectorProperty(
         name="Acceleration",
-        description="How the velocity changes, per second and second",
+        description="Change of the velocity, per second squared",
         subtype="ACCELERATION",
         **_vector("acceleration"),
     )
     angular_velocity: FloatVectorProperty(
         name="Spin /s",
-        description="Rotation vector per second: the axis, as long as the angle",
+        description="Rotation vector per second: its direction is the axis, its length the angle",
         subtype="EULER",
         unit="ROTATION",
         **_vector("angular_velocity"),
     )
     angular_acceleration: FloatVectorProperty(
         name="Spin /s²",
-        description="How the spin changes, per second and second",
+        description="Change of the spin, per second squared",
         subtype="EULER",
         unit="ROTATION",
         **_vector("angular_acceleration"),
     )
     center_offset: FloatVectorProperty(
         name="Center",
-        description="The point that flies or rests while the object spins about it, seen from the anchor",
+        description="Point that the object spins about, relative to the anchor",
         subtype="TRANSLATION",
         unit="LENGTH",
         **_vector("center_offset"),
     )
     frequency: FloatProperty(
         name="Swings /s",
-        description="How often a second the motion swings to and fro; 0 moves steadily",
+        description="Oscillations per second; 0 for none",
         get=_read_swing,
         set=_write_swing,
         update=write_at_once,
@@ -165,12 +173,15 @@ class R5DGS_PG_motion(bpy.types.PropertyGroup):
     )
     learned_leader: PointerProperty(type=bpy.types.Object, options={"HIDDEN"})
     tube: PointerProperty(
-        name="Confidence", description="Helper that shows how sure the path is", type=bpy.types.Object, options=set()
+        name="Confidence",
+        description="Helper that shows the uncertainty of the path",
+        type=bpy.types.Object,
+        options=set(),
     )
     leader: PointerProperty(
         name="Follows",
-        description="The anchor whose path this one takes after the last observed time, as a shadow does; "
-        "none to move by numbers of its own",
+        description="Anchor whose path this one follows past the last observed time, like a shadow; "
+        "empty for a motion of its own",
         type=bpy.types.Object,
         poll=lambda state, obj: obj.r5dgs.role == "ANCHOR" and obj != state.id_data,
         options=set(),
@@ -184,14 +195,14 @@ def remember(
     tolerance: float,
     reaches: np.ndarray,
 ) -> None:
-    """Keep the learned motions of a scene on its anchors, so that editing them needs no scene file.
+    """Store the learned motions of a scene on its anchors, so that editing does not need the scene file.
 
     Args:
-        anchors: Anchors by object id and motion id; the object id is 0 unless the motion id is.
-        scene: The scene.
-        times: Its times.
-        tolerance: Error of the keys, fraction of the scene's size.
-        reaches: Of its motion groups, from `keyframes.reaches`. [G]
+        anchors: Anchors by object id and motion id; the object id is 0 unless the motion id is 0.
+        scene: Source scene.
+        times: Times of the scene.
+        tolerance: Maximum error of the keys, as a fraction of the scene's extent.
+        reaches: Reach of the motion groups, from `keyframes.reaches`. [G]
     """
     extent = scene.extent
     for (_, motion_id), anchor in anchors.items():
@@ -213,14 +224,14 @@ def remember(
 
 
 def sign(anchor: bpy.types.Object, times: timeline.Times) -> None:
-    """Remember what the keys past t_max are and what motion they have, for `hand_edited` and `is_written`."""
+    """Store digests of the keys past t_max and of their motion, for `hand_edited` and `is_written`."""
     place = fcurves.place(anchor)
     anchor.r5dgs_motion.written = fcurves.digest(place, times.frame(times.t_max))
     anchor.r5dgs_motion.written_motion = _digest(anchor)
 
 
 def is_written(anchor: bpy.types.Object) -> bool:
-    """Whether the keys past t_max were written from the motion that the fields describe now."""
+    """True if the keys past t_max match the motion in the fields."""
     return anchor.r5dgs_motion.written_motion == _digest(anchor)
 
 
@@ -233,17 +244,17 @@ def _digest(anchor: bpy.types.Object) -> str:
 
 
 def hand_edited(anchor: bpy.types.Object, times: timeline.Times) -> bool:
-    """Whether the keys past t_max are others than those written last.
+    """True if the keys past t_max differ from the last written ones.
 
     Raises:
-        ConfigError: Its curves cannot be read.
+        ConfigError: The curves cannot be read.
     """
     place = fcurves.place(anchor)
     return fcurves.digest(place, times.frame(times.t_max)) != anchor.r5dgs_motion.written
 
 
 def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
-    """Warning that names the anchors whose motion keys cannot follow, or "" if there are none."""
+    """Warning that names the anchors whose motion is too fast for keys, or ""."""
     names = [anchor.name for anchor in anchors if anchor.r5dgs_motion.too_fast]
     if not names:
         return ""
@@ -254,7 +265,7 @@ def too_fast(anchors: Iterable[bpy.types.Object]) -> str:
 
 
 def has_motion(anchor: bpy.types.Object) -> bool:
-    """Whether an anchor remembers a learned motion."""
+    """True if an anchor has a learned motion."""
     return bool(anchor.r5dgs_motion.learned)
 
 
@@ -268,16 +279,16 @@ def show(state: bpy.types.PropertyGroup, model: MotionModel) -> None:
 
 
 def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -> None:
-    """Give an anchor the motion of another that follows nobody; what it learned itself stays remembered.
+    """Give an anchor the motion of another anchor without leader. Its own learned motion stays stored.
 
     Args:
-        source: The anchor that has the motion.
-        target: The anchor that gets it.
-        turn: How the target is turned against the source in its own frame, unit wxyz. [4]
+        source: Anchor with the motion.
+        target: Anchor that receives it.
+        turn: Rotation of the target relative to the source in its own frame, unit wxyz. [4]
     """
     giver, taker = source.r5dgs_motion, target.r5dgs_motion
     base = basis(giver)
-    if base.inertia is not None:  # that of the source in the world, seen from the target
+    if base.inertia is not None:  # inertia of the source in the world, in the target's frame
         back = rotations.quats_to_rotmats(rotations.conjugate(turn))
         base = replace(base, inertia=back @ base.inertia @ back.T)
     taker.taken = json.dumps(base.to_dict())
@@ -287,7 +298,7 @@ def take(source: bpy.types.Object, target: bpy.types.Object, turn: np.ndarray) -
 
 
 def reset(anchor: bpy.types.Object) -> None:
-    """Bring the fields of an anchor back to the learned motion."""
+    """Reset the fields of an anchor to the learned motion."""
     state = anchor.r5dgs_motion
     state.taken = ""
     show(state, basis(state))
@@ -295,14 +306,14 @@ def reset(anchor: bpy.types.Object) -> None:
 
 
 def basis(state: bpy.types.PropertyGroup) -> MotionModel:
-    """What the fields were set to before anybody edited them: the motion of the scene file, or one that was taken."""
+    """Motion before edits of the fields: from the scene file, or taken from another object."""
     if state.taken:
         return MotionModel.from_dict(json.loads(state.taken))
     return MotionModel.from_dict(json.loads(state.learned)["model"]) if state.learned else models.STATIC
 
 
 def edited(state: bpy.types.PropertyGroup) -> set[str]:
-    """Fields of the motion that differ from its `basis`."""
+    """Names of the fields that differ from the `basis`."""
     model = basis(state)
     stored = {name: np.array(getattr(state, f"stored_{name}"), np.float32) for name in (*RATES, "frequency")}
     found = {name for name, value in stored.items() if (value != np.float32(getattr(model, name))).any()}
@@ -310,14 +321,13 @@ def edited(state: bpy.types.PropertyGroup) -> set[str]:
 
 
 def model(anchor: bpy.types.Object) -> MotionModel:
-    """The motion of an anchor as its fields have it now, relative to its pose at t_max.
+    """Current motion of an anchor from its fields, relative to its pose at t_max.
 
-    A learned motion blends from the last observed pose, which is noisy, onto the path that was fitted to all of them.
-    An edited one starts with exactly the rates that are shown. Edited rates count as certain: the covariance speaks of
-    the others.
+    A learned motion blends from the noisy last observed pose to the path fitted to all observations. An edited motion
+    starts exactly with the displayed rates. Edited rates count as certain; the covariance covers the others.
 
     Raises:
-        ConfigError: A field is no number that a motion can have.
+        ConfigError: A field has an invalid value.
     """
     state = anchor.r5dgs_motion
     base, changed = basis(state), edited(state)
@@ -335,7 +345,7 @@ def model(anchor: bpy.types.Object) -> MotionModel:
 
 
 def inertia(anchor: bpy.types.Object) -> np.ndarray:
-    """Inertia of the points that an anchor carries, about their centre, bind state; up to a factor. [3, 3]"""
+    """Inertia of an anchor's points about their centre in the bind state, up to a factor. [3, 3]"""
     points = _points(anchor)
     if len(points) == 0:
         return np.eye(3) / 3
@@ -350,13 +360,13 @@ def allow(anchor: bpy.types.Object, error: float) -> None:
 
 
 def size(anchor: bpy.types.Object) -> float:
-    """The size of what an anchor carries: twice the radius that its learned motion was weighed with, scene units."""
+    """Object size of an anchor: twice the radius used to weigh its learned motion, in scene units."""
     kept = json.loads(anchor.r5dgs_motion.learned)
     return 2.0 * (kept["model"]["radius"] if kept["reach"] else key_error(anchor)[1])
 
 
 def _points(anchor: bpy.types.Object) -> np.ndarray:
-    """Centres of the Gaussians that an anchor carries, bind state. [n, 3] float64"""
+    """Centres of an anchor's Gaussians in the bind state. [n, 3] float64"""
     parts = [np.zeros((0, 3))]
     for cloud in anchor.children:
         if cloud.r5dgs.role == "CLOUD" and cloud.type == "POINTCLOUD":
@@ -367,7 +377,7 @@ def _points(anchor: bpy.types.Object) -> np.ndarray:
 
 
 def key_error(anchor: bpy.types.Object) -> tuple[float, float]:
-    """Allowed error of an anchor's keys and the largest distance of its points from it, both in scene units."""
+    """Allowed error of an anchor's keys, and largest distance of its points from it, in scene units."""
     kept = json.loads(anchor.r5dgs_motion.learned)
     return kept["allowed"], kept["reach"] or _reach(anchor)
 
@@ -378,7 +388,7 @@ def _reach(anchor: bpy.types.Object) -> float:
 
 
 def follow_matrix(state: bpy.types.PropertyGroup) -> np.ndarray | None:
-    """Linear map from the leader's displacement to this anchor's, or None where it follows nobody. [3, 3]"""
+    """Linear map from the leader's displacement to this anchor's, or None without leader. [3, 3]"""
     if state.leader is None:
         return None
     matrix = json.loads(state.learned)["follow_matrix"]
@@ -386,12 +396,12 @@ def follow_matrix(state: bpy.types.PropertyGroup) -> np.ndarray | None:
 
 
 def mover(anchor: bpy.types.Object) -> bpy.types.Object:
-    """The anchor whose motion moves an anchor: the one that it follows, or itself."""
+    """Anchor whose motion applies: the leader, or the anchor itself."""
     return anchor.r5dgs_motion.leader or anchor
 
 
 def register():
-    """Register the group and hang it on objects."""
+    """Register the property group on objects."""
     bpy.utils.register_class(R5DGS_PG_motion)
     bpy.types.Object.r5dgs_motion = PointerProperty(type=R5DGS_PG_motion)
 

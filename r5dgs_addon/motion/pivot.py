@@ -1,8 +1,7 @@
-"""About which point and axis an anchor turns or swings past t_max, as fields to look at and to edit.
+"""Pivot and axis of an anchor's rotation or oscillation past t_max, as editable properties.
 
-They are another view of `Object.r5dgs_motion`, whose rates they change: nothing else knows of them. Both are along the
-axes of the anchor's parent, those of its location; the point is where the curves and the delta transform have it at
-t_max, and not an offset from the anchor.
+They are a view of the rates in `Object.r5dgs_motion`. Both are in the axes of the anchor's parent, like its location.
+The pivot is the position at t_max according to curves and delta transform, not an offset from the anchor.
 """
 
 import contextlib
@@ -17,30 +16,30 @@ from ...r5dgs_core.motion import rotation_centers
 from ...r5dgs_core.motion.models import MotionModel
 from . import extrapolate, fcurves, physics
 
-_ON_AXIS = 1e-4  # of a point's distance: rates are float32
+_ON_AXIS = 1e-4  # tolerance as a fraction of the point's distance, because rates are float32
 
 
 def point(anchor: bpy.types.Object) -> np.ndarray | None:
-    """The point about which an anchor turns or swings, or None where its motion has none. [3]
+    """Point that an anchor turns or swings about, or None if its motion has none. [3]
 
     Raises:
-        ConfigError: It is no anchor of a loaded scene, or its curves cannot be read.
+        ConfigError: The object is no anchor of a loaded scene, or its curves cannot be read.
     """
     found = _offset(anchor)
     return None if found is None else _place(anchor) + found
 
 
 def axis(anchor: bpy.types.Object) -> np.ndarray | None:
-    """Unit vector about which an anchor turns, or None where it does not turn. [3]"""
+    """Unit axis that an anchor turns about, or None if it does not turn. [3]"""
     model = _model(anchor)
     return None if model is None else rotation_centers.axis(model)
 
 
 def move(anchor: bpy.types.Object, to: np.ndarray) -> None:
-    """Let an anchor turn or swing about another point; nothing is written to its curves yet. [3]
+    """Change the point that an anchor turns or swings about, without writing its curves. to [3]
 
     Raises:
-        ConfigError: Its motion has no such point, or its curves cannot be read.
+        ConfigError: The motion has no such point, or the curves cannot be read.
     """
     model, old = _model(anchor), _offset(anchor)
     if model is None or old is None:
@@ -57,12 +56,12 @@ def move(anchor: bpy.types.Object, to: np.ndarray) -> None:
 
 
 def turn(anchor: bpy.types.Object, direction: np.ndarray) -> None:
-    """Let an anchor turn about an axis of another direction, through the same point and as fast. [3]
+    """Change the direction of an anchor's axis; pivot and speed are kept. direction [3]
 
-    What does not turn, and a direction of no length, is left alone.
+    Does nothing if the anchor does not turn or the direction is zero.
 
     Raises:
-        ConfigError: The rates that it would take are too large.
+        ConfigError: The resulting rates are too large.
     """
     model = _model(anchor)
     length = float(np.linalg.norm(direction))
@@ -75,54 +74,55 @@ def turn(anchor: bpy.types.Object, direction: np.ndarray) -> None:
 
 
 def to_parent(anchor: bpy.types.Object, place: Vector) -> np.ndarray:
-    """A place in the world along the axes of an anchor's parent, those of its location. [3]"""
+    """Convert a world position to the axes of an anchor's parent, the space of its location. [3]"""
     if anchor.parent is None:
         return np.array(place, np.float64)
     if anchor.parent_type == "OBJECT":
         frame = anchor.parent.matrix_world @ anchor.matrix_parent_inverse
-    else:  # bones and points of meshes
+    else:  # bones and mesh vertices
         frame = anchor.matrix_world @ anchor.matrix_basis.inverted_safe()
     return np.array(frame.inverted_safe() @ place, np.float64)
 
 
 def _place(anchor: bpy.types.Object) -> np.ndarray:
-    """Where an anchor is at t_max, along the axes of its parent. [3]"""
+    """Position of an anchor at t_max in the axes of its parent. [3]"""
     times = extrapolate.times_of(anchor)
     location, _ = fcurves.pose_at(anchor, fcurves.place(anchor), times.frame(times.t_max))
     return location + np.array(anchor.delta_location, np.float64)
 
 
 def _model(anchor: bpy.types.Object) -> MotionModel | None:
-    """The rates that the fields hold, as a motion; None where they are none, or it tumbles freely or follows."""
+    """Motion model of the fields' rates, or None if they are invalid, or if the anchor tumbles or follows another."""
     state = anchor.r5dgs_motion
     if state.kind == "free_top" or state.leader is not None:
         return None
     rates = {name: getattr(state, f"stored_{name}") for name in physics.RATES}
     try:
         return MotionModel(state.kind, frequency=state.stored_frequency, **rates)
-    except ValueError:  # numbers that are none
+    except ValueError:  # invalid values
         return None
 
 
 def _offset(anchor: bpy.types.Object) -> np.ndarray | None:
-    """The point about which an anchor turns, seen from it. [3]
+    """Point that an anchor turns about, relative to the anchor. [3]
 
-    Any point of the axis of a screw or an orbit is one: it is the one that was chosen, if the axis still goes through
-    that, else the one nearest to the anchor.
+    For a screw or an orbit, any point of the axis qualifies: the chosen point if it is still on the axis, otherwise the
+    one
+    nearest to the anchor.
     """
     model = _model(anchor)
     found = None if model is None else rotation_centers.center(model)
     if model is None or found is None or model.kind in ("ballistic_spin", "translation"):
         return found
     along = rotation_centers.axis(model)
-    assert along is not None  # what has a center and is no spring turns
+    assert along is not None  # a model with a center that is no spring turns
     chosen = np.array(anchor.r5dgs_motion.stored_pivot, np.float64)
     on_axis = found + along * (along @ chosen)
     return on_axis if np.linalg.norm(on_axis - chosen) <= _ON_AXIS * np.linalg.norm(chosen) else found
 
 
 def _store(anchor: bpy.types.Object, model: MotionModel) -> None:
-    """Set the rates of an anchor; those that stay keep their bits. ConfigError where one is too large to be kept."""
+    """Store the rates of an anchor; unchanged ones keep their bits. Raises ConfigError if one overflows."""
     state = anchor.r5dgs_motion
     with np.errstate(over="ignore"):
         values = {name: getattr(model, name).astype(np.float32) for name in physics.RATES}
@@ -134,7 +134,7 @@ def _store(anchor: bpy.types.Object, model: MotionModel) -> None:
 
 
 def _read_point(state):
-    with contextlib.suppress(errors.R5dgsError):  # the panel says why, and shows no pivot
+    with contextlib.suppress(errors.R5dgsError):  # shown in the panel
         found = point(state.id_data)
         if found is not None:
             return found
@@ -161,12 +161,12 @@ def _write_at_once(state, context):
 
 
 class R5DGS_PG_pivot(bpy.types.PropertyGroup):
-    """The point and the axis about which an anchor turns or swings past t_max."""
+    """Pivot and axis of an anchor's motion past t_max."""
 
     point: FloatVectorProperty(
         name="Pivot",
-        description="The point that the object turns or swings about, where it lies at the last observed time; it "
-        "flies along where the object is thrown. Along the axes of the parent, as the location is",
+        description="Point that the object turns or swings about, at its position at the last observed time, "
+        "in the axes of the parent; it moves along if the object is thrown",
         size=3,
         subtype="TRANSLATION",
         unit="LENGTH",
@@ -177,7 +177,7 @@ class R5DGS_PG_pivot(bpy.types.PropertyGroup):
     )
     axis: FloatVectorProperty(
         name="Axis",
-        description="The direction that the object turns about; another one keeps pivot and speed",
+        description="Axis that the object turns about; changing it keeps pivot and speed",
         size=3,
         subtype="XYZ",
         get=_read_axis,
@@ -188,7 +188,7 @@ class R5DGS_PG_pivot(bpy.types.PropertyGroup):
 
 
 def register():
-    """Register the group and hang it on objects."""
+    """Register the property group on objects."""
     bpy.utils.register_class(R5DGS_PG_pivot)
     bpy.types.Object.r5dgs_pivot = PointerProperty(type=R5DGS_PG_pivot)
 

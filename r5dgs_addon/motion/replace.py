@@ -1,4 +1,4 @@
-"""The motion of one anchor for another: its curves, moved and turned to where the other one is, and its physics."""
+"""Transfer of a motion to another anchor: its curves, moved and rotated to the target's pose, and its physics."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from . import confidence_tubes, extrapolate, fcurves, physics
 
 @dataclass(frozen=True)
 class Curve:
-    """One component of a motion as it will be written: arrays over its keys, handles [K, 2].
+    """One component of a motion to be written, as arrays over its keys. Points and handles [K, 2].
 
     Attributes:
         co: Frames and values.
@@ -34,16 +34,16 @@ _ENUMS = ("interpolation", "handle_left_type", "handle_right_type", "type")
 
 @dataclass(frozen=True)
 class Replacement:
-    """The motion that an anchor will get: everything that can fail is done.
+    """Motion to be written to an anchor. All checks that can fail are done.
 
     Attributes:
-        target: The anchor.
-        source: The anchor that has the motion.
-        times: The target's times.
-        location: Where the target is while no curve says otherwise. [3]
-        quat: How it is turned then, unit wxyz. [4]
-        turn: How it is turned against the source in its own frame, unit wxyz. [4]
-        curves: Its curves by path and component.
+        target: Anchor that receives the motion.
+        source: Anchor with the motion.
+        times: Times of the target.
+        location: Location of the target without curves. [3]
+        quat: Rotation of the target without curves, unit wxyz. [4]
+        turn: Rotation of the target relative to the source in its own frame, unit wxyz. [4]
+        curves: Curves by data path and component.
     """
 
     target: bpy.types.Object
@@ -56,20 +56,19 @@ class Replacement:
 
 
 def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, times: timeline.Times) -> Replacement:
-    """What lets an anchor move as another one does, from the pose that it has at a frame.
+    """Prepare a transfer of motion that keeps the target's pose at a frame.
 
-    Its place moves by what the other's place moves, and it turns by what the other turns, about its own pivot: at
-    ``frame`` it is where it was. Its physics become the other's, its learned motion stays its own, for *Reset to
-    Learned*. Curves of other channels stay.
+    The target moves by the displacement of the source and turns by its rotation, about its own pivot. It takes over the
+    source's physics, but keeps its own learned motion for *Reset to Learned*. Curves of other channels are kept.
 
     Args:
-        target: The anchor that gets the motion.
-        source: The anchor that has it.
-        frame: The frame at which the target stays.
-        times: The target's times.
+        target: Anchor that receives the motion.
+        source: Anchor with the motion.
+        frame: Frame at which the target keeps its pose.
+        times: Times of the target.
 
     Raises:
-        ConfigError: One of them has curves that cannot be read or written.
+        ConfigError: Curves of an anchor cannot be read or written.
     """
     here, there = fcurves.place(target), fcurves.place(source)
     for obj, where in ((target, here), (source, there)):
@@ -83,7 +82,7 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
     from_location, from_quat = fcurves.pose_at(source, there, frame)
     moves = location - from_location
     turn = rotations.multiply(rotations.conjugate(rotations.normalize(from_quat)), rotations.normalize(quat))
-    # q(t) turn is linear in q(t): what mixes the four components.
+    # The product q(t) turn is linear in q(t); `mix` is its matrix.
     mix = np.stack([rotations.multiply(row, turn) for row in np.eye(4)], axis=-1)
     curves = there.curves()
     written: dict[tuple[str, int], Curve] = {}
@@ -103,7 +102,7 @@ def prepare(target: bpy.types.Object, source: bpy.types.Object, frame: float, ti
 
 
 def apply(plan: Replacement) -> None:
-    """Write a motion that `prepare` gave."""
+    """Write the result of `prepare`."""
     target = plan.target
     fcurves.make_own(target)
     extrapolate.clear(target, fcurves.place(target))
@@ -139,9 +138,9 @@ def _moved(curve: Curve, by: float) -> Curve:
 
 
 def _mixed(name: str, parts: list[Curve], mix: np.ndarray) -> list[Curve]:
-    """Curves whose values are a linear map of those of other curves with keys at the same times.
+    """Apply a linear map to the values of curves whose keys are at the same frames.
 
-    A curve of one key is taken for one with the keys of the others. [4, 4] maps values of ``parts`` to those wanted.
+    A curve with one key is treated as constant over the keys of the others. ``mix`` [4, 4] maps old values to new ones.
     """
     longest = max(parts, key=lambda part: len(part.co))
     for k, part in enumerate(parts):

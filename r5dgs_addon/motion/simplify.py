@@ -1,4 +1,4 @@
-"""Fewer keys for an anchor, within a stated distance of the curves that it has now, so that a hand can edit them."""
+"""Key reduction of an anchor within a given tolerance of its current curves, for manual editing."""
 
 import bpy
 import numpy as np
@@ -11,23 +11,23 @@ from ..scene import timeline
 from . import extrapolate, fcurves, keyframes, physics
 
 _FRAMES = reduction.FrameTimes(0.0, 1.0)  # the curves' times are frames
-_LIKE = 0.01  # of the allowed error over the shorter side: slopes that differ by less are no kink
+_LIKE = 0.01  # tolerance of slopes that do not form a kink: fraction of the allowed error over the shorter segment
 
 
 def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
-    """Write location and rotation of anchors with as few keys as hold a tolerance; it holds for later keys, too.
+    """Rewrite location and rotation of anchors with as few keys as a tolerance permits, also for later extrapolation.
 
-    The first and the last key, the last observed time and kinks stay exact. Other channels stay as they are.
+    The first and the last key, the last observed time and kinks stay exact. Other channels are kept.
 
     Args:
         anchors: Anchors of loaded scenes.
-        share: Largest distance of any point from its place now, as a share of its object's size.
+        share: Maximum displacement of any point, as a fraction of its object's size.
 
     Returns:
         Number of keys before and after.
 
     Raises:
-        ConfigError: The curves of one cannot be read as smooth ones, or not be written; nothing was changed.
+        ConfigError: Curves of an anchor are not smooth or cannot be written; nothing was changed.
     """
     plans = [(anchor, *_plan(anchor, share * physics.size(anchor))) for anchor in anchors]
     before = key_count(anchors)
@@ -43,13 +43,13 @@ def simplify(anchors: list[bpy.types.Object], share: float) -> tuple[int, int]:
 
 
 def key_count(anchors: list[bpy.types.Object]) -> int:
-    """Number of keys of location and rotation, over all curves of anchors."""
+    """Total number of location and rotation keys of anchors."""
     curves = [curve for anchor in anchors for curve in fcurves.place(anchor).curves().values()]
     return sum(len(curve.keyframe_points) for curve in curves)
 
 
 def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, float, dict[str, reduction.Keys]]:
-    """Times, allowed error and the keys over frames that an anchor will get; none where nothing can go."""
+    """Times, allowed error and new keys over frames of an anchor; no keys if nothing can be removed."""
     times, place = extrapolate.times_of(anchor), fcurves.place(anchor)
     if place.strip is not None:
         raise errors.ConfigError(f"{anchor.name}: its action lies in the NLA; make it active again first")
@@ -64,7 +64,7 @@ def _plan(anchor: bpy.types.Object, allowed: float) -> tuple[timeline.Times, flo
 
 
 def _segments(name: str, curve: bpy.types.FCurve) -> np.ndarray:
-    """The segments of a curve; a single point where it has one key. [K, 4, 2]"""
+    """Segments of a curve, or one degenerate segment if it has one key. [K, 4, 2]"""
     points = fcurves.Points(curve)
     co, left, right = (values.astype(np.float64) for values in (points.co, points.left, points.right))
     if len(co) == 1:
@@ -84,7 +84,7 @@ def _segments(name: str, curve: bpy.types.FCurve) -> np.ndarray:
 def _reduced(
     anchor: bpy.types.Object, parts: dict[tuple[str, int], np.ndarray], last: float, allowed: float, reach: float
 ) -> reduction.Curves:
-    """Few keys over frames, between kinks and joined there."""
+    """Reduced keys over frames, computed between kinks and joined there."""
     start = min(float(part[0, 0, 0]) for part in parts.values())
     stop = max(float(part[-1, 3, 0]) for part in parts.values())
     kinks = [kink for name, part in parts.items() for kink in _kinks(part, allowed, name[0], reach)]
@@ -101,7 +101,7 @@ def _reduced(
 
 
 def _kinks(part: np.ndarray, allowed: float, path: str, reach: float) -> list[float]:
-    """Frames at which a curve changes its slope."""
+    """Frames of discontinuous slope."""
     if len(part) < 2:
         return []
     scale = 1.0 if path == "location" else max(2.0 * reach, 1e-12)
@@ -121,7 +121,7 @@ def _sampler(
         part = parts.get((path, index))
         value = getattr(anchor, path)[index] if part is None else None
         middle = 0.5 * (start + stop)
-        if part is not None and not part[0, 0, 0] <= middle <= part[-1, 3, 0]:  # held before and after its keys
+        if part is not None and not part[0, 0, 0] <= middle <= part[-1, 3, 0]:  # constant before and after its keys
             value = part[0, 0, 1] if middle < part[0, 0, 0] else part[-1, 3, 1]
         if value is not None or part is None:
             return np.full(len(at), value), np.zeros(len(at))
@@ -143,6 +143,6 @@ def _sampler(
 
 
 def _over_time(keys: reduction.Keys, times: timeline.Times) -> reduction.Keys:
-    """Keys over frames as keys over scene time."""
+    """Convert keys over frames to keys over scene time."""
     per = times.frames_per_unit
     return reduction.Keys(times.time(keys.times), keys.values, keys.left_slopes * per, keys.right_slopes * per)

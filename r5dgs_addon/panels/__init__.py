@@ -1,4 +1,4 @@
-"""The sidebar of the 3D view: tab R5DGS. Each module lists its panels in ``CLASSES``, in the order of the sidebar."""
+"""Panels of the *R5DGS* sidebar tab. Each module lists its panels in ``CLASSES``, in sidebar order."""
 
 import bpy
 

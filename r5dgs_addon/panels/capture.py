@@ -1,4 +1,4 @@
-"""Panel *Capture*."""
+"""*Capture* panel."""
 
 import bpy
 
@@ -6,7 +6,7 @@ from . import sidebar
 
 
 class R5DGS_PT_capture(sidebar.Sidebar, bpy.types.Panel):
-    """Make training data from this Blender scene."""
+    """Capture training data from this Blender scene."""
 
     bl_idname = "R5DGS_PT_capture"
     bl_label = "Capture"

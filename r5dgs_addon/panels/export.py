@@ -1,4 +1,4 @@
-"""Panel *Export*."""
+"""*Export* panel."""
 
 import bpy
 
@@ -13,7 +13,7 @@ ENTRIES = (
 
 
 class R5DGS_PT_export(sidebar.WithScene, bpy.types.Panel):
-    """Write what Blender shows for other tools."""
+    """Export what Blender shows to other tools."""
 
     bl_idname = "R5DGS_PT_export"
     bl_label = "Export"

@@ -1,4 +1,4 @@
-"""Panel *Motion*: how the active object moves on after the last observed time."""
+"""*Motion* panel: motion of the active object past the last observed time."""
 
 import bpy
 
@@ -10,7 +10,7 @@ from . import sidebar
 
 
 class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
-    """Edit how the active object moves on."""
+    """Edit the motion of the active object."""
 
     bl_idname = "R5DGS_PT_motion"
     bl_label = "Motion"
@@ -36,7 +36,7 @@ class R5DGS_PT_motion(sidebar.WithScene, bpy.types.Panel):
 
 
 def _physics(layout, anchor) -> None:
-    """The fields of the motion."""
+    """Draw the fields of the motion."""
     state = anchor.r5dgs_motion
     layout.label(text=anchor.name, icon="EMPTY_ARROWS")
     refused = fcurves.refusal(anchor)
@@ -63,10 +63,10 @@ def _physics(layout, anchor) -> None:
 
 
 def _pivot(layout, anchor) -> None:
-    """What the motion turns or swings about, where it does."""
+    """Draw the pivot and axis if the motion has them."""
     try:
         point = pivot.point(anchor)
-    except errors.R5dgsError:  # an action says why
+    except errors.R5dgsError:  # shown by the operators
         point = None
     if point is not None:
         column = layout.column(align=True)
@@ -77,7 +77,7 @@ def _pivot(layout, anchor) -> None:
 
 
 def _scene(layout, collection) -> None:
-    """What concerns all objects."""
+    """Draw the settings of the whole scene."""
     column = layout.column(align=True)
     column.operator("r5dgs.extrapolate_until", icon="PREVIEW_RANGE")
     shown = any(confidence_tubes.helper_of(anchor) for anchor in loaded_scenes.members(collection, "ANCHOR"))

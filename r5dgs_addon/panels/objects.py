@@ -1,4 +1,4 @@
-"""Panel *Objects*: what the scene holds, in which colours, and what is shown of it."""
+"""*Objects* panel: names, colours and visibility of a scene's objects."""
 
 import bpy
 
@@ -6,11 +6,11 @@ from ..scene import isolation, loaded_scenes, object_names, object_tint
 from . import sidebar
 
 OTHERS = (("r5dgs.duplicate_object", "Duplicate", "DUPLICATE"), ("r5dgs.delete_object", "Delete", "TRASH"))
-WIDE = 350  # points of a sidebar in which rows have room for how objects move
+WIDE = 350  # minimum width of a sidebar that shows the motion in each row (px at UI scale 1)
 
 
 class R5DGS_UL_objects(bpy.types.UIList):
-    """Objects of a loaded scene."""
+    """List of a loaded scene's objects."""
 
     bl_idname = "R5DGS_UL_objects"
 
@@ -44,7 +44,7 @@ class R5DGS_UL_objects(bpy.types.UIList):
 
 
 class R5DGS_PT_objects(sidebar.WithScene, bpy.types.Panel):
-    """The objects of the scene."""
+    """Objects of the scene."""
 
     bl_idname = "R5DGS_PT_objects"
     bl_label = "Objects"
@@ -76,7 +76,7 @@ def _draw_active(box, collection, entry):
     row.prop(entry, "tint")
     row.operator("r5dgs.reset_color", text="", icon="LOOP_BACK")
     if any(object_tint.is_tinted(cloud) for cloud in object_names.clouds(collection, entry.object_id)):
-        box.label(text="Tinted: previews, renders and exports obey it", icon="COLOR")
+        box.label(text="Tinted in previews, renders and exports", icon="COLOR")
     if entry.caption:
         box.label(text=entry.caption)
     row = box.row()
@@ -90,7 +90,7 @@ def _draw_active(box, collection, entry):
 
 
 def _motion(own) -> str:
-    """How an object moves, as its anchor's physics say; "" where that is not known."""
+    """Name of an object's motion type, or "" if unknown."""
     for cloud in sorted(own, key=lambda cloud: -cloud.r5dgs.count):
         physics = getattr(cloud.parent, "r5dgs_motion", None)
         if physics is not None and "kind" in physics.bl_rna.properties:

@@ -1,4 +1,4 @@
-"""Panel *Preview*."""
+"""*Preview* panel."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from . import render, sidebar
 
 
 class R5DGS_PT_preview(sidebar.WithScene, bpy.types.Panel):
-    """Render what Blender shows in the worker."""
+    """Render the scene in the worker."""
 
     bl_idname = "R5DGS_PT_preview"
     bl_label = "Preview"

@@ -1,4 +1,4 @@
-"""Panel *Select by Prompt*."""
+"""*Select by Prompt* panel."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from . import sidebar
 
 
 class R5DGS_MT_prompts(bpy.types.Menu):
-    """Prompts that found something before"""
+    """Earlier prompts with matches"""
 
     bl_idname = "R5DGS_MT_prompts"
     bl_label = "Earlier Prompts"
@@ -74,7 +74,7 @@ def _draw_answers(box, session, names):
 
 
 def _current_names(session) -> dict[tuple[str, int], str]:
-    """What the objects that matched are called by now."""
+    """Current names of the matched objects."""
     wanted = {match.scene for match in session.matches}
     return {
         (collection.name, object_id): name

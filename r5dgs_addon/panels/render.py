@@ -1,4 +1,4 @@
-"""Panels of the engine R5DGS in the render and view layer properties."""
+"""Panels of the R5DGS engine in the render and view layer properties."""
 
 import bpy
 
@@ -9,7 +9,7 @@ from ..worker import jobs
 
 
 def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """Draw the loss of the scenes' colours under the view, once it is measured."""
+    """Draw the colour loss under the view transform once it has been measured."""
     loss = inverse_loss.known(scene)
     if loss is not None:
         poor, text = loss.psnr < inverse_loss.ENOUGH_DB, inverse_loss.note(loss)
@@ -20,7 +20,7 @@ def draw_loss(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
 
 
 class _OfEngine:
-    """A panel of the properties editor, shown for the engine R5DGS."""
+    """Mixin for panels of the properties editor that belong to the R5DGS engine."""
 
     bl_space_type = "PROPERTIES"
     bl_region_type = "WINDOW"
@@ -32,7 +32,7 @@ class _OfEngine:
 
 
 class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
-    """What the engine renders, and whether colours come out as trained."""
+    """Settings of the engine, and warnings about colour management."""
 
     bl_idname = "R5DGS_PT_render"
     bl_label = "R5DGS"
@@ -69,7 +69,7 @@ class R5DGS_PT_render(_OfEngine, bpy.types.Panel):
 
 
 class R5DGS_PT_passes(_OfEngine, bpy.types.Panel):
-    """The passes that the engine has."""
+    """Passes supported by the engine."""
 
     bl_idname = "R5DGS_PT_passes"
     bl_label = "Passes"

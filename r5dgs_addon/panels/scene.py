@@ -1,4 +1,4 @@
-"""Panel *Scene*: load one and see what it holds."""
+"""*Scene* panel: load a scene and show its contents."""
 
 import bpy
 
@@ -8,7 +8,7 @@ from . import sidebar
 
 
 class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
-    """Load a scene and see what it holds."""
+    """Load a scene and show its contents."""
 
     bl_idname = "R5DGS_PT_scene"
     bl_label = "Scene"
@@ -43,7 +43,7 @@ class R5DGS_PT_scene(sidebar.Sidebar, bpy.types.Panel):
         row = layout.row(align=True)
         for value, name, _ in viewport_display.ITEMS:
             row.operator("r5dgs.set_display", text=name, depress=state.display == value).display = value
-        row = layout.split(factor=0.33)  # beside the field Blender would cut the name
+        row = layout.split(factor=0.33)  # beside the field, Blender would truncate the name
         row.label(text="Scene File")
         row.prop(state, "filepath", text="")
         asked = trust.find(collection).asked

@@ -1,4 +1,4 @@
-"""What all panels of the tab R5DGS have in common."""
+"""Base classes of the panels in the *R5DGS* tab."""
 
 from ..scene import loaded_scenes
 
@@ -6,7 +6,7 @@ TAB = "R5DGS"
 
 
 class Sidebar:
-    """A panel in the sidebar of the 3D view."""
+    """Panel in the sidebar of the 3D view."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -14,7 +14,7 @@ class Sidebar:
 
 
 class WithScene(Sidebar):
-    """A panel that is shown once a scene is loaded."""
+    """Panel that is shown only if a scene is loaded."""
 
     @classmethod
     def poll(cls, context):

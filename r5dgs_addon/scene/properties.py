@@ -102,7 +102,7 @@ class R5DGS_PG_scene(bpy.types.PropertyGroup):
         update=trust.choose,
     )
     seen_at: StringProperty(
-        name="Seen At", description="Last known location of the scene file, used after appending from another .blend"
+        name="Seen At", description="Last known location of the scene file, for scenes appended from another .blend"
     )
     display: EnumProperty(
         name="Display",

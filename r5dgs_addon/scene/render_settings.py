@@ -22,8 +22,8 @@ class R5DGS_PG_render(bpy.types.PropertyGroup):
     )
     as_trained: BoolProperty(
         name="Colors as Trained",
-        description="Invert the view transform, so that AgX, Filmic and others display the colors of Gaussians as they "
-        "were trained, and meshes as ever",
+        description="Invert the view transform for Gaussians, so that AgX, Filmic and others show their trained "
+        "colors; meshes are not affected",
         default=True,
     )
     moving: EnumProperty(

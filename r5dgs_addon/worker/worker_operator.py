@@ -76,6 +76,6 @@ class Waiting:
 def free(operator: type, key: str) -> bool:
     """True if no job with this key runs; otherwise sets the poll message. For an operator's ``poll``."""
     if jobs.busy(key):
-        operator.poll_message_set("It is at work already; Esc stops it")
+        operator.poll_message_set("Already running; press Esc to stop it")
         return False
     return True
