@@ -1,7 +1,7 @@
 """Bounded reading of a zip of `.npy` arrays: sizes are checked before anything is decompressed or allocated.
 
-Notation: a file of F bytes may declare `ALLOWANCE` + `RATIO` F bytes of content in all. A declared size is the size: a
-member that inflates to more or less is an error.
+Notation: a file of F bytes may declare at most `ALLOWANCE` + `RATIO` F bytes of content. The declared sizes are
+binding: a member that inflates to more or less is an error.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from ..errors import SceneFileError
 
 ALLOWANCE = 32 << 20
 RATIO = 64
-_BLOCK = 1 << 20  # what is read at once; also the largest directory of a zip
+_BLOCK = 1 << 20  # largest single read in bytes, and largest zip directory
 _MOST_DIMENSIONS = 8
 _MAGIC = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
     rb"\{'descr': '([<>|=]?[A-Za-z][0-9]*)', 'fortran_order': (True|False), 'shape': \(([0-9, ]*)\), \} *\n"
 )
 _DIMENSION = re.compile(r"(?:[0-9]{1,18}(?:, ?[0-9]{1,18})*,?)?")
-# What zipfile and zlib raise on damaged bytes; the encrypted flag is a RuntimeError, odd names a ValueError.
+# Exceptions of zipfile and zlib on damaged bytes; encryption raises RuntimeError, odd names ValueError.
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -48,7 +48,7 @@ _BROKEN = (
 
 
 def most_content(size: int) -> int:
-    """Bytes of content that a file of a size may hold."""
+    """Largest allowed content, in bytes, of a file of a given size."""
     return ALLOWANCE + RATIO * size
 
 
@@ -57,8 +57,8 @@ class Header:
     """Header of an array in C order.
 
     Attributes:
-        dtype: Code of the dtype, such as "<f4".
-        shape: Its shape.
+        dtype: Dtype code, such as "<f4".
+        shape: Shape of the array.
     """
 
     dtype: str
@@ -66,13 +66,13 @@ class Header:
 
 
 class Archive:
-    """A zip that is open for reading. Every fault of it is a `SceneFileError`.
+    """A zip open for reading. Every fault raises `SceneFileError`.
 
     Args:
         path: The file.
 
     Raises:
-        SceneFileError: It is missing, no zip, damaged, or declares more content than its size allows.
+        SceneFileError: The file is missing, not a zip, damaged, or declares more content than its size allows.
     """
 
     def __init__(self, path: Path):
@@ -106,25 +106,25 @@ class Archive:
         return member in self._members
 
     def size(self, member: str) -> int:
-        """Declared size of a member, bytes."""
+        """Declared size of a member in bytes."""
         return self._members[member].file_size
 
     def compressed_size(self, member: str) -> int:
-        """Bytes of a member in the file."""
+        """Compressed size of a member in bytes."""
         return self._members[member].compress_size
 
     def read(self, member: str) -> bytes:
-        """Content of a member, of its declared size."""
+        """Content of a member, exactly of its declared size."""
         with self._reading(member) as stream:
             return _read_exactly(stream, bytearray(self.size(member)))
 
     def header(self, member: str, dtypes: Collection[str]) -> Header:
-        """Header of an array of one of some dtypes, whose declared size is the one that its header gives it."""
+        """Header of an array with one of the given dtypes. Its shape must match the declared size of the member."""
         with self._reading(member) as stream:
             return self._header(stream, member, dtypes)
 
     def array(self, member: str, dtypes: Collection[str]) -> np.ndarray:
-        """An array of one of some dtypes."""
+        """Array with one of the given dtypes."""
         with self._reading(member) as stream:
             header = self._header(stream, member, dtypes)
             result = np.empty(header.shape, header.dtype)
@@ -132,7 +132,7 @@ class Archive:
             return result
 
     def _checked(self, size: int) -> dict[str, zipfile.ZipInfo]:
-        """The members by name, their sizes checked against that of the file."""
+        """Members by name, with their sizes checked against that of the file."""
         found = self._zip.infolist()
         members = {info.filename: info for info in found}
         if len(members) < len(found):
@@ -151,10 +151,10 @@ class Archive:
 
     @contextmanager
     def _reading(self, member: str) -> Iterator[BinaryIO]:
-        # One byte more than declared, so that a member that goes on past its size is noticed.
+        # Read one byte more than declared, to detect a member that exceeds its size.
         info = copy.copy(self._members[member])
         info.file_size += 1
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others inflate without a bound
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # other methods inflate without bound
             raise SceneFileError(f"{self.place}: {member}: expected a stored or deflated member, found another kind")
         try:
             with self._zip.open(info) as stream:
@@ -186,7 +186,7 @@ class Archive:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that is read in pieces of at most `_BLOCK` bytes; a zip's directory, which is read whole, is one piece."""
+    """File reader limited to `_BLOCK` bytes per read, which also bounds a zip's directory, as it is read whole."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > _BLOCK:
@@ -195,7 +195,7 @@ class _Bounded(io.BufferedReader):
 
 
 def _read_exactly(stream: BinaryIO, target: bytearray | memoryview) -> bytes:
-    """Fill the target to its end and make sure that nothing follows."""
+    """Fill the target completely and check that no data follows."""
     view, at = memoryview(target), 0
     while at < len(view):
         piece = stream.read(min(_BLOCK, len(view) - at))

@@ -1,4 +1,4 @@
-"""Checks that the shapes of a scene's arrays fit each other and the rest of the scene."""
+"""Shape checks of a scene's arrays, against each other and the rest of the scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .lookup_table import Table
 from .scene import EMBEDDINGS, IDENTITY_DIM, MotionGroup, SceneObject
 
 SH_BASES = (1, 4, 9, 16)
-_PER_GAUSSIAN = ("quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids")  # beside means
+_PER_GAUSSIAN = ("quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids")  # besides means
 _Shape = tuple[int | None, ...]  # None: any length
 
 
@@ -27,10 +27,10 @@ def check(
     """Raise `SceneFileError` if the shapes of a scene's arrays do not fit each other or the rest of the scene.
 
     Args:
-        shapes: Shapes by name, at least of the arrays that every scene has; `findings.UNREAD` for unknown ones.
-        objects, groups, vocabulary, table: Fields of `Scene`, the last one `Scene.lookup`.
-        place: For messages.
-        guard: Entered around each array.
+        shapes: Shapes by name, including all required arrays; `findings.UNREAD` for unknown ones.
+        objects, groups, vocabulary, table: Fields of `Scene`; ``table`` is `Scene.lookup`.
+        place: File, for messages.
+        guard: Context manager entered around each array.
 
     Returns:
         Names of the arrays whose shapes fit.
@@ -90,11 +90,11 @@ def check_meanings(
 
     Args:
         shapes: Shapes by name; only `EMBEDDINGS` are checked.
-        objects: Rows of the table of objects, None if unknown.
-        words: Words of the vocabulary, None if unknown.
+        objects: Number of objects, None if unknown.
+        words: Number of words in the vocabulary, None if unknown.
         table: Encoder, thresholds and views of the embeddings.
-        place: For messages.
-        guard: Entered around each array and rule.
+        place: File, for messages.
+        guard: Context manager entered around each array and rule.
 
     Returns:
         Names of the arrays whose shapes fit.
@@ -133,7 +133,7 @@ def check_meanings(
 def _fitting(
     shapes: Mapping[str, tuple[int, ...]], expected: Mapping[str, _Shape], place: str, guard: findings.Guard
 ) -> set[str]:
-    """Names of the known shapes that are as expected. Raises `SceneFileError` with the first other one."""
+    """Names of the known shapes that are as expected. Raises `SceneFileError` for the first mismatch."""
     sound = set()
     for name, shape in shapes.items():
         if shape is findings.UNREAD:
@@ -147,7 +147,7 @@ def _fitting(
 
 
 def _gaussians(shapes: Mapping[str, tuple[int, ...]]) -> int | None:
-    """Number of Gaussians: the rows of means; if these are unknown, those of most other arrays."""
+    """Number of Gaussians: the length of means, or if unknown, the most frequent length of the other arrays."""
     if shapes.get("means") is not findings.UNREAD:
         return _length(shapes, "means")
     rows = Counter(
@@ -157,13 +157,13 @@ def _gaussians(shapes: Mapping[str, tuple[int, ...]]) -> int | None:
 
 
 def _length(shapes: Mapping[str, tuple[int, ...]], name: str, rank: int | None = None) -> int | None:
-    """Rows of an array: 0 without it, None if its shape is unknown or not of the rank."""
+    """Number of rows of an array: 0 if it is missing, None if its shape is unknown or has another rank."""
     shape = shapes.get(name, (0,))
     return None if shape is findings.UNREAD or len(shape) != (rank or len(shape)) else next(iter(shape), 0)
 
 
 def _number(guard: findings.Guard, count: Callable[[], int]) -> int | None:
-    """A number of items, None if they could not be read."""
+    """Result of ``count``, or None if the items could not be read."""
     number = findings.attempt(guard, count)
     return None if number is findings.UNREAD else number
 

@@ -1,7 +1,7 @@
-"""Pinhole cameras and the axes they are written in.
+"""Pinhole cameras and conversions of their axes.
 
-Inside the core a camera is OpenCV: x right, y down, z forward; ``T_cam_world`` takes world points into it; pixel
-centres lie at +0.5. Blender and the D-NeRF files use OpenGL axes (y up, looking along -z): this module converts.
+Core cameras are OpenCV: x right, y down, z forward; ``T_cam_world`` maps world points to camera space; pixel centres
+are at +0.5. Blender and the D-NeRF files use OpenGL axes (y up, looking along -z); this module converts between them.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-FARTHEST = 1e15  # largest coordinate that is drawn: single precision can square it
-MOST_PIXELS = 1 << 16  # of a side of an image
-_MOST_FOCAL = 1e12  # pixels; the least is one in so many
+FARTHEST = 1e15  # largest coordinate that is drawn; float32 can square it
+MOST_PIXELS = 1 << 16  # largest image side
+_MOST_FOCAL = 1e12  # pixels; the smallest focal length is its reciprocal
 _RIGID_TOLERANCE = 1e-3  # largest entry of R R^T - 1
-_ROUNDING = 1e-9  # of the entries of a camera that are 0 or 1 and not read
-FAR = 1e4  # what parallel projections take for infinity, in half depths of what they show
+_ROUNDING = 1e-9  # tolerance of matrix entries that must be 0 or 1
+FAR = 1e4  # camera distance that replaces infinity for parallel projections, in half depth ranges
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Camera:
         width: Image width in pixels.
         height: Image height in pixels.
         intrinsics: Camera matrix in pixels, float64. [3, 3]
-        T_cam_world: World to camera, rigid, float64. [4, 4]
-        name: Name of the view, unique within a data set's cameras where given.
+        T_cam_world: Rigid transform from world to camera, float64. [4, 4]
+        name: Name of the view, unique within a data set, or "".
     """
 
     width: int
@@ -50,7 +50,7 @@ class Camera:
 
 
 def check(camera: Camera) -> None:
-    """Raise ValueError or TypeError naming the entry of a camera that no image can be drawn with."""
+    """Raise ValueError or TypeError naming the entry that makes a camera unusable for rendering."""
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
     place = f"camera {camera.name!r}" if camera.name else "camera"
@@ -93,7 +93,7 @@ def check(camera: Camera) -> None:
 
 
 def opengl_to_cam_world(matrix_world: np.ndarray) -> np.ndarray:
-    """Turn a camera-to-world matrix with OpenGL axes into ``T_cam_world`` with OpenCV axes. [4, 4] -> [4, 4]"""
+    """Convert a camera-to-world matrix with OpenGL axes to ``T_cam_world`` with OpenCV axes. [4, 4] -> [4, 4]"""
     T_world_cam = np.asarray(matrix_world, np.float64) @ OPENGL_TO_OPENCV
     rotation = T_world_cam[:3, :3] / np.linalg.norm(T_world_cam[:3, :3], axis=0)
     T_cam_world = np.eye(4)
@@ -103,7 +103,7 @@ def opengl_to_cam_world(matrix_world: np.ndarray) -> np.ndarray:
 
 
 def cam_world_to_opengl(T_cam_world: np.ndarray) -> np.ndarray:
-    """Inverse of `opengl_to_cam_world`: camera to world with OpenGL camera axes. [4, 4] -> [4, 4]"""
+    """Inverse of `opengl_to_cam_world`: camera to world, OpenGL camera axes. [4, 4] -> [4, 4]"""
     T_world_cam = np.linalg.inv(np.asarray(T_cam_world, np.float64))
     return T_world_cam @ OPENGL_TO_OPENCV
 
@@ -116,21 +116,21 @@ def from_projection(
     depths: tuple[float, float] = (0.0, 1.0),
     name: str = "",
 ) -> tuple[Camera, float]:
-    """The camera of an OpenGL projection.
+    """Camera of an OpenGL projection.
 
-    A parallel projection has no centre: it becomes that of a camera `FAR` half depths away, whose picture differs by a
-    small part of a pixel.
+    A parallel projection is approximated by a camera `FAR` half depth ranges away; the image differs by a small
+    fraction of a pixel.
 
     Args:
-        projection: Camera space to clip space, perspective or parallel; sensor fit and shift are in it.
-        matrix_world: Camera to world, OpenGL camera axes.
+        projection: Camera space to clip space, perspective or parallel, including sensor fit and shift. [4, 4]
+        matrix_world: Camera to world, OpenGL camera axes. [4, 4]
         width: Image width in pixels.
         height: Image height in pixels.
-        depths: Nearest and farthest depth before ``matrix_world`` that matter; read for parallel projections alone.
+        depths: Nearest and farthest relevant depth from ``matrix_world``; used only for parallel projections.
         name: Name of the camera.
 
     Returns:
-        The camera, and the distance by which it stands behind ``matrix_world``: 0 for perspective ones.
+        The camera, and its distance behind ``matrix_world``: 0 for perspective projections.
     """
     p = np.asarray(projection, np.float64)
     T_cam_world = opengl_to_cam_world(matrix_world)
@@ -140,7 +140,7 @@ def from_projection(
         intrinsics[1] = 0.0, 0.5 * height * p[1, 1], 0.5 * height * (1 + p[1, 2])
         return Camera(width, height, intrinsics, T_cam_world, name), 0.0
     middle, half = 0.5 * (depths[0] + depths[1]), 0.5 * (depths[1] - depths[0])
-    away = FAR * max(half, 1e-3 * abs(middle), 1e-6)  # from the depth where the scale is exact
+    away = FAR * max(half, 1e-3 * abs(middle), 1e-6)  # distance to the depth at which the scale is exact
     intrinsics[0] = 0.5 * width * p[0, 0] * away, 0.0, 0.5 * width * (1 + p[0, 3])
     intrinsics[1] = 0.0, 0.5 * height * p[1, 1] * away, 0.5 * height * (1 - p[1, 3])
     T_cam_world[2, 3] += away - middle
@@ -148,12 +148,12 @@ def from_projection(
 
 
 def is_parallel(projection: np.ndarray) -> bool:
-    """Whether an OpenGL projection is parallel: clip w is 1 and not the depth. [4, 4]"""
+    """Return True if an OpenGL projection is parallel, i.e. clip w is 1 instead of the depth. [4, 4]"""
     return bool(abs(projection[3, 3]) > 0.5)
 
 
 def moved(camera: Camera, shift: np.ndarray) -> Camera:
-    """The camera moved by a vector of the world; itself if that is zero. [3]"""
+    """Camera translated by a world vector; the same object if the vector is zero. [3]"""
     if not np.any(shift):
         return camera
     T_cam_world = camera.T_cam_world.copy()
@@ -162,14 +162,14 @@ def moved(camera: Camera, shift: np.ndarray) -> Camera:
 
 
 def crop(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """The camera of a part of the picture, in pixels from its upper left corner; what lies outside is seen, too."""
+    """Camera of a rectangle of the image, in pixels from the upper left corner; it may extend beyond the image."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2, 2] -= left, top
     return dataclasses.replace(camera, width=width, height=height, intrinsics=intrinsics)
 
 
 def resize(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the same picture with another number of pixels."""
+    """Camera of the same image at another resolution."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[0] *= width / camera.width
     intrinsics[1] *= height / camera.height
@@ -177,7 +177,7 @@ def resize(camera: Camera, width: int, height: int) -> Camera:
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points.
+    """Project world points to the image.
 
     Args:
         camera: The camera.
@@ -188,7 +188,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """
     p_cam = points @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3]
     z = p_cam[..., 2]
-    in_front = z > 1e-9 * np.abs(p_cam).max(axis=-1)  # whatever the unit of the world
+    in_front = z > 1e-9 * np.abs(p_cam).max(axis=-1)  # independent of the world's unit
     uv = p_cam[..., :2] / np.where(in_front, z, np.nan)[..., None]
     k = camera.intrinsics
     pixels = np.stack([k[0, 0] * uv[..., 0] + k[0, 1] * uv[..., 1] + k[0, 2], k[1, 1] * uv[..., 1] + k[1, 2]], axis=-1)
@@ -196,7 +196,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def pixel_rays(camera: Camera) -> np.ndarray:
-    """Unit directions through all pixel centres, in the world. [H, W, 3]"""
+    """Unit world directions through all pixel centres. [H, W, 3]"""
     k = camera.intrinsics
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     v = (y - k[1, 2]) / k[1, 1]
@@ -205,7 +205,7 @@ def pixel_rays(camera: Camera) -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-# Rotation that takes a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
+# Rotation from a data set's world axes to Blender's (right-handed, Z up), applied once, on the root empty.
 WORLD_TO_BLENDER = {
     "blender": np.eye(3),
     "colmap": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),

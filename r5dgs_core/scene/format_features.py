@@ -1,11 +1,11 @@
-"""Features of a scene file that its format version 1 cannot hold.
+"""Optional and required features of scene files with format version 2.
 
-``scene.json`` of version 2 lists them:
+``scene.json`` lists them:
 
     "features": [{"name": "origin", "required": true, "since": "0.2.0"}]
 
-A reader refuses a file with a required feature that it lacks, and skips an optional one. Names reserved for later
-releases: events, parts, hulls, trajectory, quantised.
+A reader rejects a file with a required feature that it does not support, and skips an optional one. Names reserved for
+later releases: events, parts, hulls, trajectory, quantised.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .. import __version__, errors
 from . import scene_json
 from .scene import Scene
 
-VERSIONS = (1, 2)  # of the format, that this release reads
+VERSIONS = (1, 2)  # format versions that this release reads
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _RELEASE = re.compile(r"[0-9]{1,4}(\.[0-9]{1,4}){1,3}")
 
@@ -30,7 +30,7 @@ class Feature:
     Attributes:
         name: Lower case, with underscores.
         required: True if a reader without the feature would misread the scene.
-        since: First release that reads it.
+        since: First release that supports it.
     """
 
     name: str
@@ -43,24 +43,24 @@ _KNOWN_NAMES = {ORIGIN.name}
 
 
 def version(scene: Scene) -> int:
-    """The lowest format version that can hold a scene."""
+    """Lowest format version that can store a scene."""
     return 2 if scene.origin.any() else 1
 
 
 def dump(scene: Scene) -> dict[str, Any]:
-    """The list of features of a scene and what they store in ``scene.json``; empty for one that version 1 can hold."""
+    """Features of a scene and their entries in ``scene.json``; empty if version 1 suffices."""
     if version(scene) == 1:
         return {}
     return {"features": [asdict(ORIGIN)], "origin": scene.origin.tolist()}
 
 
 def fields(top: scene_json.Row) -> dict[str, Any]:
-    """The fields of `Scene` that belong to the features of a checked file. Raises as `check` does."""
+    """Fields of `Scene` that belong to the features of a checked file. Raises as `check` does."""
     return {"origin": top.numbers("origin", (3,))} if ORIGIN.name in _names(top.data) else {}
 
 
 def skipped(data: dict[str, Any]) -> list[str]:
-    """Names of the optional features of a checked file that this release does not read."""
+    """Names of optional features of a checked file that this release does not support."""
     return [name for name in _names(data) if name not in _KNOWN_NAMES]
 
 
@@ -70,10 +70,6 @@ def check(data: dict[str, Any], place: str) -> None:
     Args:
         data: Content of ``scene.json``.
         place: File and member, for messages.
-
-    Raises:
-        SceneFileError: The version, the list or a required feature is unknown; the message names the release to
-            update to.
     """
     found = data.get("format_version")
     if found not in VERSIONS or not isinstance(found, int) or isinstance(found, bool):

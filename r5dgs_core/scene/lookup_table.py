@@ -1,4 +1,4 @@
-"""Description of the embeddings that a scene stores: their encoder, their views, and the thresholds of a match.
+"""Metadata of a scene's stored embeddings: encoder, views and match thresholds.
 
 Notation: D numbers of an embedding, C canonical phrases, as in `embedding_search`.
 """
@@ -13,14 +13,14 @@ POOLINGS = ("mean", "max")
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """Which encoder made the embeddings, and how.
+    """Encoder that made the embeddings, and its settings.
 
     Attributes:
         kind: "clip", "siglip", "open_clip" or "text".
-        name: Name of its folder, for people.
-        digest: SHA-256 of its weights, hexadecimal: queries have to come from the same ones.
+        name: Name of its folder, for display.
+        digest: Hexadecimal SHA-256 of its weights; queries must use the same weights.
         dimension: D.
-        templates: Sentences with "{}" for the phrase; a phrase is the mean over them.
+        templates: Sentences with "{}" for the phrase; the embedding of a phrase is the mean over them.
         scale: s of the relevancy, see `embedding_search`.
     """
 
@@ -33,19 +33,19 @@ class EncoderCard:
 
     @property
     def sees(self) -> bool:
-        """Whether it looks at pixels."""
+        """True if the encoder has an image tower."""
         return self.kind != "text"
 
 
 @dataclass(frozen=True)
 class View:
-    """What one embedding of an object was made of.
+    """Source of one embedding of an object.
 
     Attributes:
         source: Name of the camera, or the phrase.
         threshold: Least cosine of a match with this embedding.
-        t: Scene time of the picture, None for a phrase.
-        box: What was cut out: left, top, right, bottom in pixels of that camera, None for a phrase.
+        t: Scene time of the image, None for a phrase.
+        box: Crop of the image: left, top, right, bottom in pixels of that camera; None for a phrase.
     """
 
     source: str
@@ -56,16 +56,16 @@ class View:
 
 @dataclass(frozen=True)
 class Table:
-    """What a scene stores about its embeddings, beside the numbers.
+    """Metadata of a scene's embeddings.
 
     Attributes:
-        encoder: What made them.
-        canonical: The C phrases that everything is compared with.
-        views: Of each object of the scene's table, its views, the rows of `Scene.view_embeddings`; none for an object
-            that has no embedding.
-        thresholds: Least cosine of a match with each object's embedding, None for an object without.
-        margin: How far below the best cosine others still match.
-        pooling: What answers: "mean", the object's embedding, or "max", the best of its views.
+        encoder: Encoder that made them.
+        canonical: The C phrases that every query is compared with.
+        views: Views of each object, corresponding to the rows of `Scene.view_embeddings`; empty for an object without
+            an embedding.
+        thresholds: Least cosine of a match with each object's embedding, None for an object without one.
+        margin: Largest cosine difference from the best match at which other objects still match.
+        pooling: Embeddings that are compared: "mean" for the object's own, "max" for the best of its views.
     """
 
     encoder: EncoderCard
@@ -76,7 +76,7 @@ class Table:
     pooling: str
 
     def select(self, rows: Sequence[int]) -> Table:
-        """The table for other objects, each by the row that it had."""
+        """Table restricted to the given rows, in their order."""
         return replace(
             self,
             views=tuple(self.views[row] for row in rows),

@@ -1,4 +1,4 @@
-"""What is known of a scene's error: what its evaluation measured, and what its motion leaves out."""
+"""Known error of a scene: measured image quality, and observed motion that the rigid groups do not explain."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from .. import errors, strict_json
 from .scene import Scene
 
-MODE = "rigid"  # how Blender plays, see `playback.MODES`
+MODE = "rigid"  # Blender's playback mode, see `playback.MODES`
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Error of a scene's pictures and of its motion, as far as it is known.
+    """Image and motion error of a scene, as far as known.
 
     Attributes:
-        psnr_observed: Of held-out views in the observed time, dB, or None.
-        psnr_later: Of views past t_max, dB, or None.
-        rigid_rms: Root mean square distance of Gaussians from the rigid motion of their group in the observed time, as
-            a share of the scene's extent; None where it was not measured.
-        bending: Number of Gaussians with residuals: the part of the observed motion that no group's motion explains.
+        psnr_observed: PSNR of held-out views in the observed time, dB, or None.
+        psnr_later: PSNR of views past t_max, dB, or None.
+        rigid_rms: Root mean square distance of Gaussians from the rigid motion of their group in the observed time,
+            relative to the scene's extent; None if not measured.
+        bending: Number of Gaussians with residuals: motion that their group does not explain.
     """
 
     psnr_observed: float | None
@@ -32,7 +32,7 @@ class Quality:
     bending: int
 
     def text(self) -> str:
-        """In a line, for people."""
+        """One-line summary for users."""
         if self.psnr_observed is not None:
             later = "" if self.psnr_later is None else f", {self.psnr_later:.1f} dB past the observed time"
             return f"held-out views {self.psnr_observed:.1f} dB PSNR{later}"
@@ -44,15 +44,15 @@ class Quality:
 
 
 def of(scene: Scene, path: Path | None = None) -> Quality:
-    """What is known of a scene's error.
+    """Collect the known errors of a scene.
 
     Args:
         scene: The scene.
-        path: Its file. An evaluation beside it counts where it is not older and is of a scene of this name and number
-            of Gaussians.
+        path: Its file, or None. An evaluation beside it is used if it is not older and has the same scene name and
+            number of Gaussians.
 
     Returns:
-        What is known.
+        The known errors.
     """
     splits = _evaluation(scene, path)
     counts = np.bincount(scene.motion_ids, minlength=len(scene.groups)) if len(scene.means) else np.zeros(0)
@@ -64,7 +64,7 @@ def of(scene: Scene, path: Path | None = None) -> Quality:
 
 
 def _evaluation(scene: Scene, path: Path | None) -> dict[str, Any]:
-    """The splits of the evaluation beside a scene file; empty where there is none of this scene."""
+    """Splits of the evaluation beside a scene file; empty if there is none for this scene."""
     if path is None:
         return {}
     for place in (path.with_suffix(".evaluation.json"), path.with_name("evaluation.json")):
@@ -74,7 +74,7 @@ def _evaluation(scene: Scene, path: Path | None) -> dict[str, Any]:
             found = strict_json.read(place, errors.SceneFileError)
             if found["scene"] == scene.name and found["train"]["gaussians"] == len(scene.means):
                 return found["splits"]
-        except (OSError, errors.SceneFileError, KeyError, TypeError):  # not there, or no evaluation
+        except (OSError, errors.SceneFileError, KeyError, TypeError):  # missing, or not an evaluation
             continue
     return {}
 

@@ -1,4 +1,4 @@
-"""Stretches of rows that belong together."""
+"""Runs of consecutive rows with equal ids."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def runs(ids: np.ndarray) -> list[tuple[int, int, int]]:
-    """Stretches of equal neighbours among ids [N], as (start, stop, id)."""
+    """Runs of equal neighbours among ids [N], as (start, stop, id)."""
     if len(ids) == 0:
         return []
     cuts = np.flatnonzero(ids[1:] != ids[:-1]) + 1

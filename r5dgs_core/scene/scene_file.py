@@ -25,13 +25,13 @@ from .stored_embeddings import Meanings
 FORMAT = "r5dgs scene"
 JSON_MEMBER = "scene.json"
 
-# Fixed point: stored int16 i stands for i / scale.
+# Fixed point: a stored int16 i represents i / scale.
 FIXED_POINT = {"quats": 32767.0, "residual_quats": 32767.0, "log_scales": 2048.0, "opacity_logits": 1024.0}
 _QUATS = ("quats", "residual_quats")
-_READ_BEFORE = 1e-7  # float32 rounding of what was read
-_QUATS_AT_ONCE = 1 << 15  # what the processor's cache holds
+_READ_BEFORE = 1e-7  # float32 rounding error of decoded components
+_QUATS_AT_ONCE = 1 << 15  # rows per block, sized for the CPU cache
 _HALF = ("sh", "shading", "residual_offsets", "residual_log_scales")
-_TRACKS = ("track_times", "track_poses")  # left out where nothing moves
+_TRACKS = ("track_times", "track_poses")  # omitted if nothing moves
 _REQUIRED = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "background_sh")
 _STORED_DTYPES = {name: {np.dtype(dtype).newbyteorder("<").str} for name, dtype in DTYPES.items()}
 for _name in FIXED_POINT:
@@ -42,12 +42,12 @@ _log = logging.getLogger(__name__)
 
 
 def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
-    """Write a scene, atomically: the old file stays until the new one is complete and on the disk.
+    """Write a scene atomically: the old file is kept until the new one is complete and on disk.
 
     Args:
-        scene: The scene; checked first.
-        path: Where to, its folder must exist.
-        exact: Store everything in the precision of memory instead of the compact one.
+        scene: The scene; validated first.
+        path: Target file in an existing folder.
+        exact: Store all arrays in their in-memory precision instead of the compact one.
 
     Returns:
         The path written.
@@ -65,12 +65,12 @@ def write(scene: Scene, path: str | Path, *, exact: bool = False) -> Path:
 
 
 def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
-    """Read and check a scene. Raises `SceneFileError` naming the member and what was expected.
+    """Read and validate a scene. Raises `SceneFileError` naming the member and what was expected.
 
     Args:
         path: The file.
-        guard: Entered around each array, entry and rule, for callers that want all faults (`findings`). What it keeps
-            an error of is `findings.UNREAD` in the result.
+        guard: Context manager entered around each array, entry and rule, for callers that collect all faults
+            (`findings`). Parts whose errors it keeps are `findings.UNREAD` in the result.
     """
     with Archive(Path(path)) as archive:
         scene = _read_zip(archive, guard)
@@ -81,15 +81,17 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Scene:
 
 
 def is_exact(path: str | Path) -> bool:
-    """Whether a file stores anything in the precision of memory that the compact form would round: who writes what was
-    read of it loses nothing with ``exact``."""
+    """Return True if a file stores any array more precisely than the compact form.
+
+    After reading such a file, write with ``exact`` to avoid losses.
+    """
     with Archive(Path(path)) as archive:
         headers = _read_headers(archive, _read_json(archive), (*FIXED_POINT, *_HALF))
     return any(header.dtype == "<f4" for header in headers.values())
 
 
 def read_meanings(path: str | Path) -> Meanings | None:
-    """Return only the stored embeddings of a scene; None if it has none. Raises as `read` does."""
+    """Read only the stored embeddings of a scene; returns None if it has none. Raises as `read` does."""
     place = str(path)
     with Archive(Path(path)) as archive:
         top = _read_json(archive)
@@ -107,7 +109,7 @@ def read_meanings(path: str | Path) -> Meanings | None:
 
 
 def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
-    """Warn of a scene that was baked far from its world's origin, without the feature `origin`."""
+    """Warn about a scene baked far from its world's origin without the feature `origin`."""
     some = slice(None, None, max(1, len(scene.means) // 1000))
     if len(scene.means) < 2:
         return
@@ -124,16 +126,16 @@ def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
 
 
 def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:
-    if not _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED):  # made scenes, of equal Gaussians or objects
+    if not _write_members(scene, stream, exact, zipfile.ZIP_DEFLATED):  # synthetic scenes with many equal rows
         stream.seek(0)
         stream.truncate()
         _write_members(scene, stream, exact, zipfile.ZIP_STORED)
 
 
 def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> bool:
-    """Write the zip; returns False if it compresses so well that a reader would take it for a bomb."""
+    """Write the zip; returns False if it compresses so well that readers would reject it as a zip bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
-        still = _TRACKS if len(scene.track_times) == 1 else ()  # then every pose is the identity
+        still = _TRACKS if len(scene.track_times) == 1 else ()  # every pose is then the identity
         arrays = [name for name in DTYPES if getattr(scene, name) is not None and name not in still]
         head = {
             "format": FORMAT,
@@ -155,7 +157,7 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> None:
-    # A fixed date makes equal scenes equal files.
+    # A fixed date gives equal scenes identical files.
     entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
     entry.compress_type = compression
     entry.external_attr = 0o644 << 16
@@ -163,7 +165,7 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes, compression: int) -> 
 
 
 def _encode(name: str, array: np.ndarray) -> np.ndarray:
-    """Compact form of a member, or the member itself where the compact one cannot hold it."""
+    """Compact form of an array, or the array itself if the compact form cannot represent it."""
     if name in FIXED_POINT:
         scaled = _whole_units(array) if name in _QUATS else np.rint(array.astype(np.float64) * FIXED_POINT[name])
         fits = len(array) == 0 or np.abs(scaled).max() <= 32767
@@ -174,17 +176,17 @@ def _encode(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _whole_units(quats: np.ndarray) -> np.ndarray:
-    """Quaternions as whole numbers; those that they were read from, where they were.
+    """Quantised quaternions; for decoded ones, the stored integers that they were decoded from.
 
-    Reading normalises, so that the stored ones may be longer or shorter by their rounding, and others a step beside
-    them would be written for what was read.
+    Decoding normalises, so the stored integers may be slightly longer or shorter than a unit quaternion. Rounding the
+    decoded values directly could then give neighbouring integers.
     """
     unit = FIXED_POINT["quats"]
     result = np.empty(quats.shape)
     for start in range(0, len(quats), _QUATS_AT_ONCE):
         wide = np.ascontiguousarray(
             quats[start : start + _QUATS_AT_ONCE].T, np.float64
-        )  # columns: numpy is slow at fours
+        )  # by column, because numpy is slow on rows of four
         best = np.rint(wide * unit)
         for radius in (unit - 0.75, unit + 0.75):
             other = np.clip(np.rint(wide * radius), -unit, unit)
@@ -243,8 +245,10 @@ def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
 
 
 def _read_json(archive: Archive, guard: findings.Guard = findings.STRICT) -> scene_json.Row:
-    """Content of the JSON member. It is `findings.UNREAD` if the guard keeps an error of it as JSON; a file of another
-    kind or version always raises, as its arrays may mean something else."""
+    """Content of the JSON member, or `findings.UNREAD` if it is not valid JSON and the guard keeps the error.
+
+    A file of another kind or version always raises, because its arrays may have another meaning.
+    """
     where = f"{archive.place}: {JSON_MEMBER}"
     if JSON_MEMBER not in archive:
         raise errors.SceneFileError(f"{where}: expected in a .r5dgs file, not found; this is another kind of zip")
@@ -271,9 +275,9 @@ def _parse_json(archive: Archive, where: str) -> Any:
 def _read_headers(
     archive: Archive, top: scene_json.Row, names: Iterable[str], guard: findings.Guard = findings.STRICT
 ) -> dict[str, Header]:
-    """Headers of some arrays that a file has; `findings.UNREAD` for one whose error the guard keeps.
+    """Headers of the requested arrays that a file has; `findings.UNREAD` if the guard keeps the error.
 
-    An optional one is absent if scene.json does not list it, so that a lost one is noticed.
+    Optional arrays count as present only if scene.json lists them, so that a lost one is detected.
     """
     listed = top.words("arrays")
     if listed is findings.UNREAD:
@@ -300,7 +304,7 @@ def _shapes(headers: dict[str, Header]) -> dict[str, tuple[int, ...]]:
 def _read_arrays(
     archive: Archive, there: Collection[str], names: Iterable[str], guard: findings.Guard = findings.STRICT
 ) -> dict[str, np.ndarray | None]:
-    """Arrays in their dtypes of memory, None for those that a file does not have."""
+    """Arrays in their in-memory dtypes, None for those that the file lacks."""
 
     def read_one(name: str) -> np.ndarray:
         return _decode(name, archive.array(f"{name}.npy", _STORED_DTYPES[name]))

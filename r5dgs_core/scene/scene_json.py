@@ -1,4 +1,4 @@
-"""The JSON member of a scene file: everything of a `Scene` that is not an array of Gaussians or knots."""
+"""The JSON member of a scene file: all fields of `Scene` except the arrays."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 
 def dump(scene: Scene, head: dict[str, Any]) -> bytes:
-    """The JSON member as UTF-8, with the entries of ``head`` first."""
+    """JSON member as UTF-8, with the entries of ``head`` first."""
     light = scene.light_direction
     tree = {
         **head,
@@ -76,7 +76,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
     }
     try:
         data = json.dumps(tree, indent=1, allow_nan=False, default=_plain, ensure_ascii=False).encode()
-    except (ValueError, TypeError, RecursionError) as error:  # of what the caller put into provenance and needs
+    except (ValueError, TypeError, RecursionError) as error:  # caused by the caller's provenance or needs
         raise errors.SceneFileError(f"scene.json: expected what JSON can hold: {error}") from error
     strict_json.parse(data, "scene.json", errors.SceneFileError, "change names, provenance or needs")
     return data
@@ -84,12 +84,12 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
 
 @dataclass(slots=True)
 class Row:
-    """An object of the JSON member; each wrong entry is a fault of its own.
+    """Typed access to an object of the JSON member; each invalid entry is a separate fault.
 
     Attributes:
         data: The object.
-        place: File, member and way to the object, for messages.
-        guard: Entered around each entry; an entry whose error it keeps is `findings.UNREAD`.
+        place: File, member and path to the object, for messages.
+        guard: Context manager entered around each entry; entries whose errors it keeps are `findings.UNREAD`.
     """
 
     data: dict[str, Any]
@@ -97,7 +97,7 @@ class Row:
     guard: findings.Guard = findings.STRICT
 
     def get(self, key: str, kind: type) -> Any:
-        """The value of a key, of the wanted JSON type; whole numbers pass for float."""
+        """Value of a key with the given JSON type; integers are accepted as float."""
         with self.guard():
             value = self.data.get(key)
             if kind is float and isinstance(value, int) and not isinstance(value, bool):
@@ -113,11 +113,11 @@ class Row:
         return None if self.lacks(key) else self.get(key, kind)
 
     def has(self, key: str) -> bool:
-        """True if there is such a key."""
+        """True if the key exists."""
         return self.data is not findings.UNREAD and key in self.data
 
     def lacks(self, key: str) -> bool:
-        """True if a key is missing or null."""
+        """True if the key is missing or null."""
         return self.data is not findings.UNREAD and self.data.get(key) is None
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -136,12 +136,12 @@ class Row:
         return findings.UNREAD
 
     def floats(self, key: str, count: int) -> Any:
-        """A tuple of so many finite numbers."""
+        """Tuple of ``count`` finite numbers."""
         values = self.numbers(key, (count,))
         return values if values is findings.UNREAD else tuple(values.tolist())
 
     def words(self, key: str) -> tuple[str, ...]:
-        """A list of strings."""
+        """Tuple of strings."""
         with self.guard():
             words = self.get(key, list)
             for word in words:
@@ -151,7 +151,7 @@ class Row:
         return findings.UNREAD
 
     def each(self, key: str, reader: Callable[[Row], Any]) -> tuple[Any, ...]:
-        """The objects of a list, each through ``reader``."""
+        """Objects of a list, each converted by ``reader``."""
         rows = self.get(key, list)
         if rows is findings.UNREAD:
             return rows
@@ -167,7 +167,7 @@ class Row:
 
 
 def fields(top: Row) -> dict[str, Any]:
-    """The fields of `Scene` that are not arrays of the zip. Raises `SceneFileError` naming place and key."""
+    """Fields of `Scene` that are not arrays of the zip. Raises `SceneFileError` naming place and key."""
     return {
         "name": top.get("name", str),
         "objects": top.each("objects", _read_object),
@@ -277,7 +277,7 @@ def _read_view(row: Row) -> View:
 
 
 def _table_tree(found: Table) -> dict[str, Any]:
-    """JSON form of what `table` reads."""
+    """JSON form of an embedding table; inverse of `table`."""
     card = found.encoder
     return {
         "encoder": {
@@ -305,7 +305,7 @@ def _view_tree(view: View) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON form of what provenance may hold besides JSON types."""
+    """JSON form of numpy values and paths in provenance."""
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     if isinstance(value, Path):

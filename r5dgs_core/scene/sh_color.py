@@ -1,7 +1,7 @@
-"""Real spherical harmonics to degree 3: how the colour of a Gaussian depends on the direction it is seen from.
+"""Colours of Gaussians from real spherical harmonics up to degree 3.
 
-The basis is that of `scene.spherical_harmonics`, which the light tier has, too. Colours are display-referred sRGB and
-carry an offset of one half, so that all-zero coefficients are middle grey. One code serves numpy and torch.
+The basis is that of `scene.spherical_harmonics`. Colours are display-referred sRGB with an offset of one half, so that
+all-zero coefficients are mid-grey. The same code serves numpy and torch.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def evaluate(sh: Array, directions: Array) -> Array:
         Colour minus one half. [..., 3]
     """
     degree = degree_of(sh.shape[-2])
-    if degree == 0:  # independent of the direction: no basis to evaluate
+    if degree == 0:  # independent of the direction
         return C0 * sh[..., 0, :]
     return (basis(directions, degree)[..., None] * sh).sum(-2)
 
@@ -55,7 +55,7 @@ def to_rgb(sh: Array, directions: Array) -> Array:
 
 
 def rgb_to_dc(rgb: Array) -> Array:
-    """Coefficient of degree 0 that shows this display-referred colour from everywhere. [..., 3] -> [..., 3]"""
+    """Degree-0 coefficient of a display-referred colour that is the same from all directions. [..., 3] -> [..., 3]"""
     return (rgb - 0.5) / C0
 
 

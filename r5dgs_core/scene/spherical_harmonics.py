@@ -1,7 +1,7 @@
-"""The basis of real spherical harmonics to degree 3, and coefficients of colours that are carried by a linear map.
+"""Basis of real spherical harmonics up to degree 3, and coefficients under linear maps.
 
 The basis has the order and signs of 3DGS files: K = (degree + 1)^2 functions, ordered by degree l and then by order
-m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). One code serves numpy and torch.
+m = -l .. l, with the Condon-Shortley sign (the three linear terms are -y, z, -x). The same code serves numpy and torch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_DEGREE = 3
 _TURNED_AT_ONCE = 4096
 _TURN = np.pi * (1 + 5**0.5) * (np.arange(48) + 0.5)
 _HEIGHT = 1 - (2 * np.arange(48) + 1) / 48
-# Directions spread evenly over the sphere. [48, 3]
+# Evenly distributed directions (Fibonacci sphere). [48, 3]
 _DIRECTIONS = np.stack(
     [np.sqrt(1 - _HEIGHT**2) * np.cos(_TURN), np.sqrt(1 - _HEIGHT**2) * np.sin(_TURN), _HEIGHT], axis=-1
 )
@@ -39,7 +39,7 @@ C3_2_DIFFERENCE = math.sqrt(105 / (16 * math.pi))
 
 
 def degree_of(count: int) -> int:
-    """The degree with ``count`` basis functions: 1, 4, 9, 16 give 0, 1, 2, 3. ValueError for any other count."""
+    """Degree with ``count`` basis functions: 1, 4, 9, 16 give 0, 1, 2, 3. ValueError for any other count."""
     for degree in range(MAX_DEGREE + 1):
         if (degree + 1) ** 2 == count:
             return degree
@@ -54,7 +54,7 @@ def basis(directions: Array, degree: int) -> Array:
         degree: 0 to 3.
 
     Returns:
-        Their values, same library and dtype as ``directions``. [..., (degree + 1) ** 2]
+        Values in the library and dtype of ``directions``. [..., (degree + 1) ** 2]
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics: expected a degree from 0 to {MAX_DEGREE}, got {degree}")
@@ -85,10 +85,11 @@ def basis(directions: Array, degree: int) -> Array:
 
 
 def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
-    """What coefficients are multiplied with when the body that wears the colour is carried by a linear map.
+    """Matrix that transforms coefficients when the object with that colour is transformed by a linear map.
 
-    The colour seen along d after the map is the one seen along A^-1 d before it. Rotations, mirrors and uniform scales
-    do not mix the bands, so that this is exact for them; for any other map it is the best fit over all directions.
+    The colour seen along d after the map is that seen along A^-1 d before it. The result is exact for rotations,
+    mirrors and uniform scales, which do not mix the bands; for any other map it is a least-squares fit over all
+    directions.
 
     Args:
         linear: A, invertible. [3, 3]
@@ -103,14 +104,14 @@ def change_of_basis(linear: np.ndarray, degree: int) -> np.ndarray:
 
 
 def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Coefficients of Gaussians that are carried by a linear map, see `change_of_basis`.
+    """Coefficients of Gaussians transformed by a linear map, see `change_of_basis`.
 
     Args:
         sh: Coefficients. [N, K, C]
         linear: A, invertible. [3, 3]
 
     Returns:
-        Coefficients, same dtype; ``sh`` itself where they are the same for every map. [N, K, C]
+        Coefficients, same dtype; ``sh`` itself for degree 0. [N, K, C]
     """
     degree = degree_of(sh.shape[-2])
     if degree == 0 or len(sh) == 0:
@@ -123,16 +124,17 @@ def carried(sh: np.ndarray, linear: np.ndarray) -> np.ndarray:
 
 
 def turned(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Coefficients of colours that turn with their body: the result seen along d is ``sh`` seen along R^T d.
+    """Rotate coefficients with their body: the result seen along d is ``sh`` seen along R^T d.
 
-    Bands do not mix, so the change of basis is exact; it is solved from more directions than there are functions.
+    Exact, because rotations do not mix bands. The change of basis is solved from more directions than there are
+    functions.
 
     Args:
         sh: Coefficients. [N, K, C]
         quats: Rotations R, unit wxyz, one for all or one for each. [4] or [N, 4]
 
     Returns:
-        Coefficients in the turned frame, float64. [N, K, C]
+        Rotated coefficients, float64. [N, K, C]
     """
     degree = degree_of(sh.shape[-2])
     if degree == 0 or len(sh) == 0:
@@ -148,6 +150,6 @@ def turned(sh: np.ndarray, quats: np.ndarray) -> np.ndarray:
 
 
 def _library(array: Array):
-    """The module that made the array: torch where it is a tensor (torch is then loaded already), else numpy."""
+    """Return torch if the array is a tensor, else numpy. Never imports torch."""
     torch = sys.modules.get("torch")
     return torch if torch is not None and isinstance(array, torch.Tensor) else np

@@ -1,6 +1,6 @@
-"""Embeddings of objects and words that a scene stores.
+"""Embeddings of objects and words that are stored in a scene.
 
-Notation: M objects, V views of an object at most, D numbers of an embedding, W words, C canonical phrases.
+Notation: M objects, at most V views of an object, D numbers of an embedding, W words, C canonical phrases.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from .scene import Scene
 
 @dataclass(frozen=True)
 class Meanings:
-    """Embeddings that a scene stores, by which words find objects that are called otherwise.
+    """Stored embeddings of a scene, for finding objects by words other than their names.
 
     Attributes:
         object_ids: Ids of the M objects, in the order of ``embeddings``.
-        embeddings: One row per object, unit, zero for an object without. [M, D]
+        embeddings: One unit row per object, zero if it has none. [M, D]
         vocabulary: The W words with an embedding.
-        vocabulary_embeddings: One row per word, unit. [W, D]
-        table: What is known about them, None in files that say nothing.
-        canonical_embeddings: One row per canonical phrase, unit. [C, D] or None
-        view_embeddings: Of each object, one row per view, unit, zero past the last. [M, V, D] or None
+        vocabulary_embeddings: One unit row per word. [W, D]
+        table: Metadata of the embeddings, None if the file has none.
+        canonical_embeddings: One unit row per canonical phrase. [C, D] or None
+        view_embeddings: For each object, one unit row per view, zero-padded. [M, V, D] or None
     """
 
     object_ids: tuple[int, ...]
@@ -37,7 +37,7 @@ class Meanings:
 
     @classmethod
     def of(cls, scene: Scene) -> Meanings | None:
-        """Those of a scene; None where it stores none."""
+        """Return the embeddings of a scene, or None if it stores none."""
         if scene.embeddings is None or scene.vocabulary_embeddings is None:
             return None
         return cls(

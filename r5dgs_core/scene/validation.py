@@ -1,6 +1,6 @@
-"""Checks that a `Scene` is consistent: shapes, types, finite numbers, unit quaternions, ranges, references.
+"""Consistency checks of a `Scene`: shapes, dtypes, finite numbers, unit quaternions, ranges, references.
 
-Reading and writing apply the same rules.
+Reading and writing apply the same checks.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from .scene import DTYPES, EMBEDDINGS, ROLES, MotionGroup, Scene
 _fail = array_shapes.fail
 _UNIT_TOLERANCE = 1e-3
 
-# Largest numbers that a scene may hold: single precision can square them, and no motion overflows within its times.
+# Largest numbers of a scene: float32 can square them, and no motion overflows within its times.
 _LARGE = 1e9  # colours, logits, embeddings
-_LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # what is thinner than single precision is drawn as thin as can be
+_LOG_SCALE, _LEAST_LOG_SCALE = 40.0, -1e4  # thinner Gaussians than float32 resolves are drawn at the minimum width
 _SPIN = 1e6  # rad per unit of time, and per its square
-_LEAST_LENGTH = 1e-30  # of the near plane and of radii
-_LEAST_STEP, _MOST_TIME = 1e-12, 1e12  # between observed times
+_LEAST_LENGTH = 1e-30  # smallest near plane and radius
+_LEAST_STEP, _MOST_TIME = 1e-12, 1e12  # smallest step between observed times, and largest time
 _RATES = np.repeat([cameras.FARTHEST, _SPIN, cameras.FARTHEST, _SPIN], 3)
 _POSE = np.repeat([_LARGE, cameras.FARTHEST], [4, 3])
 _LIMITS: dict[str, float | np.ndarray] = {
@@ -64,7 +64,7 @@ _MODEL_LIMITS = {
     "frequency": _SPIN,
 }
 _MOST_ID = np.iinfo(np.int32).max
-_CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # in memory any floats, which writing converts
+_CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing
 _DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}
 _ARRAYS = (*DTYPES, "light_direction", "origin")
 
@@ -74,8 +74,9 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
 
     Args:
         scene: The scene; fields may be `findings.UNREAD` if the guard kept their errors.
-        place: For messages.
-        guard: Entered around each array, rule, object, motion group and camera, for callers that want all faults.
+        place: File, for messages.
+        guard: Context manager entered around each array, rule, object, motion group and camera, for callers that
+            collect all faults.
     """
     given = {name: array for name in _ARRAYS if (array := getattr(scene, name)) is not None}
     for name, array in given.items():
@@ -110,7 +111,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
 
 
 def _listed(values: Sequence[Any]) -> Sequence[Any]:
-    """The items of a field; none if it could not be read."""
+    """Items of a field; empty if it could not be read."""
     return () if values is findings.UNREAD else values
 
 
@@ -142,8 +143,8 @@ def check_meanings(
     Args:
         arrays: `EMBEDDINGS` by name.
         table: Encoder, thresholds and views of the embeddings.
-        place: For messages.
-        guard: Entered around each array and rule.
+        place: File, for messages.
+        guard: Context manager entered around each array and rule.
     """
     for name, array in arrays.items():
         with guard():
@@ -170,13 +171,13 @@ def check_range(name: str, values: np.ndarray, place: str) -> None:
 def _check_range(
     place: str, name: str, values: np.ndarray, limit: float | np.ndarray, low: float | None = None
 ) -> None:
-    """Raise `SceneFileError` with the first row that holds NaN or a number out of range.
+    """Raise `SceneFileError` for the first row with NaN or a number out of range.
 
     Args:
         place, name: For the message.
         values: Any shape.
-        limit: Largest absolute value, of all or of each column.
-        low: Smallest value; the negative limit if None.
+        limit: Largest absolute value, for all or by column.
+        low: Smallest value, or None for the negative limit.
     """
     least = -limit if low is None else low
     if not values.size or (values.min() >= np.max(least) and values.max() <= np.min(limit)):
@@ -244,7 +245,7 @@ def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
     with guard():
         if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
-    with guard(), np.errstate(invalid="ignore"):  # of infinite means, which are a fault of their own
+    with guard(), np.errstate(invalid="ignore"):  # infinite means are reported separately
         last = scene.track_poses[:, -1]
         off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
         if off.any():
@@ -336,7 +337,7 @@ def _check_group(
 
 
 def _check_model(group: MotionGroup, place: str, guard: findings.Guard) -> None:
-    """Raise `SceneFileError` with the name of a rate that playback cannot use."""
+    """Raise `SceneFileError` naming a rate that playback cannot use."""
     for name, limit in _MODEL_LIMITS.items():
         with guard():
             value = np.max(np.abs(getattr(group.model, name)))
