@@ -1,7 +1,7 @@
-"""The deformation field f_def: how each Gaussian differs from its canonical state at a time of the observed interval.
+"""Deformation field f_def: change of each Gaussian from its canonical state at an observed time.
 
-Notation: N Gaussians, W the width of the network. All Gaussians of a picture share one time, so the part of a layer
-that reads the time is one vector, added like a bias; the result is that of the concatenated input.
+Notation: N Gaussians, W width of the network. All Gaussians of a picture share one time, so the part of a layer that
+reads the time is a single vector, added like a bias. The result equals that of the concatenated input.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ class FieldShape:
     """Size of a deformation field.
 
     Attributes:
-        depth: Hidden layers; the encodings enter again after half of them.
-        width: Their width.
-        position_bands: Octaves of the positions' encoding.
-        time_bands: Octaves of the time's.
-        time_width: Hidden width of the network that reads the time first, 0 for none.
-        time_features: What that network gives.
+        depth: Hidden layers; the encodings are concatenated again after half of them.
+        width: Width of the hidden layers.
+        position_bands: Octaves of the position encoding.
+        time_bands: Octaves of the time encoding.
+        time_width: Hidden width of the time network, 0 for no time network.
+        time_features: Outputs of the time network.
     """
 
     depth: int = 8
@@ -45,11 +45,11 @@ SHAPES = {
 
 @dataclass(frozen=True)
 class Deltas:
-    """What a field adds to the canonical state.
+    """Changes of the canonical state.
 
     Attributes:
         offsets: Added to the centres. [N, 3]
-        quats: Rotations that are applied after the canonical ones, unit wxyz. [N, 4]
+        quats: Rotations applied after the canonical ones, unit wxyz. [N, 4]
         log_scales: Added to the log scales. [N, 3]
     """
 
@@ -59,14 +59,14 @@ class Deltas:
 
 
 class DeformationField(nn.Module):
-    """A perceptron from canonical centre and time to `Deltas`; untrained it is the identity.
+    """MLP from canonical centre and time to `Deltas`. The untrained field is the identity.
 
     Args:
-        shape: Its size.
+        shape: Size of the network.
         generator: Source of the initial weights.
 
-    Source: TRACE and FreeGave (f_def), after Deformable 3D Gaussians (Yang et al. 2024); heads that start at zero are
-        ours, so that nothing jumps when the deformation sets in.
+    Source: TRACE and FreeGave (f_def), after Deformable 3D Gaussians (Yang et al. 2024). Unlike there, heads start at
+        zero, so that nothing jumps when the deformation is enabled.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator):
@@ -92,12 +92,12 @@ class DeformationField(nn.Module):
             self.head.bias.copy_(torch.tensor([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0]))
 
     def forward(self, means: Tensor, t: float, chunk: int = 65536) -> Deltas:
-        """Deltas of Gaussians at a time.
+        """Return the deltas of Gaussians at a time.
 
         Args:
             means: Canonical centres. [N, 3]
             t: Scene time.
-            chunk: Gaussians that pass at once.
+            chunk: Number of Gaussians per evaluation; bounds the memory.
         """
         time = self._time_features(means, t)
         out = encoding.in_chunks(lambda rows: self._run(rows, time), means, chunk)

@@ -1,4 +1,4 @@
-"""Positional encoding of positions and times, and the perceptrons that read it."""
+"""Positional encoding of positions and times, and helpers of the MLPs that use it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.utils import checkpoint as checkpointing
 
 
 def encode(x: Tensor, bands: int) -> Tensor:
-    """The identity, then sine and cosine of 2^k x for k = 0 .. bands - 1, without a factor of pi.
+    """Return x, then sine and cosine of 2^k x for k = 0 .. bands - 1, without a factor of pi.
 
     Args:
         x: Positions or times. [..., C]
@@ -29,12 +29,12 @@ def encode(x: Tensor, bands: int) -> Tensor:
 
 
 def encoded_size(channels: int, bands: int) -> int:
-    """Length of an `encode` of ``channels`` numbers."""
+    """Number of channels that `encode` returns for ``channels`` inputs."""
     return channels * (1 + 2 * bands)
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A linear layer whose weights come from ``generator``, in PyTorch's default distribution."""
+    """Create a linear layer with PyTorch's default initialisation, drawn from ``generator``."""
     layer = nn.Linear(inputs, outputs)
     bound = 1 / math.sqrt(inputs)
     with torch.no_grad():
@@ -44,9 +44,9 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 def in_chunks(function: Callable[[Tensor], Tensor], rows: Tensor, chunk: int) -> Tensor:
-    """``function`` of the rows, at most ``chunk`` at a time, so that one chunk's intermediate values are in memory.
+    """Apply ``function`` to the rows in chunks, so that intermediate values of one chunk are in memory.
 
-    With gradients a chunk is evaluated again on the way back, where there is more than one.
+    With gradients, several chunks are recomputed in the backward pass (checkpointing).
     """
     if len(rows) <= chunk:
         return function(rows)

@@ -1,4 +1,4 @@
-"""The trainable Gaussians: raw parameters by name, with labels that select, split and prune carry along.
+"""Trainable Gaussians: raw parameters by name, with labels that are kept in step.
 
 Notation: N Gaussians, K spherical harmonics bases.
 """
@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-# ``sh`` [N, 1, 3] is the constant colour, ``sh_rest`` [N, K - 1, 3] what depends on the view: they learn at different
-# rates. ``shading`` is the vector g of `posing.py`.
+# ``sh`` [N, 1, 3] is the constant colour and ``sh_rest`` [N, K - 1, 3] the view-dependent part, as they have different
+# learning rates. ``shading`` is the vector g of `posing.py`.
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh", "sh_rest", "shading")
-# What only some runs train: identity encodings.
+# Parameters of some runs only: identity encodings.
 OPTIONAL = ("identities",)
 
 
@@ -22,8 +22,8 @@ class Gaussians:
 
     Args:
         params: Tensors by name: ``means`` [N, 3], ``quats`` [N, 4] wxyz, ``log_scales`` [N, 3], ``opacity_logits`` [N],
-            ``sh`` [N, 1, 3], ``sh_rest`` [N, K - 1, 3] and ``shading`` [N, 3]; where they are trained with the
-            rest also ``identities`` [N, 16].
+            ``sh`` [N, 1, 3], ``sh_rest`` [N, K - 1, 3] and ``shading`` [N, 3]; optionally ``identities`` [N, 16], if
+            they are trained together.
         motion_ids: Motion group of each Gaussian. [N] int64
 
     Raises:
@@ -46,7 +46,7 @@ class Gaussians:
         raise AttributeError(name)
 
     def add(self, name: str, values: Tensor) -> None:
-        """Give every Gaussian a parameter that it had not; before an optimizer is made. [N, ...]"""
+        """Add a parameter [N, ...]. Call it before the optimizer is created."""
         _check(name, values, len(self))
         self.params[name] = values.detach().requires_grad_(True)
 
@@ -60,7 +60,7 @@ class Gaussians:
         )
 
     def keep(self, optimizer: torch.optim.Optimizer | None, mask: Tensor) -> None:
-        """Keep the rows where ``mask`` [N] is true, optimizer state included."""
+        """Keep the rows for which ``mask`` [N] is True, including the optimizer's state."""
         self.motion_ids = self.motion_ids[mask]
         self._rebuild(optimizer, lambda _, tensor: tensor[mask], lambda _, moment: moment[mask])
 

@@ -18,7 +18,7 @@ class GroupPoses:
 
 
 def at_rest(count: int) -> GroupPoses:
-    """Poses of groups that are where they were."""
+    """Return the identity pose for all groups."""
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return GroupPoses(quats, torch.eye(3).expand(count, 3, 3).contiguous(), torch.zeros(count, 3))

@@ -1,4 +1,4 @@
-"""Plain tensors: the only ones that are accepted from files of tensors."""
+"""Validation of tensors from files: only plain tensors are accepted."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 
 
 def fault(tensor: Tensor, dtypes: Collection[torch.dtype] | None = None) -> str:
-    """Return what is wrong with a tensor of a file; "" for a dense one of real numbers that do not share memory.
+    """Describe the problem with a tensor of a file; returns "" for dense real tensors without shared elements.
 
     Args:
         tensor: The tensor.
-        dtypes: Accepted types of numbers; all real ones if None.
+        dtypes: Accepted dtypes; None for all real ones.
     """
     if _is_plain(tensor) and (dtypes is None or tensor.dtype in dtypes):
         return ""
@@ -34,7 +34,7 @@ def _is_plain(tensor: Tensor) -> bool:
 
 
 def _overlaps(tensor: Tensor) -> bool:
-    """Return True if two elements share memory, as those of an axis with stride 0 do."""
+    """Return True if two elements share memory, e.g. along an axis with stride 0."""
     end = 1
     for stride, length in sorted(zip(tensor.stride(), tensor.shape, strict=True)):
         if length > 1:

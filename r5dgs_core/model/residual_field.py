@@ -1,13 +1,13 @@
-"""A residual field: how bodies that bend or breathe differ from their rigid track, by nodes spread over each body.
+"""Residual field: deviation of flexible bodies from their rigid track, interpolated from nodes on each body.
 
-Notation: Q nodes of all flexible bodies together, S knots, n members of a body. Node j at the canonical place p_j with
-the length h of its body carries at each knot an offset d_j and three rows l_j, the change of the offset per length h
-along each axis. A member at x, with normalised weights w_j(x) that fall off over the spacing of the nodes, gets
+Notation: Q nodes of all flexible bodies together, S knots, n members of a body. Node j at the canonical position p_j,
+on a body of length h, has at each knot an offset d_j and three rows l_j, the change of the offset per length h along
+each axis. With normalised weights w_j(x) that fall off over the spacing of the nodes, a member at x gets
 
     offset o(x) = sum_j w_j (d_j + l_j^T (x - p_j) / h),    gradient F(x) = I + sum_j w_j l_j^T / h
 
-F turns the Gaussian and stretches its axes. What is left of a rigid motion in o is taken out, to first order: it
-belongs to the track. Between knots values follow the curve of the tracks.
+F rotates the Gaussian and stretches its axes. The rigid part of o belongs to the track and is removed, to first order.
+Between knots, values follow the curve of the tracks.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..playback.visibility import SEEN_OPACITY
 
 @dataclass(frozen=True)
 class Change:
-    """What a field does to the members of its bodies, in canonical coordinates.
+    """Effect of a field on the members of its bodies, in canonical coordinates.
 
     Attributes:
-        rows: The members among all Gaussians. [n] int64
+        rows: Rows of the members among all Gaussians. [n] int64
         offsets: Added to the centres. [n, 3]
-        quats: Rotations applied to those of the Gaussians (turn q), unit wxyz. [n, 4]
+        quats: Rotations applied after those of the Gaussians (turn q), unit wxyz. [n, 4]
         log_scales: Added to the log scales. [n, 3]
     """
 
@@ -39,12 +39,12 @@ class Change:
 
 
 class ResidualField:
-    """Nodes on the flexible bodies with their values at the knots; at zero it changes nothing.
+    """Nodes on the flexible bodies with their values at the knots. Zero values change nothing.
 
-    All bodies pass together, F of them, padded to the most members and the most nodes of one.
+    All F bodies are evaluated in one batch, padded to the largest numbers of members and nodes.
 
     Args:
-        nodes: Canonical places. [Q, 3]
+        nodes: Canonical positions. [Q, 3]
         owners: Motion group of each node. [Q] int64
         values: d and the rows of l at the knots. [S, Q, 4, 3]
     """
@@ -64,7 +64,7 @@ class ResidualField:
         self._members: tuple[Tensor, Tensor, Tensor] | None = None
 
     def only(self, bodies: list[int]) -> ResidualField:
-        """The field of some of its bodies."""
+        """Return the field of some of its bodies."""
         kept = torch.isin(self.owners, torch.tensor(bodies, dtype=torch.int64))
         return ResidualField(self.nodes[kept], self.owners[kept], self.values.detach()[:, kept].clone())
 
@@ -76,14 +76,14 @@ class ResidualField:
         motion_ids: Tensor,
         weights: dict[int, float],
     ) -> Change:
-        """What happens to the members at a time; differentiable in the values and ``quats``.
+        """Return the change of the members at a time; differentiable in the values and ``quats``.
 
         Args:
             means: Canonical centres of all Gaussians. [N, 3]
             quats: Their rotations wxyz, any positive norm. [N, 4]
-            opacities: Weights of the members in the rigid motion that is taken out. [N]
+            opacities: Weights of the members in the rigid motion that is removed. [N]
             motion_ids: Their motion groups. [N] int64
-            weights: Of the knots at that time.
+            weights: Weights of the knots at that time.
         """
         index, there = self._members_of(motion_ids)
         if not bool(there.any()):
@@ -106,7 +106,7 @@ class ResidualField:
         return Change(where, offsets.flatten(0, 1)[kept], _turn(gradient), growth)
 
     def penalty(self, size: float, roughness: float) -> Tensor:
-        """Weighted sum of the mean squared value and of its second difference over the knots, per length of the body.
+        """Weighted sum of the mean squared value and second difference over the knots, relative to the body's length.
 
         Args:
             size: Weight of the values.
@@ -119,13 +119,13 @@ class ResidualField:
         return total
 
     def _members_of(self, motion_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Members of each body and which entries are some. [F, n]"""
+        """Members of each body, padded, and the mask of valid entries. [F, n]"""
         if self._members is None or not torch.equal(self._members[0], motion_ids):
             self._members = (motion_ids.clone(), *_padded(motion_ids, self.bodies))
         return self._members[1:]
 
     def _blend(self, x: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets [F, n, 3] and their gradients, column by axis of x, [F, n, 3, 3] of members at x."""
+        """Offsets [F, n, 3] of members at x and their gradients, one column per axis of x, [F, n, 3, 3]."""
         nodes = self.nodes[self._slots]
         squared = (x**2).sum(-1, keepdim=True) - 2 * x @ nodes.mT + (nodes**2).sum(-1)[:, None]
         squared = squared / (2 * self._spacings**2)
@@ -138,7 +138,7 @@ class ResidualField:
 
 
 def _padded(ids: Tensor, bodies: list[int]) -> tuple[Tensor, Tensor]:
-    """Where each body's id stands, padded with zeros, and which entries are some. [F, most of one]"""
+    """Rows with each body's id, padded with zeros, and the mask of valid entries. [F, largest count]"""
     found = [torch.nonzero(ids == body)[:, 0] for body in bodies]
     most = max((len(rows) for rows in found), default=0)
     index, there = torch.zeros(len(bodies), most, dtype=torch.int64), torch.zeros(len(bodies), most, dtype=torch.bool)
@@ -150,14 +150,14 @@ def _padded(ids: Tensor, bodies: list[int]) -> tuple[Tensor, Tensor]:
 def spread(
     means: Tensor, motion_ids: Tensor, opacities: Tensor, bodies: list[int], count: int, knots: int
 ) -> ResidualField:
-    """A field at zero: nodes on the members of bodies, each as far from the others as can be.
+    """Create a zero field with nodes on the members of bodies, by farthest point sampling.
 
     Args:
         means: Canonical centres of all Gaussians. [N, 3]
         motion_ids: Their motion groups. [N] int64
-        opacities: Members fainter than `SEEN_OPACITY` carry no node where others do. [N]
-        bodies: Motion groups that get nodes; those without members get none.
-        count: Nodes of each body, at most.
+        opacities: Members below `SEEN_OPACITY` get no node, unless the body has no others. [N]
+        bodies: Motion groups that get nodes, if they have members.
+        count: Most nodes per body.
         knots: Number of knots S.
     """
     nodes, owners = [means.new_zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)]
@@ -169,7 +169,7 @@ def spread(
             continue
         middle = points.median(0).values
         reach = (points - middle).norm(dim=1)
-        points = points[reach <= 1.5 * reach.quantile(0.9)]  # strays would take nodes away from the body
+        points = points[reach <= 1.5 * reach.quantile(0.9)]  # outliers would take nodes from the body
         chosen = _far_apart(points, middle, min(count, len(points)))
         nodes.append(points[chosen])
         owners.append(torch.full((len(chosen),), body, dtype=torch.int64))
@@ -178,7 +178,7 @@ def spread(
 
 
 def _far_apart(points: Tensor, start: Tensor, count: int) -> Tensor:
-    """Indices of ``count`` points, each the farthest from those before it; the first is farthest from ``start``."""
+    """Farthest point sampling: indices of ``count`` points, the first farthest from ``start``."""
     chosen = [int((points - start).norm(dim=1).argmax())]
     distance = (points - points[chosen[0]]).norm(dim=1)
     while len(chosen) < count:
@@ -188,7 +188,7 @@ def _far_apart(points: Tensor, start: Tensor, count: int) -> Tensor:
 
 
 def _lengths(nodes: Tensor) -> tuple[float, float]:
-    """Length of a body (root mean square distance from the middle) and spacing of its nodes (mean nearest distance)."""
+    """Length of a body (root mean square distance from its mean) and spacing of its nodes (mean nearest distance)."""
     length = float((nodes - nodes.mean(0)).pow(2).sum(1).mean().sqrt())
     if len(nodes) < 2 or length <= 0:
         return max(length, 1e-3), 1.0
@@ -203,18 +203,18 @@ def _mean(x: Tensor, weights: Tensor) -> Tensor:
 
 
 def _rigid_part(middle: Tensor, offsets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean offset [F, 1, 3] and small rotation about the mean [F, 3] that explain the offsets best, weighted.
+    """Weighted least-squares fit of the offsets by a mean offset [F, 1, 3] and a small rotation about the mean [F, 3].
 
     Args:
-        middle: Members about their weighted mean. [F, n, 3]
-        offsets: [F, n, 3]
-        weights: [F, n]
+        middle: Members relative to their weighted mean. [F, n, 3]
+        offsets: Offsets of the members. [F, n, 3]
+        weights: Weights of the members. [F, n]
     """
     shift = _mean(offsets, weights)
     squares = (weights[..., None] * middle).mT @ middle
     trace = squares.diagonal(dim1=1, dim2=2).sum(1)[:, None, None]
     one = torch.eye(3, dtype=middle.dtype)
-    inertia = one * trace - squares + (1e-6 * trace + 1e-12) * one  # a line does not tell its spin
+    inertia = one * trace - squares + (1e-6 * trace + 1e-12) * one  # regularised: a line does not determine its spin
     moment = (weights[..., None] * torch.linalg.cross(middle, offsets - shift)).sum(1)
     return shift, (torch.linalg.inv(inertia) @ moment[..., None])[..., 0]
 
@@ -227,7 +227,7 @@ def _cross_matrix(w: Tensor) -> Tensor:
 
 
 def _turn(gradient: Tensor) -> Tensor:
-    """Rotation next to a gradient near the identity; exact where it is a rotation by less than half a turn. [n, 4]"""
+    """Rotation close to a gradient near the identity; exact for rotations by less than half a turn. [n, 4]"""
     g = gradient
     trace = g[:, 0, 0] + g[:, 1, 1] + g[:, 2, 2]
     parts = [1 + trace, g[:, 2, 1] - g[:, 1, 2], g[:, 0, 2] - g[:, 2, 0], g[:, 1, 0] - g[:, 0, 1]]

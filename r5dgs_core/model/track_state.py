@@ -1,4 +1,4 @@
-"""Tracks as named tensors of a checkpoint, and back."""
+"""Conversion of tracks to and from the named tensors of a checkpoint."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .tracks import Tracks
 
 
 def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
-    """Tracks by ``tracks.NAME``."""
+    """Return the tensors of tracks, named ``tracks.NAME``."""
     named = {f"tracks.{name}": parameter.detach() for name, parameter in tracks.params.items()}
     named["tracks.times"] = torch.from_numpy(tracks.times)
     for name in ("centers", "base_quats", "casters", "plane_normal"):
@@ -20,7 +20,7 @@ def tensors_of(tracks: Tracks) -> dict[str, Tensor]:
 
 
 def tracks_of(tensors: Mapping[str, Tensor]) -> Tracks:
-    """The tracks in a checkpoint's named tensors."""
+    """Restore tracks from the named tensors of a checkpoint."""
     tracks = Tracks(
         tensors["tracks.times"].numpy(),
         tensors["tracks.centers"],

@@ -1,11 +1,11 @@
 """Tracks: one SE(3) motion per body, as knots at the observed times.
 
 Notation: G motion groups, S knots. Group g moves a canonical point x to c_g + R_g(t) (x - c_g) + d_g(t) with a fixed
-centre c_g. Group 0 is pinned. A shadow group takes d = A d_caster with A = I - n n^T + s n^T (n the normal of the
-support plane, s the learned slope along it) and does not turn.
+centre c_g. Group 0 is pinned. A shadow group has d = A d_caster with A = I - n n^T + s n^T (n normal of the support
+plane, s learned slope along it), and no rotation.
 
-A knot's rotation is exp(rotvec) * base: ``rotvecs`` is what the optimizer moves, ``base_quats`` absorbs it from time
-to time (`rebase`), so that an object may turn by any angle and the exponential stays far from its singularity.
+A knot's rotation is exp(rotvec) * base. The optimizer updates ``rotvecs``; `rebase` periodically folds them into
+``base_quats``. An object may thus rotate by any angle while the exponential stays far from its singularity.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ class Tracks:
 
     @property
     def bodies(self) -> int:
-        """Number of bodies, the pinned group included."""
+        """Number of bodies, including the pinned group."""
         return len(self.centers)
 
     @property
     def groups(self) -> int:
-        """Number of motion groups, shadows included."""
+        """Number of motion groups, including shadows."""
         return self.bodies + len(self.casters)
 
     def group_centers(self) -> Tensor:
-        """Centres of all groups; a shadow's is its caster's. [G, 3]"""
+        """Centres of all groups; a shadow has its caster's. [G, 3]"""
         return torch.cat([self.centers, self.centers[self.casters]])
 
     def follow_matrix(self) -> Tensor:
@@ -73,9 +73,9 @@ class Tracks:
         return torch.eye(3) - torch.outer(n, n) + torch.outer(in_plane, n)
 
     def knot_weights(self, t: float) -> dict[int, float]:
-        """Weights of the knots at a time: 1 at a knot, held outside the range, between knots those of playback's curve.
+        """Weights of the knots at a time: 1 at a knot, constant outside the range, else those of playback's curve.
 
-        That curve, a cubic Hermite by component with slopes from neighbouring knots, is linear in the knots' values.
+        The curve, a cubic Hermite per component with slopes from neighbouring knots, is linear in the knots' values.
         """
         k = int(np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 1))
         near = k if k + 1 == len(self.times) or t - self.times[k] <= self.times[k + 1] - t else k + 1
@@ -92,7 +92,7 @@ class Tracks:
         return {int(s): float(w) for s, w in zip(window, weights, strict=True) if w != 0.0}
 
     def poses(self, t: float) -> GroupPoses:
-        """Differentiable poses of all groups at a time."""
+        """Return the poses of all groups at a time, differentiable."""
         weights = self.knot_weights(t)
         quats, displacements = self._knot(next(iter(weights)))
         if len(weights) > 1:
@@ -125,7 +125,7 @@ class Tracks:
 
     @torch.no_grad()
     def rebase(self) -> None:
-        """Fold the learned rotation vectors into the base and start them at zero again."""
+        """Fold the learned rotation vectors into the base rotations and reset them to zero."""
         self.base_quats = rotations.normalize(self.knot_quats()).detach()
         self.params["rotvecs"].zero_()
 
@@ -141,9 +141,9 @@ class Tracks:
         gives plain second differences.
 
         Args:
-            entered: First and last knot that count; all where None. The mean stays that over all knots.
-            shift_stiffness: Weight of each body's displacement at each knot; 1 where None. [B - 1, S]
-            turn_stiffness: Weight of its rotation about each axis, world; the identity where None. [B - 1, S, 3, 3]
+            entered: First and last knot to include; None for all. The mean is always over all knots.
+            shift_stiffness: Weight of each body's displacement at each knot; None for 1. [B - 1, S]
+            turn_stiffness: Weight matrix of its rotation, world axes; None for the identity. [B - 1, S, 3, 3]
         """
         first, last = (0, len(self.times) - 1) if entered is None else entered
         if last - first < 2 or self.bodies < 2:

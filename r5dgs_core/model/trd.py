@@ -1,7 +1,7 @@
-"""The translation-rotation dynamics module (TRD): how each Gaussian goes on moving from where it is at a time.
+"""Translation-rotation dynamics module (TRD): motion state of each Gaussian, from its position and time.
 
-Notation: the state of a Gaussian is a twist about the origin of the coordinates with linear rates: at tau after the
-start the velocity at p is v + a tau + (w + e tau) x p.
+Notation: the state of a Gaussian is a twist about the origin of the coordinates with linear rates. At time tau after
+the start, the velocity at p is v + a tau + (w + e tau) x p.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class MotionState:
     """Twist of each Gaussian at the start, world frame, about the origin of the coordinates.
 
     Attributes:
-        equiv_velocity: Velocity of the point that sits at the origin. [N, 3]
-        angular_velocity: rad per unit of time. [N, 3]
-        equiv_acceleration: Rate of the first. [N, 3]
-        angular_acceleration: Rate of the second. [N, 3]
+        equiv_velocity: Velocity of the body's point at the origin. [N, 3]
+        angular_velocity: Angular velocity, rad per unit of time. [N, 3]
+        equiv_acceleration: Time derivative of ``equiv_velocity``. [N, 3]
+        angular_acceleration: Time derivative of ``angular_velocity``. [N, 3]
     """
 
     equiv_velocity: Tensor
@@ -45,14 +45,14 @@ class MotionState:
 
 
 class TRD(nn.Module):
-    """A perceptron from position and time to `MotionState`; untrained, everything rests.
+    """MLP from position and time to `MotionState`. The untrained state is nearly at rest.
 
     Args:
-        shape: Its size.
+        shape: Size of the network.
         generator: Source of the initial weights.
 
-    Source: TRACE (the TRD): twelve numbers, of which the last six pass through a signed square, a |a| / 10. A signed
-        square has no slope at zero, so these six start at 0.1 instead of zero, which is an acceleration of 0.001.
+    Source: TRACE (the TRD): twelve outputs, the last six through a signed square a |a| / 10. Its slope is zero at
+        zero, so these six start at 0.1 instead, which is an acceleration of 0.001.
     """
 
     def __init__(self, shape: TRDShape, generator: torch.Generator):
@@ -67,12 +67,12 @@ class TRD(nn.Module):
             self.head.bias.copy_(torch.cat([torch.zeros(6), 0.1 * signs]))
 
     def forward(self, positions: Tensor, t: float, chunk: int = 65536) -> MotionState:
-        """State of Gaussians.
+        """Return the motion state of Gaussians.
 
         Args:
-            positions: Where they are at time ``t``. [N, 3]
+            positions: Centres at time ``t``. [N, 3]
             t: Scene time.
-            chunk: Gaussians that pass at once.
+            chunk: Number of Gaussians per evaluation; bounds the memory.
         """
         inputs = torch.cat([positions, positions.new_full((len(positions), 1), t)], dim=-1)
         out = encoding.in_chunks(self._run, inputs, chunk)
