@@ -1,1 +1,1 @@
-"""Import runs of other projects as a `Scene`."""
+"""Import of training runs of other projects as a `Scene`."""

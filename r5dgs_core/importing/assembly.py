@@ -1,6 +1,6 @@
-"""A run of others becomes a scene: bind state at t_max, residuals at knots, dynamics past t_max, table of objects.
+"""Assembly of a scene from an imported run: bind state at t_max, residuals at knots, dynamics past t_max, and objects.
 
-Everything belongs to one pinned motion group; what moves in the observed time does so by residuals.
+All Gaussians belong to one pinned motion group; observed motion is stored as residuals.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from ..scene import scene
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from .foreign_run import Foreign, State
 
-CHUNK = 16384  # rows that are evaluated at all knots at once
-STILL = 1e-4  # of the scene's extent: motion of a Gaussian's ellipsoid that is left out
+CHUNK = 16384  # rows per evaluation at all knots; bounds the memory
+STILL = 1e-4  # motion of a Gaussian's ellipsoid that is dropped, as a share of the scene's extent
 
 Progress = Callable[[int, int], None]
 
@@ -27,10 +27,10 @@ class Motion:
     """Observed motion of N Gaussians of which R move. S knots.
 
     Attributes:
-        bind: Their state at the last knot.
-        rows: Those that move, increasing. [R] int32
+        bind: State of all Gaussians at the last knot.
+        rows: Rows of the moving Gaussians, increasing. [R] int32
         offsets: Their displacement from the bind state. [R, S, 3] float32
-        turns: Their rotation from it, unit wxyz. [R, S, 4] float32
+        turns: Their rotation from the bind state, unit wxyz. [R, S, 4] float32
         growths: Change of their log scales. [R, S, 3] float32
         dynamics: Motion past the last knot. [N, 12] float32 or None
     """
@@ -49,8 +49,8 @@ def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Prog
     Args:
         foreign: A run with a `state`.
         times: Knots, the last is t_max. [S]
-        tolerance: World units; Gaussians whose ellipsoids stay that close to their bind state count as still.
-        progress: Told how many Gaussians of how many are done.
+        tolerance: Largest motion of a static Gaussian's ellipsoid, world units.
+        progress: Called with the number of finished Gaussians and their total.
     """
     assert foreign.state is not None
     count, last = len(foreign.splats.means), float(times[-1])
@@ -73,7 +73,7 @@ def sample(foreign: Foreign, times: np.ndarray, tolerance: float, progress: Prog
 
 
 def _relative(states: list[State], bind: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Offsets [n, S, 3], turns [n, S, 4] and growths [n, S, 3] from the bind state, which is added as the last knot."""
+    """Offsets [n, S, 3], turns [n, S, 4] and growths [n, S, 3] from the bind state, which is appended as last knot."""
     states = [*states, bind]
     offsets = np.stack([state.means - bind.means for state in states], axis=1)
     growths = np.stack([state.log_scales - bind.log_scales for state in states], axis=1)
@@ -85,7 +85,7 @@ def _relative(states: list[State], bind: State) -> tuple[np.ndarray, np.ndarray,
 
 
 def _reach(bind: State, offsets: np.ndarray, turns: np.ndarray, growths: np.ndarray) -> np.ndarray:
-    """How far a point on the ellipsoid of one standard deviation gets from where it is bound, at most. [n]"""
+    """Upper bound on the motion of points on the one-sigma ellipsoid, relative to the bind state. [n]"""
     size = np.exp(bind.log_scales.max(-1))[:, None]
     angle = np.linalg.norm(rotations.quats_to_rotvecs(turns), axis=-1)
     stretch = np.abs(np.expm1(growths) * np.exp(bind.log_scales)[:, None]).max(-1)
@@ -93,11 +93,11 @@ def _reach(bind: State, offsets: np.ndarray, turns: np.ndarray, growths: np.ndar
 
 
 def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **rest) -> Scene:
-    """The scene.
+    """Assemble the scene.
 
     Args:
         foreign: The run.
-        motion: What `sample` gave, None where nothing moves.
+        motion: Result of `sample`, None for a static scene.
         times: Knots. [S]
         **rest: The fields of `Scene` that do not come from the run: name, frames_per_unit, world_convention, cameras,
             background_sh, provenance.
@@ -147,12 +147,12 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
 
 
 def classify(foreign: Foreign) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Object of each Gaussian, the class its identity scores highest in, and the classifier of the objects there are.
+    """Assign each Gaussian to the class with its highest score, and reduce the classifier to the classes that occur.
 
     Returns:
         Object ids [N] int32, all 0 without a classifier; weight [M + 1, 16] and bias [M + 1] float32 or None.
 
-    Source: Gaussian Grouping, whose class 0 is what no mask covers.
+    Source: Gaussian Grouping, whose class 0 is the unmasked background.
     """
     identities = foreign.splats.identities
     if foreign.classifier is None or identities is None:
@@ -164,7 +164,7 @@ def classify(foreign: Foreign) -> tuple[np.ndarray, np.ndarray | None, np.ndarra
 
 
 def _objects(labels: np.ndarray) -> tuple[SceneObject, ...]:
-    """The table of sorted labels: the background and "object k"."""
+    """Object table of sorted labels: the background and "object k"."""
     table = []
     for k in np.union1d(labels, [0]).tolist():
         start, stop = np.searchsorted(labels, [k, k + 1]).tolist()

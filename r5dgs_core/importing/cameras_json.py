@@ -1,4 +1,4 @@
-"""``cameras.json`` of 3DGS and its descendants: one entry per image, camera to world, OpenCV axes."""
+"""Reader of ``cameras.json`` of 3DGS and its descendants: one entry per image, camera to world, OpenCV axes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ..scene import cameras
 from ..scene.cameras import Camera
 
 _log = logging.getLogger(__name__)
-_TOLERANCE = 1e-3  # of an entry of a rotation matrix
+_TOLERANCE = 1e-3  # for R^T R - I of rotation matrices
 
 
 def read(path: Path) -> tuple[Camera, ...]:
-    """The distinct cameras of the file, by first appearance; none where there is no file.
+    """Read the distinct cameras of the file, by first appearance; returns () if the file is missing.
 
     Raises:
-        CheckpointError: The file is damaged, or an entry is no camera.
+        CheckpointError: The file is damaged, or an entry is not a valid camera.
     """
     if not path.exists():
         return ()

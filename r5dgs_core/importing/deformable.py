@@ -1,8 +1,8 @@
-"""Deformable-3DGS: rotations and scales of the network are added to the canonical ones.
+"""Reader of Deformable-3DGS runs, whose network outputs are added to the canonical rotations and scales.
 
-Its rasterizer (that of 3DGS) does not normalise what it is given, so q + dq acts as a matrix that is no rotation: with
-q + dq = (w, v) it turns about v by atan2(2 w |v|, 1 - 2 |v|^2) and scales across v. What is drawn has the covariance
-A A^T, A = matrix(q + dq) diag(exp(s) + ds); its principal axes are what a scene can hold.
+The 3DGS rasterizer does not normalise quaternions, so the matrix of q + dq is not a rotation: q + dq = (w, v) rotates
+about v by atan2(2 w |v|, 1 - 2 |v|^2) and scales perpendicular to v. The rendered covariance is A A^T,
+A = matrix(q + dq) diag(exp(s) + ds). The scene stores its principal axes.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from . import networks, weights
 from .foreign_run import SPLATTING_NEAR, Foreign, State
 from .run_folder import RunFolder
 
-_SMALLEST = 1e-12  # standard deviation that a Gaussian keeps where exp(s) + ds vanishes, world units
-_ROUNDING = 1e-14  # of the sum of variances: what float64 leaves off the diagonal of spheres and discs
-_SWEEPS = 8  # Jacobi converges quadratically: far more than float64 needs for 3 x 3
+_SMALLEST = 1e-12  # smallest standard deviation, if exp(s) + ds vanishes, world units
+_ROUNDING = 1e-14  # share of the trace below which off-diagonal elements are rounding errors of float64
+_SWEEPS = 8  # Jacobi converges quadratically; float64 needs far fewer for 3 x 3
 
 
 def read(run: RunFolder) -> Foreign:
@@ -39,15 +39,15 @@ def read(run: RunFolder) -> Foreign:
 
 
 def principal_axes(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and log scales of the Gaussians that 3DGS draws for quaternions of any length and scales of any sign.
+    """Rotation and log scales of the Gaussians that 3DGS renders for quaternions of any length and any scales.
 
     Args:
         quats: wxyz. [n, 4] float64
-        scales: Standard deviations along the axes before the quaternion acts. [n, 3] float64
+        scales: Signed standard deviations along the axes before the quaternion is applied. [n, 3] float64
 
     Returns:
-        Unit quaternions wxyz [n, 4] and log scales [n, 3]. The axes are those nearest to the ones given, in the same
-        order, so that both are continuous along time; for unit quaternions they are the ones given.
+        Unit quaternions wxyz [n, 4] and log scales [n, 3]. The axes are those nearest to the given ones, in the same
+        order, so that both are continuous over time; for unit quaternions they are the given ones.
     """
     linear = rotations.quats_to_rotmats(quats) * scales[:, None, :]
     axes = rotations.quats_to_rotmats(_turn_of(quats))
@@ -64,7 +64,7 @@ def principal_axes(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _turn_of(quats: np.ndarray) -> np.ndarray:
-    """Rotational part, unit wxyz, of the matrices that quaternions of any length stand for. [n, 4]"""
+    """Rotational part, unit wxyz, of the matrices of quaternions of any length. [n, 4]"""
     w, v = quats[:, :1], quats[:, 1:]
     length = np.linalg.norm(v, axis=-1, keepdims=True)
     angle = np.arctan2(2 * w * length, 1 - 2 * length**2)
@@ -72,7 +72,7 @@ def _turn_of(quats: np.ndarray) -> np.ndarray:
 
 
 def _rotate_pair(covariance: np.ndarray, axes: np.ndarray, p: int, q: int) -> tuple[np.ndarray, np.ndarray]:
-    """One Jacobi rotation by at most 45 degrees that makes element (p, q) zero. [n, 3, 3] each"""
+    """Apply one Jacobi rotation by at most 45 degrees that zeroes element (p, q). [n, 3, 3] each"""
     off = covariance[:, p, q]
     wanted = np.abs(off) > _ROUNDING * np.trace(covariance, axis1=-2, axis2=-1)
     if not wanted.any():

@@ -1,4 +1,4 @@
-"""What every layout comes down to: Gaussians, their state at observed times, and how each moves past the last one."""
+"""Common form of all imported runs: Gaussians, their state at observed times, and their motion past the last one."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..formats.ply import Splats
 from ..motion import rotations
 from .networks import DeformNetwork
 
-SPLATTING_NEAR = 0.2  # depth in front of which the rasterizer of 3DGS draws nothing
-TRACE_NEAR = 0.8  # the same in TRACE and FreeGave, which drop nearer Gaussians first
+SPLATTING_NEAR = 0.2  # near plane of the 3DGS rasterizer, depth
+TRACE_NEAR = 0.8  # near plane of TRACE and FreeGave, which cull nearer Gaussians first
 
 
 @dataclass(frozen=True)
 class State:
-    """Some Gaussians at one time.
+    """State of some Gaussians at one time.
 
     Attributes:
         means: Centres, world. [n, 3] float64
@@ -34,17 +34,17 @@ class State:
 
 @dataclass(frozen=True)
 class Foreign:
-    """A run of others, read.
+    """A loaded run of another project.
 
     Attributes:
         kind: One of `run_folder.KINDS`.
-        splats: The Gaussians as they are stored: canonical where there is a deformation.
-        near_plane: Depth in front of which their renderer draws nothing.
-        state: State of some rows at a time up to t_max, or None where nothing moves.
-        dynamics: For some rows and their centres at a time t_max [n, 3] the motion past it, as `Scene.dynamics`
-            [n, 12] has it; None where the layout has none.
-        t_max: Last time of the deformation, None where nothing says it.
-        classifier: Weight [K, 16] and bias [K] of the classifier of identities, or None.
+        splats: The Gaussians as stored; canonical if there is a deformation.
+        near_plane: Near plane of the run's renderer, depth.
+        state: Function from rows and a time up to t_max to their state, or None for a static run.
+        dynamics: Function from rows, their centres at t_max [n, 3], and t_max to the motion past it, as in
+            `Scene.dynamics` [n, 12]; None if the layout has none.
+        t_max: Last time of the deformation, None if unknown.
+        classifier: Weight [K, 16] and bias [K] of the identity classifier, or None.
     """
 
     kind: str
@@ -57,14 +57,14 @@ class Foreign:
 
 
 def twisted_state(splats: Splats, network: DeformNetwork, rows: slice, t: float, codes: Tensor | None = None) -> State:
-    """State by the rule of TRACE and FreeGave: the predicted rotation goes before the canonical one, log scales add.
+    """Compute the state as TRACE and FreeGave do: predicted rotation times canonical one, log scales added.
 
     Args:
         splats: The canonical Gaussians.
         network: The deformation network.
-        rows: Which of them.
+        rows: Rows to evaluate.
         t: The time.
-        codes: Codes of these rows where the network takes them. [n, C]
+        codes: Codes of these rows, if the network takes them. [n, C]
     """
     with torch.no_grad():
         means = torch.from_numpy(splats.means[rows])

@@ -1,9 +1,9 @@
-"""FreeGave: a code per Gaussian, and motion patterns whose weights depend on time alone.
+"""Reader of FreeGave runs: a code per Gaussian, and motion patterns whose weights depend on time only.
 
-A Gaussian takes shares of the patterns; of the six weights that this gives, the first three are v and the last three
--w: the velocity at p is v + w x p, p in the world. FreeGave asks for the weights anew at every step; here their value
-and slope at max_time are kept, which is the same to second order in the time that has passed since. Gaussians that
-stay within a hundredth of where they are at time 0 keep the state of time 0, as in FreeGave's own renderings.
+A code gives shares of the patterns. Of the resulting six weights, the first three are v and the last three -w; the
+velocity at p is v + w x p, p in the world. FreeGave evaluates the weights at every step. The scene stores their value
+and slope at max_time, which agrees to second order in the elapsed time. Gaussians that stay within 0.01 of their
+position at time 0 keep the state of time 0, as in FreeGave's own renderings.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .foreign_run import TRACE_NEAR, Foreign, State, twisted_state
 from .run_folder import RunFolder
 from .trace import about_centers
 
-BANK = "vel_net.a_weight_bank"  # rates that FreeGave trains and does not use; no other layout has them
+BANK = "vel_net.a_weight_bank"  # trained but unused by FreeGave; identifies the layout
 WEIGHTS = 6
 STILL_TIMES = tuple(k / 100 for k in range(75))
 STILL_DISTANCE = 0.01  # world units
@@ -33,7 +33,7 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
 
     Args:
         run: The folder.
-        velocity: Of its ``vel.pth``.
+        velocity: Content of its ``vel.pth``.
         t_max: Last time of the deformation.
     """
     splats = ply.read(run.ply)
@@ -63,9 +63,9 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
         turned = torch.cat([value[:, :3], -value[:, 3:], slope[:, :3], -slope[:, 3:]], -1)
         return about_centers(turned.double().numpy(), means)
 
-    @functools.lru_cache(maxsize=1)  # one stretch of rows is asked for at many times
+    @functools.lru_cache(maxsize=1)  # the same rows are requested for many times
     def resting(start: int, stop: int) -> tuple[np.ndarray, State]:
-        """Which rows stay where they are at time 0, and the state at time 0."""
+        """Mask of the rows that stay at their position of time 0, and their state at time 0."""
         rows = slice(start, stop)
         first, last = predicted(rows, 0.0), predicted(rows, t_max).means
         v, w, a, _ = np.split(rates(rows, last, t_max), 4, axis=-1)

@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting and Gaussian Grouping: Gaussians that stand still, the latter with identities and classes."""
+"""Reader of 3D Gaussian Splatting and Gaussian Grouping runs: static Gaussians, the latter with identities."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .run_folder import RunFolder
 
 
 def read(run: RunFolder) -> Foreign:
-    """Read the Gaussians, and the classifier where there is one.
+    """Read the Gaussians, and the classifier if there is one.
 
     Raises:
         CheckpointError: The classifier does not fit the identities.

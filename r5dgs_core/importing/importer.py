@@ -1,4 +1,4 @@
-"""`r5dgs import`: a run folder of others to a scene. docs/user/import.md says what is taken over and what is not."""
+"""Import of another project's run folder as a scene (`r5dgs import`); docs/import.md describes what is imported."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from . import assembly, cameras_json, deformable, freegave, gaussian_splatting, 
 from .foreign_run import Foreign
 from .run_folder import RunFolder
 
-MOST_KNOTS = 10_000  # without --knots
-ROUNDING = 1e-9  # share of the extent below which a motion is none
+MOST_KNOTS = 10_000  # limit without --knots
+ROUNDING = 1e-9  # smallest motion, as a share of the extent
 _log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a user can say about an import.
+    """User options of an import.
 
     Attributes:
-        iteration: Which iteration to read; the last without it.
-        data: The data set that the run was trained on; gives cameras, times and the world's axes.
-        knots: Number of times at which the deformation is sampled; without it the data set's times, or
+        iteration: Iteration to read; None for the last.
+        data: Data set that the run was trained on; gives cameras, times and world axes.
+        knots: Number of times at which the deformation is sampled; None for the data set's times, or
             `datasets.FRAMES_PER_UNIT` per unit of time.
-        t_max: Last time of the deformation; without it the run's, or the data set's, or 1.
+        t_max: Last time of the deformation; None for that of the run, else of the data set, else 1.
         world: Axes of the world, a key of `cameras.WORLD_TO_BLENDER`.
-        still: Motion that is left out, as a share of the scene's extent.
+        still: Motion that is dropped, as a share of the scene's extent.
     """
 
     iteration: int | None = None
@@ -59,11 +59,11 @@ class Options:
 
 
 def read(run: RunFolder, t_max: float | None = None) -> Foreign:
-    """Read a run folder by the rules of whoever wrote it.
+    """Read a run folder with the reader of its layout.
 
     Args:
         run: The folder.
-        t_max: Last time of the deformation, where the user says it.
+        t_max: Last time of the deformation, if given by the user.
 
     Raises:
         CheckpointError, SceneFileError: A file is missing, damaged, holds code, or is of an unknown layout.
@@ -78,15 +78,15 @@ def read(run: RunFolder, t_max: float | None = None) -> Foreign:
 
 
 def import_run(folder: Path, options: Options = Options(), progress: assembly.Progress | None = None) -> Scene:
-    """Turn a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave into a scene.
+    """Convert a run folder of 3DGS, Gaussian Grouping, Deformable-3DGS, TRACE or FreeGave to a scene.
 
     Args:
         folder: The run folder.
-        options: What the user says about it.
-        progress: Told how many Gaussians of how many are sampled.
+        options: User options.
+        progress: Called with the number of sampled Gaussians and their total.
 
     Raises:
-        R5dgsError: The folder or the data set cannot be used; the message says why.
+        R5dgsError: The folder or the data set cannot be used; the message names the reason.
     """
     run = run_folder.open_run(folder, options.iteration)
     dataset = None if options.data is None else datasets.read(options.data, min_registered=0.0).relative_to(np.zeros(3))
@@ -121,7 +121,7 @@ def import_run(folder: Path, options: Options = Options(), progress: assembly.Pr
 
 
 def _among_cameras(scene: Scene, folder: Path) -> Scene:
-    """The scene with an origin among its cameras if these stand far from the world's."""
+    """Move the scene's origin to its cameras if they are far from the world's origin."""
     if not scene.cameras:
         return scene
     origin = origins.find(np.stack([camera.center for camera in scene.cameras]), f"{folder}: cameras")
@@ -163,7 +163,7 @@ def _times(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
 
 
 def _extent(foreign: Foreign) -> float:
-    """Diagonal of the box that holds the middle 98 % of the centres, as `Scene.extent` has it."""
+    """Diagonal of the box that contains the middle 98 % of the centres, as in `Scene.extent`."""
     if len(foreign.splats.means) == 0:
         return 1.0
     low, high = np.quantile(foreign.splats.means, [0.01, 0.99], axis=0)
@@ -171,7 +171,7 @@ def _extent(foreign: Foreign) -> float:
 
 
 def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: Options) -> str:
-    """Axes of the world: as user or data set say; else z up for what was trained on Blender's, else COLMAP's."""
+    """World axes: from the user or the data set; else Blender's for runs trained on Blender data, else COLMAP's."""
     if options.world is not None:
         return options.world
     if dataset is not None:
@@ -186,7 +186,7 @@ def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
 
 
 def _plain(value: Any) -> Any:
-    """JSON form of a setting."""
+    """Convert a setting to JSON types."""
     whole = isinstance(value, int) and abs(value) < 1 << 63
     if value is None or whole or (isinstance(value, float) and math.isfinite(value)):
         return value

@@ -1,4 +1,4 @@
-"""The networks of others, evaluated from their weights: widths, depths and encodings are read from the shapes.
+"""Networks of other projects, evaluated from their weights; widths, depths and encodings follow from the shapes.
 
 Notation: N Gaussians, L frequency bands. An input x becomes x, sin(2^k x), cos(2^k x) for k = 0..L-1.
 """
@@ -15,15 +15,15 @@ from torch.nn import functional
 from ..errors import CheckpointError
 from .weights import Linear, Weights
 
-RAW_TIME_BANDS = 10  # of networks that take the encoded time as it is
+RAW_TIME_BANDS = 10  # of networks without a time network
 
 
 @dataclass(frozen=True)
 class Deformation:
-    """What a deformation network predicts.
+    """Output of a deformation network.
 
     Attributes:
-        shift: Displacement of the centres, or where the network gives screws, its map of each centre. [N, 3] or
+        shift: Displacement of the centres, or affine map of each centre if the network predicts screws. [N, 3] or
             [N, 3, 4]
         quats: Raw output of the rotation head. [N, 4]
         scales: Raw output of the scale head. [N, 3]
@@ -34,7 +34,7 @@ class Deformation:
     scales: Tensor
 
     def move(self, means: Tensor) -> Tensor:
-        """The centres after the deformation. [N, 3]"""
+        """Return the deformed centres. [N, 3]"""
         if self.shift.ndim == 2:
             return means + self.shift
         return (self.shift[..., :3] @ means[..., None])[..., 0] + self.shift[..., 3]
@@ -42,23 +42,23 @@ class Deformation:
 
 @dataclass(frozen=True)
 class SkipRow:
-    """ReLU layers that follow each other; layer ``skip`` sees the inputs beside the output of the one before it."""
+    """Sequence of ReLU layers with one skip connection: layer ``skip`` also reads the inputs."""
 
     layers: tuple[Linear, ...]
     skip: int
 
     @property
     def inputs(self) -> int:
-        """Width of what goes in."""
+        """Number of input channels."""
         return self.layers[0].inputs
 
     @property
     def outputs(self) -> int:
-        """Width of what comes out."""
+        """Number of output channels."""
         return self.layers[-1].outputs
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        """[N, inputs] -> [N, outputs]"""
+        """Evaluate the layers. [N, inputs] -> [N, outputs]"""
         hidden = inputs
         for i, layer in enumerate(self.layers):
             hidden = torch.relu(layer(torch.cat([inputs, hidden], -1) if i == self.skip else hidden))
@@ -66,7 +66,7 @@ class SkipRow:
 
 
 def read_skip_row(weights: Weights) -> SkipRow:
-    """The layers ``linear.0``, ``linear.1``, ... of a state dictionary."""
+    """Read the layers ``linear.0``, ``linear.1``, ... of a state dictionary."""
     layers = [weights.linear("linear.0")]
     width, inputs, skips = layers[0].outputs, layers[0].inputs, []
     while f"linear.{len(layers)}.weight" in weights:
@@ -84,13 +84,13 @@ def read_skip_row(weights: Weights) -> SkipRow:
 
 @dataclass(frozen=True)
 class DeformNetwork:
-    """Network of Deformable-3DGS, TRACE and FreeGave.
+    """Deformation network of Deformable-3DGS, TRACE and FreeGave.
 
     Attributes:
-        trunk: Its layers.
-        time_layers: Two layers that the encoded time goes through first, or none.
+        trunk: Hidden layers.
+        time_layers: Two layers for the encoded time, or none.
         bands: Frequency bands of position and time.
-        shift: Head of the displacement, or of the rotational and translational part of a screw.
+        shift: Head of the displacement, or heads of the rotational and translational part of a screw.
         quats: Head of the rotation.
         scales: Head of the scale.
     """
@@ -103,7 +103,7 @@ class DeformNetwork:
     scales: Linear
 
     def __call__(self, means: Tensor, t: float, codes: Tensor | None = None) -> Deformation:
-        """Deformation of canonical centres [N, 3], with their codes [N, C] where the network takes them, at a time."""
+        """Deform canonical centres [N, 3], with codes [N, C] if the network takes them, at a time."""
         time = encode(torch.tensor([[t]], dtype=means.dtype), self.bands[1])
         if self.time_layers:
             time = chain(self.time_layers, time, torch.relu)
@@ -114,14 +114,14 @@ class DeformNetwork:
 
 
 def read_deform(weights: Weights, code_size: int = 0) -> DeformNetwork:
-    """The deformation network of a state dictionary; the unused gate that some hold is passed over.
+    """Read the deformation network of a state dictionary; the unused gate of some files is ignored.
 
     Args:
-        weights: Of ``deform.pth``.
-        code_size: Numbers of the code that the network takes beside position and time.
+        weights: Content of ``deform.pth``.
+        code_size: Channels of the code that the network takes besides position and time.
 
     Raises:
-        CheckpointError: The shapes are not those of such a network.
+        CheckpointError: The shapes do not match such a network.
     """
     trunk = read_skip_row(weights)
     time_layers: list[Linear] = []
@@ -147,7 +147,7 @@ class CodeField:
     """FreeGave's network from a position to a code, and from a code to the shares of the motion patterns.
 
     Attributes:
-        trunk: Its layers.
+        trunk: Hidden layers.
         bands: Frequency bands of the position.
         output: Head of the code.
         shares: Layers from the code to the shares.
@@ -160,20 +160,20 @@ class CodeField:
 
     @property
     def size(self) -> int:
-        """Numbers of a code."""
+        """Number of channels of a code."""
         return self.output.outputs
 
     def codes(self, means: Tensor) -> Tensor:
-        """Codes of canonical centres. [N, 3] -> [N, C]"""
+        """Return the codes of canonical centres. [N, 3] -> [N, C]"""
         return self.output(self.trunk(encode(means, self.bands)))
 
     def pattern_shares(self, codes: Tensor) -> Tensor:
-        """How much of each motion pattern a code takes; of any sign and sum. [N, C] -> [N, C]"""
+        """Return the share of each motion pattern in a code; any sign, not normalised. [N, C] -> [N, C]"""
         return chain(self.shares, codes, torch.relu)
 
 
 def read_code_field(weights: Weights) -> CodeField:
-    """The code field of a state dictionary, ``code_field.pth``."""
+    """Read the code field of a state dictionary, ``code_field.pth``."""
     trunk = read_skip_row(weights)
     output = weights.linear("output.0", inputs=trunk.outputs)
     shares = weights.chain(["seg.0", "seg.2", "seg.4"], inputs=output.outputs, outputs=output.outputs)
@@ -182,12 +182,12 @@ def read_code_field(weights: Weights) -> CodeField:
 
 @dataclass(frozen=True)
 class VelocityNetwork:
-    """A row of SiLU layers from encoded position and time, or time alone, to rates.
+    """SiLU network from encoded position and time, or time only, to rates.
 
     Attributes:
-        layers: The row; the last one without activation.
+        layers: Layers; the last one has no activation.
         bands: Frequency bands.
-        inputs: 4 where position and time go in, 1 for time alone.
+        inputs: 4 for position and time, 1 for time only.
     """
 
     layers: tuple[Linear, ...]
@@ -200,11 +200,11 @@ class VelocityNetwork:
         return self.layers[-1].outputs
 
     def __call__(self, inputs: Tensor) -> Tensor:
-        """Rates at positions and times [N, 4], or at times [N, 1]."""
+        """Return the rates at positions and times [N, 4], or at times [N, 1]."""
         return chain(self.layers, encode(inputs, self.bands), functional.silu)
 
     def value_and_slope(self, t: float) -> tuple[Tensor, Tensor]:
-        """Rates at a time, and how they change with it, for a network that sees time alone. [outputs] each"""
+        """Return the rates at a time and their time derivative, for a network of time only. [outputs] each"""
         x = encode(torch.tensor([t]), self.bands)
         waves = x[1:].reshape(-1, 2).flip(-1) * torch.tensor([1.0, -1.0]) * 2.0 ** torch.arange(self.bands)[:, None]
         slope = torch.cat([torch.ones(1), waves.ravel()])
@@ -216,7 +216,7 @@ class VelocityNetwork:
 
 
 def read_velocity(weights: Weights) -> VelocityNetwork:
-    """The velocity network of a state dictionary, keys ``vel_net.weight_net.*`` of ``vel.pth``."""
+    """Read the velocity network of a state dictionary, keys ``vel_net.weight_net.*`` of ``vel.pth``."""
     names = ["vel_net.weight_net.0"]
     while f"vel_net.weight_net.{len(names) + 1}.0.weight" in weights:
         names.append(f"vel_net.weight_net.{len(names) + 1}.0")
@@ -232,7 +232,7 @@ def read_velocity(weights: Weights) -> VelocityNetwork:
 
 
 def encode(x: Tensor, bands: int) -> Tensor:
-    """x, sin(x), cos(x), sin(2 x), cos(2 x), sin(4 x), ... [..., D] -> [..., D (1 + 2 L)]"""
+    """Return x, sin(x), cos(x), sin(2 x), cos(2 x), sin(4 x), ... [..., D] -> [..., D (1 + 2 L)]"""
     parts = [x]
     for k in range(bands):
         parts += [torch.sin(x * 2.0**k), torch.cos(x * 2.0**k)]
@@ -240,16 +240,16 @@ def encode(x: Tensor, bands: int) -> Tensor:
 
 
 def chain(layers: Sequence[Linear], x: Tensor, activation: Callable[[Tensor], Tensor]) -> Tensor:
-    """Layers one after the other, the activation between them."""
+    """Apply layers in sequence, with the activation between them."""
     for layer in layers[:-1]:
         x = activation(layer(x))
     return layers[-1](x)
 
 
 def screw(w: Tensor, v: Tensor) -> Tensor:
-    """Rigid map of a screw as Deformable-3DGS has it with 6 degrees of freedom. [N, 3], [N, 3] -> [N, 3, 4]
+    """Map of a screw as in Deformable-3DGS with 6 degrees of freedom. [N, 3], [N, 3] -> [N, 3, 4]
 
-    The axis is w / |w| + 1e-5, which is not quite a unit vector, nor is the map quite rigid; both as trained.
+    The axis is w / |w| + 1e-5, as in training, so neither is it exactly a unit vector nor the map exactly rigid.
     """
     theta = torch.linalg.norm(w, dim=-1, keepdim=True)
     w, v = w / theta + 1e-5, v / theta + 1e-5
@@ -263,7 +263,7 @@ def screw(w: Tensor, v: Tensor) -> Tensor:
 
 
 def _bands(weights: Weights, name: str, width: int, dimensions: int) -> int:
-    """Number of frequency bands behind an encoded width."""
+    """Number of frequency bands of an encoding with a given width."""
     bands, left = divmod(width - dimensions, 2 * dimensions)
     if left or bands < 0:
         raise CheckpointError(

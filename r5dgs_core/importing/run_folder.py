@@ -1,8 +1,8 @@
-"""The run folders of 3DGS and of what was built on it: which one it is, its iterations and its settings.
+"""Run folders of 3DGS and its descendants: detection of the layout, iterations and settings.
 
-All of them have ``point_cloud/iteration_N/point_cloud.ply`` and most have ``cfg_args``. Gaussian Grouping adds
-``classifier.pth`` beside the PLY; Deformable-3DGS ``deform/iteration_N/deform.pth``; TRACE and FreeGave put ``vel.pth``
-(and ``code_field.pth``) beside that.
+All layouts have ``point_cloud/iteration_N/point_cloud.ply``, and most have ``cfg_args``. Gaussian Grouping adds
+``classifier.pth`` beside the PLY; Deformable-3DGS adds ``deform/iteration_N/deform.pth``; TRACE and FreeGave add
+``vel.pth`` (and ``code_field.pth``) beside it.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ KINDS = ("3dgs", "gaussian_grouping", "deformable_3dgs", "trace", "freegave")
 TITLES: dict[str, str] = dict(
     zip(KINDS, ("3D Gaussian Splatting", "Gaussian Grouping", "Deformable-3DGS", "TRACE", "FreeGave"), strict=True)
 )
-_MOST_BYTES = 1 << 20  # of cfg_args; what follows is not read
+_MOST_BYTES = 1 << 20  # limit on reading cfg_args
 _MOST_TIME = 1e12
 _KNOWN = f"known are the run folders of {', '.join(TITLES.values())}"
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A folder that somebody else's training wrote.
+    """Run folder of another project.
 
     Attributes:
         folder: The folder.
-        iteration: The iteration that is read.
+        iteration: Selected iteration.
         config: Settings of ``cfg_args``; empty without that file.
-        deforms: Whether there is a deformation network.
-        files: Names of the files of weights.
+        deforms: True if there is a deformation network.
+        files: Names of the weight files.
     """
 
     folder: Path
@@ -44,19 +44,19 @@ class RunFolder:
 
     @property
     def ply(self) -> Path:
-        """The Gaussians."""
+        """Path of the Gaussians."""
         return self.folder / "point_cloud" / f"iteration_{self.iteration}" / "point_cloud.ply"
 
     def weights(self, name: str) -> Path:
-        """A file of weights, "classifier.pth" or one of the deformation's."""
+        """Path of a weight file, "classifier.pth" or one of the deformation's."""
         part = "deform" if self.deforms else "point_cloud"
         return self.folder / part / f"iteration_{self.iteration}" / name
 
     def max_time(self) -> float:
-        """Last time of the deformation of TRACE and FreeGave.
+        """Return the last time of the deformation of TRACE and FreeGave.
 
         Raises:
-            CheckpointError: ``cfg_args`` does not say it.
+            CheckpointError: ``cfg_args`` does not contain it.
         """
         value = self.config.get("max_time")
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST_TIME:
@@ -69,14 +69,14 @@ class RunFolder:
 
 
 def open_run(folder: Path, iteration: int | None = None) -> RunFolder:
-    """Look at a run folder.
+    """Inspect a run folder.
 
     Args:
-        folder: The folder that was the training's ``--model_path``.
-        iteration: Which one to read; the last without it.
+        folder: The folder given to the training as ``--model_path``.
+        iteration: Iteration to read; None for the last.
 
     Raises:
-        CheckpointError: It is none of the known layouts, or lacks the iteration.
+        CheckpointError: The layout is unknown, or the iteration is missing.
     """
     folder = Path(folder)
     input_paths.check_foreign_run(folder)
@@ -109,9 +109,9 @@ def open_run(folder: Path, iteration: int | None = None) -> RunFolder:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read ``cfg_args``, the text ``Namespace(key=value, ...)``, without running it; empty where there is no file.
+    """Parse ``cfg_args``, the text ``Namespace(key=value, ...)``, without executing it; returns {} if it is missing.
 
-    Values that are no literals (a device, a path object) are kept as their text.
+    Values that are not literals (a device, a path object) are kept as text.
     """
     if not path.exists():
         return {}
@@ -135,7 +135,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def _iterations(folder: Path, file: str) -> set[int]:
-    """Numbers of the folders ``iteration_N`` that hold a file."""
+    """Numbers of the folders ``iteration_N`` that contain a file."""
     found = set()
     for path in folder.glob("iteration_*"):
         number = path.name.removeprefix("iteration_")

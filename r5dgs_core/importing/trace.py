@@ -1,8 +1,8 @@
-"""TRACE: a deformation network up to max_time, and a velocity network whose twists carry each Gaussian past it.
+"""Reader of TRACE runs: a deformation network up to max_time, and a velocity network for the motion past it.
 
-The velocity network gives v, w and raw rates once, at the centre that a Gaussian has at max_time; a rate is raw times
-|raw| / 10. The velocity at p is v + a tau + (w + e tau) x p, p in the world. With codes (the variant `freegave` of
-TRACE) the network sees the time alone and gives that for every motion pattern, and a Gaussian takes shares of them.
+The velocity network is evaluated once, at each Gaussian's centre at max_time. It returns v, w and raw rates; a rate is
+raw |raw| / 10. The velocity at p is v + a tau + (w + e tau) x p, p in the world. With codes (TRACE's variant
+`freegave`), the network depends on time only and returns these for every motion pattern; codes give shares of them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from . import networks, weights
 from .foreign_run import TRACE_NEAR, Foreign, State, twisted_state
 from .run_folder import RunFolder
 
-TWIST = 12  # v, w and their rates
+TWIST = 12  # numbers: v, w and their rates
 
 
 def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
@@ -26,7 +26,7 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
 
     Args:
         run: The folder.
-        velocity: Of its ``vel.pth``.
+        velocity: Content of its ``vel.pth``.
         t_max: Last time of the deformation.
     """
     splats = ply.read(run.ply)
@@ -63,12 +63,12 @@ def read(run: RunFolder, velocity: weights.Weights, t_max: float) -> Foreign:
 
 
 def squash(raw: Tensor) -> Tensor:
-    """Rates from raw ones; the first six numbers stay. [..., 12]"""
+    """Convert raw rates to rates; the first six numbers stay. [..., 12]"""
     rates = raw[..., 6:]
     return torch.cat([raw[..., :6], rates * rates.abs() / 10], -1)
 
 
 def about_centers(twists: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """World twists v, w and their rates a, e [n, 12], seen from centres [n, 3]: v and a become those of the centre."""
+    """Move world twists v, w and their rates a, e [n, 12] to centres [n, 3]: v and a become those of the centre."""
     v, w, a, e = np.split(twists, 4, axis=-1)
     return np.concatenate([v + rotations.cross(w, centers), w, a + rotations.cross(e, centers), e], -1)

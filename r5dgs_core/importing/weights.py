@@ -1,4 +1,4 @@
-"""Weights that others trained: state dictionaries of tensors, read without running any code that a file may hold."""
+"""Weights of other projects: state dictionaries of tensors, read without executing code from the file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..model import plain_tensors
 
 @dataclass(frozen=True)
 class Linear:
-    """One affine layer.
+    """Affine layer.
 
     Attributes:
         weight: [outputs, inputs] float32
@@ -29,22 +29,22 @@ class Linear:
 
     @property
     def inputs(self) -> int:
-        """Width of what goes in."""
+        """Number of input channels."""
         return self.weight.shape[1]
 
     @property
     def outputs(self) -> int:
-        """Width of what comes out."""
+        """Number of output channels."""
         return self.weight.shape[0]
 
     def __call__(self, x: Tensor) -> Tensor:
-        """[..., inputs] -> [..., outputs]"""
+        """Apply the layer. [..., inputs] -> [..., outputs]"""
         return functional.linear(x, self.weight, self.bias)
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The tensors of one file by name.
+    """Tensors of one file by name.
 
     Attributes:
         path: The file, for errors.
@@ -58,7 +58,7 @@ class Weights:
         return name in self.tensors
 
     def tensor(self, name: str, shape: tuple[int | None, ...]) -> Tensor:
-        """A tensor of a given shape, None where any size will do."""
+        """Return a tensor after checking its shape; None matches any size."""
         if name not in self.tensors:
             raise CheckpointError(
                 f"{self.path}: expected the tensor '{name}', found {', '.join(sorted(self.tensors)[:8]) or 'none'}, ..."
@@ -69,12 +69,12 @@ class Weights:
         return self.tensors[name]
 
     def linear(self, name: str, *, inputs: int | None = None, outputs: int | None = None) -> Linear:
-        """The layer ``name.weight, name.bias``, of a given width where one is given."""
+        """Return the layer ``name.weight, name.bias``, after checking the given widths."""
         weight = self.tensor(f"{name}.weight", (outputs, inputs))
         return Linear(weight, self.tensor(f"{name}.bias", (weight.shape[0],)))
 
     def chain(self, names: list[str], *, inputs: int | None, outputs: int | None = None) -> list[Linear]:
-        """Layers that follow each other, each as wide as the one before it puts out."""
+        """Return consecutive layers, after checking that their widths match."""
         layers: list[Linear] = []
         for i, name in enumerate(names):
             layers.append(self.linear(name, inputs=inputs, outputs=outputs if i == len(names) - 1 else None))
@@ -83,10 +83,10 @@ class Weights:
 
 
 def load(path: Path) -> Weights:
-    """Read a state dictionary; nothing but tensors is let in.
+    """Read a state dictionary; accepts only tensors.
 
     Raises:
-        CheckpointError: The file is missing, damaged, holds code or anything but finite tensors by name.
+        CheckpointError: The file is missing, damaged, holds code, or anything but finite tensors by name.
     """
     path = Path(path)
     try:
@@ -105,7 +105,7 @@ def load(path: Path) -> Weights:
             f"{path}: refused, as it holds code or objects besides tensors ({_reason(error)}); "
             "ask for a file that was saved with torch.save(model.state_dict(), ...)"
         ) from error
-    except Exception as error:  # torch raises many kinds for a damaged file
+    except Exception as error:  # torch raises many types for damaged files
         raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}); is it truncated?") from error
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: expected tensors by name, found {type(content).__name__}")
@@ -122,7 +122,7 @@ def load(path: Path) -> Weights:
 
 
 def _reason(error: Exception) -> str:
-    """The line of torch's long message that names what was refused."""
+    """Line of torch's long message that names the rejected object."""
     lines = [line.strip() for line in str(error).splitlines() if "nsupported" in line or "GLOBAL" in line]
     return (lines[0] if lines else str(error).splitlines()[0])[:160]
 
