@@ -1,4 +1,4 @@
-"""Sixteen float32 at once, inside numba kernels: a row of blocks of pixels, see `vectors`."""
+"""16-lane float32 SIMD type for numba kernels; one vector covers a block of 4 x 4 pixels. See `vectors`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ lanes, mask = make(ir.FloatType(), LANES, f"v{LANES}f32")
 
 @operation
 def splat(typingctx, scalar):
-    """Lanes that all hold ``scalar``."""
+    """Set all lanes to ``scalar``."""
     return lanes(types.float32), lambda context, builder, sig, args: repeat(builder, _FLOATS, args[0])
 
 
 @operation
 def load(typingctx, array, index):
-    """Lanes from a float32 array, from flat index ``index`` on; nothing is checked."""
+    """Load lanes from a float32 array at flat index ``index``; no bounds check."""
 
     def emit(context, builder, sig, args):
         array, index = args
@@ -35,7 +35,7 @@ def load(typingctx, array, index):
 
 @operation
 def broadcast(typingctx, array, index):
-    """Lanes that all hold one element of a float32 array, at flat index ``index``; nothing is checked."""
+    """Load one element of a float32 array, at flat index ``index``, into all lanes; no bounds check."""
 
     def emit(context, builder, sig, args):
         struct = context.make_array(sig.args[0])(context, builder, args[0])
@@ -46,7 +46,7 @@ def broadcast(typingctx, array, index):
 
 @operation
 def store(typingctx, array, index, value):
-    """Write lanes to a float32 array, from flat index ``index`` on; nothing is checked."""
+    """Store lanes to a float32 array at flat index ``index``; no bounds check."""
 
     def emit(context, builder, sig, args):
         builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], _FLOATS), align=4)
@@ -55,15 +55,15 @@ def store(typingctx, array, index, value):
     return types.void(array, types.intp, lanes), emit
 
 
-# A block of pixels: lane 4 y + x. Images hold its four rows of four pixels some stride apart.
+# A block of pixels: lane 4 y + x. In images, its four rows of four pixels are a stride apart.
 ROWS = 4
 
 
 @operation
 def store_rows(typingctx, array, index, stride, value):
-    """Write four rows of four lanes to an array, the first at a flat index, each a stride after the last.
+    """Store four rows of four lanes to an array, from a flat index on, rows ``stride`` elements apart.
 
-    The array holds float32, or int32 where the lanes are whole numbers.
+    The array is float32, or int32 if the lanes are whole numbers.
     """
 
     def emit(context, builder, sig, args):
@@ -81,7 +81,7 @@ def store_rows(typingctx, array, index, stride, value):
 
 @operation
 def store_rows_of_three(typingctx, array, index, stride, a, b, c):
-    """Like `store_rows` for an array that holds three values per pixel, from three vectors; the stride in floats."""
+    """Store three vectors like `store_rows` to an array with three values per pixel; the stride is in floats."""
 
     def emit(context, builder, sig, args):
         array, at, stride, a, b, c = args
@@ -104,7 +104,7 @@ def store_rows_of_three(typingctx, array, index, stride, a, b, c):
 
 @operation
 def load_rows(typingctx, array, index, stride):
-    """Lanes from four rows of four floats, as `store_rows` writes them."""
+    """Load lanes from four rows of four floats, in the layout of `store_rows`."""
 
     def emit(context, builder, sig, args):
         array, at, stride = args
@@ -117,7 +117,7 @@ def load_rows(typingctx, array, index, stride):
 
 @operation
 def load_rows_of_three(typingctx, array, index, stride):
-    """Three vectors from an array that holds three values per pixel, as `store_rows_of_three` writes them."""
+    """Load three vectors from an array with three values per pixel, in the layout of `store_rows_of_three`."""
 
     def emit(context, builder, sig, args):
         array, at, stride = args
@@ -142,7 +142,7 @@ def _store_part(context, builder, array_type, array, index, part):
 
 
 def _load_parts(context, builder, array_type, array, index, stride, count):
-    """Four short vectors, each a stride after the last."""
+    """Load four short vectors, a stride apart."""
     content, parts = ir.VectorType(ir.FloatType(), count), []
     for _ in range(ROWS):
         parts.append(builder.load(address(context, builder, array_type, array, index, content), align=4))
@@ -152,7 +152,7 @@ def _load_parts(context, builder, array_type, array, index, stride, count):
 
 @operation
 def mask_of(typingctx, bits):
-    """The mask whose lanes are the low bits of an integer."""
+    """Convert the low bits of an integer to a mask."""
 
     def emit(context, builder, sig, args):
         return builder.bitcast(builder.trunc(args[0], ir.IntType(LANES)), mask.content)
@@ -162,14 +162,14 @@ def mask_of(typingctx, bits):
 
 @operation
 def totals(typingctx, vectors):
-    """Lanes whose i-th is the sum of the i-th of sixteen vectors, each added up in the same fixed order."""
+    """Horizontal sums of sixteen vectors, one per lane, each added in the same fixed order."""
 
     def emit(context, builder, sig, args):
         rest = [builder.extract_value(args[0], i) for i in range(LANES)]
-        width = LANES  # lanes that still belong to one sum
+        width = LANES  # lanes that belong to one sum
         while width > 1:
             half, half_count = width // 2, len(rest) // 2
-            low, high = [], []  # lanes to add up: of each sum the first half and the second half, sums interleaved
+            low, high = [], []  # first and second half of each sum, sums interleaved
             for block in range(LANES // width):
                 for vector in (0, 1):
                     begin = vector * LANES + block * width
@@ -183,7 +183,7 @@ def totals(typingctx, vectors):
     return lanes(types.UniTuple(lanes, LANES)), emit
 
 
-# 2^x on [-1/2, 1/2]: the polynomial of least relative error (9.2e-8 in exact arithmetic) that is exact at 0.
+# 2^x on [-1/2, 1/2]: minimax polynomial for the relative error (9.2e-8 in exact arithmetic), exact at 0.
 _EXP2 = (1.0, 0.6931470036506653, 0.24022242426872253, 0.05550733581185341, 0.009671512991189957, 0.001326472730307149)
 
 
@@ -191,12 +191,12 @@ def _number(value):
     return constant(_FLOATS, float(np.float32(value)))
 
 
-_ROUND = 1.5 * 2.0**23  # a float32 this large has no fraction: adding it rounds to a whole number, kept in the low bits
+_ROUND = 1.5 * 2.0**23  # adding it rounds to an integer, held in the low bits, as a float32 this large has no fraction
 
 
 @operation
 def exp2(typingctx, a):
-    """2 to the power of each lane, for lanes in [-30, 30]: relative error below 2e-7, never subnormal."""
+    """2 to the power of each lane, for lanes in [-30, 30]; relative error below 2e-7, never subnormal."""
 
     def emit(context, builder, sig, args):
         shifted = builder.fadd(args[0], _number(_ROUND))
@@ -212,9 +212,9 @@ def exp2(typingctx, a):
 
 @operation
 def reciprocal(typingctx, a):
-    """One over each lane, for positive normal lanes: relative error below 2e-7, in a fraction of a division's time.
+    """Reciprocal of each lane, for positive normal lanes; relative error below 2e-7, much faster than a division.
 
-    Newton's method from a first guess that turns the exponent round, 12 % off at most.
+    Newton's method from an initial guess that negates the exponent, with an error of at most 12 %.
     """
 
     def emit(context, builder, sig, args):

@@ -1,4 +1,4 @@
-"""Eight float64 at once, inside numba kernels: eight Gaussians, see `vectors`."""
+"""8-lane float64 SIMD type for numba kernels; one vector covers eight Gaussians. See `vectors`."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ doubles, _ = make(ir.DoubleType(), DOUBLES, f"v{DOUBLES}f64")
 
 @operation
 def spread(typingctx, scalar):
-    """A vector that holds ``scalar`` everywhere."""
+    """Set all lanes to ``scalar``."""
     return doubles(types.float64), lambda context, builder, sig, args: repeat(builder, _DOUBLES, args[0])
 
 
 @operation
 def entry(typingctx, array, index):
-    """A vector that holds one element of a float64 array everywhere, at flat index ``index``; nothing is checked."""
+    """Load one element of a float64 array, at flat index ``index``, into all lanes; no bounds check."""
 
     def emit(context, builder, sig, args):
         array, index = args
@@ -39,9 +39,9 @@ def entry(typingctx, array, index):
 
 @operation
 def column(typingctx, array, row, last, width, index):
-    """Eight elements of a column of a flat table of floats with ``width`` columns, from ``row`` on.
+    """Load eight rows of a column of a flat float table with ``width`` columns, from ``row`` on.
 
-    Rows after ``last`` are taken to be the last one.
+    Rows beyond ``last`` repeat row ``last``.
     """
     element = array.dtype
 
@@ -62,7 +62,7 @@ def column(typingctx, array, row, last, width, index):
 
 @operation
 def set_column(typingctx, array, row, width, index, value):
-    """Write eight elements of a column of a flat table of float32 with ``width`` columns, from ``row`` on."""
+    """Store eight rows of a column of a flat float32 table with ``width`` columns, from ``row`` on."""
 
     def emit(context, builder, sig, args):
         array, row, width, index, value = args
@@ -79,7 +79,7 @@ def set_column(typingctx, array, row, width, index, value):
 
 @operation
 def store_doubles(typingctx, array, index, value):
-    """Write a vector to a float64 array, from flat index ``index`` on; nothing is checked."""
+    """Store a vector to a float64 array at flat index ``index``; no bounds check."""
 
     def emit(context, builder, sig, args):
         array, index, value = args
@@ -91,7 +91,7 @@ def store_doubles(typingctx, array, index, value):
 
 @operation
 def store_table(typingctx, array, row, columns):
-    """Write eight rows of a flat float64 table with eight columns, from ``row`` on; the columns are eight vectors."""
+    """Store eight vectors as the columns of eight rows of a flat float64 table with eight columns, from ``row`` on."""
 
     def emit(context, builder, sig, args):
         array, row, columns = args
@@ -118,7 +118,7 @@ def store_table(typingctx, array, row, columns):
 
 @operation
 def widen(typingctx, vector):
-    """Sixteen float32 as two vectors of float64."""
+    """Convert sixteen float32 to two vectors of float64."""
 
     def emit(context, builder, sig, args):
         halves = [shuffle(builder, args[0], args[0], range(k, k + DOUBLES)) for k in (0, LANES - DOUBLES)]
@@ -137,7 +137,7 @@ def sqrt(typingctx, a):
 
 @operation
 def floor(typingctx, a):
-    """The largest whole number that is not larger."""
+    """Round down to an integer."""
     return doubles(doubles), lambda context, builder, sig, args: call(
         builder, f"llvm.floor.v{DOUBLES}f64", _DOUBLES, args
     )
@@ -150,7 +150,7 @@ _TWO_TO_52 = 1075 << 52
 
 @operation
 def log2(typingctx, a):
-    """Logarithm to base 2 of positive normal numbers, good to a few units of float64 rounding."""
+    """Logarithm to base 2 of positive normal numbers, accurate to a few float64 rounding errors."""
 
     def emit(context, builder, sig, args):
         def number(value):
@@ -163,14 +163,14 @@ def log2(typingctx, a):
             return call(builder, f"llvm.fma.v{DOUBLES}f64", _DOUBLES, [a, b, c])
 
         bits = builder.bitcast(args[0], _INTS)
-        # m in [1, 2) and 2^k; where m > sqrt(2), half of it and one more, so that |m - 1| is small
+        # x = m 2^k with m in [1, 2); if m > sqrt(2), halve m and increment k, so that |m - 1| is small
         fraction = builder.bitcast(builder.or_(builder.and_(bits, integer(_FRACTION)), integer(_ONE)), _DOUBLES)
         biased = builder.or_(builder.lshr(bits, integer(52)), integer(_TWO_TO_52))
         whole = builder.fsub(builder.bitcast(biased, _DOUBLES), number(2.0**52 + 1023))
         large = builder.fcmp_ordered(">", fraction, number(math.sqrt(2.0)))
         fraction = builder.select(large, builder.fmul(fraction, number(0.5)), fraction)
         whole = builder.select(large, builder.fadd(whole, number(1.0)), whole)
-        # ln m = 2 artanh s with s = (m - 1) / (m + 1), |s| < 0.172: eleven terms of its series
+        # ln m = 2 artanh s with s = (m - 1) / (m + 1), |s| < 0.172: eleven terms of the series
         s = builder.fdiv(builder.fsub(fraction, number(1.0)), builder.fadd(fraction, number(1.0)))
         square = builder.fmul(s, s)
         series = number(1 / 21)

@@ -1,9 +1,9 @@
-"""Vectors as values inside numba kernels: their types, their operators, and what they have in common.
+"""SIMD vectors as values in numba kernels: types, operators and common operations.
 
-Numba vectorizes loops only when it can prove enough about them. Here the vector is explicit: every operation is one
-vector instruction (or two or four where the machine's vectors are shorter). The two kinds are `float32x16` (sixteen
-float32) and `float64x8` (eight float64), each with a mask of as many booleans. Sums of products are fused only where
-`fma` is written, so that kernels that do the same arithmetic decide alike, to the bit.
+Numba's automatic vectorization depends on what it can prove about a loop. Here it is explicit: every operation is one
+vector instruction, or two or four on machines with shorter vectors. The two types are `float32x16` and `float64x8`,
+each with a mask of booleans. Products and sums are fused only by `fma`, so that kernels with the same arithmetic make
+bit-identical decisions.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba.extending import intrinsic, models, register_model
 
 
 class VectorType(types.Type):
-    """A vector, or the mask of one, as numba sees it."""
+    """Numba type of a vector, or of its mask."""
 
     def __init__(self, name: str, content: ir.VectorType, suffix: str):
         super().__init__(name=name)
@@ -34,12 +34,12 @@ class VectorModel(models.PrimitiveModel):
 
 
 def operation(emitter) -> Any:
-    """Make a function of the kernels from one that is called by the compiler: signature and emitter of instructions."""
+    """Register a numba intrinsic; ``emitter`` returns its signature and its code generator."""
     return intrinsic(emitter)
 
 
 def make(element: ir.Type, count: int, suffix: str) -> tuple[VectorType, VectorType]:
-    """A kind of vector and its mask, with their operators; ``suffix`` is LLVM's name of the vector."""
+    """Create a vector type and its mask type with their operators; ``suffix`` is LLVM's name of the vector."""
     vector = VectorType(f"vector_{suffix}", ir.VectorType(element, count), suffix)
     mask = VectorType(f"mask_{suffix}", ir.VectorType(ir.IntType(1), count), f"v{count}i1")
     _define(operator.add, (vector, vector), vector, lambda b, x, y: b.fadd(x, y))
@@ -56,45 +56,45 @@ def make(element: ir.Type, count: int, suffix: str) -> tuple[VectorType, VectorT
 
 
 def _define(key, operands, result, emit) -> None:
-    """Let ``key`` (from the module ``operator``) work on vector types by emitting one instruction."""
+    """Implement ``key`` (from the module ``operator``) for vector types by one instruction."""
     register: Any = infer_global(key)
     register(type(f"Vector_{key.__name__}", (ConcreteTemplate,), {"cases": [signature(result, *operands)]}))
     lower_builtin(key, *operands)(lambda context, builder, sig, args: emit(builder, *args))
 
 
-# What emitters need
+# Helpers for code generators
 
 
 def constant(vector: ir.VectorType, value: float) -> ir.Constant:
-    """A vector that holds one number everywhere."""
+    """Vector constant with one number in all lanes."""
     return ir.Constant(vector, [value] * vector.count)
 
 
 def repeat(builder, vector: ir.VectorType, scalar):
-    """Repeat a scalar everywhere."""
+    """Copy a scalar to all lanes."""
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
     return shuffle(builder, first, first, [0] * vector.count)
 
 
 def shuffle(builder, a, b, indices: Iterable[int]):
-    """A vector of some elements of a followed by b."""
+    """Select elements of the concatenation of a and b."""
     indices = list(indices)
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
 
 
 def call(builder, name: str, result: ir.Type, arguments):
-    """Call an intrinsic function of LLVM."""
+    """Call an LLVM intrinsic."""
     function_type = ir.FunctionType(result, [a.type for a in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), arguments)
 
 
 def address(context, builder, array_type, array, index, content: ir.Type):
-    """Pointer to some elements of a C-contiguous array from a flat index on."""
+    """Pointer into a C-contiguous array at a flat index."""
     struct = context.make_array(array_type)(context, builder, array)
     return builder.bitcast(builder.gep(struct.data, [index]), content.as_pointer())
 
 
-# What both kinds can do
+# Operations of both types
 
 
 @operation
@@ -107,25 +107,25 @@ def fma(typingctx, a, b, c):
 
 @operation
 def smaller(typingctx, a, b):
-    """Element by element the smaller of two."""
+    """Element-wise minimum."""
     return a(a, b), lambda context, builder, sig, args: builder.select(builder.fcmp_ordered("<", *args), *args)
 
 
 @operation
 def larger(typingctx, a, b):
-    """Element by element the larger of two."""
+    """Element-wise maximum."""
     return a(a, b), lambda context, builder, sig, args: builder.select(builder.fcmp_ordered(">", *args), *args)
 
 
 @operation
 def select(typingctx, condition, a, b):
-    """Element by element a where the condition holds, else b."""
+    """Element-wise choice: a if the condition is true, else b."""
     return a(condition, a, b), lambda context, builder, sig, args: builder.select(*args)
 
 
 @operation
 def bits_of(typingctx, condition):
-    """The mask as the low bits of an integer, the first element lowest."""
+    """Convert a mask to the low bits of an integer, the first lane lowest."""
 
     def emit(context, builder, sig, args):
         return builder.zext(builder.bitcast(args[0], ir.IntType(sig.args[0].count)), ir.IntType(64))
@@ -135,7 +135,7 @@ def bits_of(typingctx, condition):
 
 @operation
 def any_of(typingctx, condition):
-    """Whether the condition holds anywhere."""
+    """True if any lane is true."""
 
     def emit(context, builder, sig, args):
         bits = builder.bitcast(args[0], ir.IntType(sig.args[0].count))
@@ -146,7 +146,7 @@ def any_of(typingctx, condition):
 
 @operation
 def unlikely(typingctx, condition):
-    """The condition itself; tells the compiler to keep what hangs on it out of the way of the rest."""
+    """Return the condition, with a hint to the compiler that it is rarely true."""
 
     def emit(context, builder, sig, args):
         return call(builder, "llvm.expect.i1", ir.IntType(1), [args[0], ir.Constant(ir.IntType(1), 0)])
@@ -156,7 +156,7 @@ def unlikely(typingctx, condition):
 
 @operation
 def lowest_bit(typingctx, bits):
-    """Index of the lowest bit that is set; undefined for zero."""
+    """Index of the lowest set bit; undefined for zero."""
 
     def emit(context, builder, sig, args):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -166,7 +166,7 @@ def lowest_bit(typingctx, bits):
 
 @operation
 def prefetch(typingctx, array, index):
-    """Ask for the cache line of one element of an array, at flat index ``index``, before it is needed."""
+    """Prefetch the cache line of an array element at flat index ``index``."""
 
     def emit(context, builder, sig, args):
         array, index = args
