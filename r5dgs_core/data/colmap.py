@@ -217,7 +217,7 @@ def _videos(root: Path, registered: tuple[Registered, ...], guard: findings.Guar
         if image.name not in used:
             with guard():
                 _check_kind(root, image.name, f"{root / IMAGES / image.name}")
-            _log.warning("%s: left out, as nothing says its time; give times.json", image.name)
+            _log.warning("%s: left out, as its time is unknown; list it in times.json", image.name)
     frames = [
         _Frame(name, pose, camera, (number - first) / max(span, 1))
         for (name, pose, camera), number in zip(found, numbers, strict=True)

@@ -149,8 +149,8 @@ class Dataset:
         videos = sorted({view.mask_video for view in self.train if view.mask_path is not None})
         if len(videos) > 1:
             raise errors.DatasetError(
-                f"{self.mask_folder}: the ids of these masks hold within a video only ({len(videos)} of them: "
-                f"{', '.join(videos[:3])}{', ...' if len(videos) > 3 else ''}), an object has another one in each. "
+                f"{self.mask_folder}: the ids of these masks are valid per video only ({len(videos)} videos: "
+                f"{', '.join(videos[:3])}{', ...' if len(videos) > 3 else ''}); an object has a different id in each. "
                 f"Remedy: train with --masks none, then r5dgs associate RUN --masks {self.mask_folder}, which gives "
                 "them one numbering"
             )
@@ -218,8 +218,8 @@ def read(
     named = folders["train"] if folders["train"] != folders["val"] else None
     if named is not None and all(view.mask_path is None for view in views["train"]):
         raise errors.DatasetError(
-            f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: 'r5dgs masks' with "
-            "--from takes masks over that lie flat, --masks none goes without",
+            f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: import masks of "
+            "another layout with 'r5dgs masks --from', or train without masks: --masks none",
             code="D17",
         )
     for folder in dict.fromkeys(folders.values()):

@@ -1,4 +1,4 @@
-"""Import of another project's run folder as a scene (`r5dgs import`); docs/import.md describes what is imported."""
+"""Import of another project's run folder as a scene (`r5dgs import`). Documentation: docs/user/import.md."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def _world(run: RunFolder, foreign: Foreign, dataset: Dataset | None, options: O
     if not blender and isinstance(source, str) and source:
         blender = (Path(source) / "transforms_train.json").is_file()
     world = "blender" if blender else "colmap"
-    _log.info("%s: world axes taken to be those of %s; --world says otherwise", run.folder, world)
+    _log.info("%s: assuming the world axes of %s; change them with --world", run.folder, world)
     return world
 
 

@@ -63,7 +63,7 @@ class RunFolder:
             found = f"{value!r:.60}" if "max_time" in self.config else "nothing"
             raise CheckpointError(
                 f"{self.folder / 'cfg_args'}: 'max_time': expected the last time of the deformation, found {found}; "
-                "say it with --t-max (both codes take 0.7 where nothing is said)"
+                "give it with --t-max (the default of both codes is 0.7)"
             )
         return float(value)
 
@@ -102,9 +102,7 @@ def open_run(folder: Path, iteration: int | None = None) -> RunFolder:
     files = frozenset(path.name for path in part.glob("*.pth"))
     known = {"deform.pth", "vel.pth", "code_field.pth"} if deforms else {"classifier.pth"}
     if files - known:
-        raise CheckpointError(
-            f"{part}: unknown layout: nothing is known of {', '.join(sorted(files - known))}; {_KNOWN}"
-        )
+        raise CheckpointError(f"{part}: unknown layout: unexpected {', '.join(sorted(files - known))}; {_KNOWN}")
     return RunFolder(folder, chosen, read_config(folder / "cfg_args"), deforms, files)
 
 

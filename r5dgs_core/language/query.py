@@ -40,7 +40,7 @@ def check(stored: EncoderCard, asked: EncoderCard, place: str) -> None:
     """Raise `BackendError` if an encoder is not the one that made a table."""
     if stored.digest != asked.digest or stored.kind != asked.kind:
         raise errors.BackendError(
-            f"{place}: its lookup table was made by {_said(stored)}, and cannot be asked with {_said(asked)}; give "
+            f"{place}: its lookup table was made by {_said(stored)}, and cannot be used with {_said(asked)}; give "
             "the one that made it, or make the table again: r5dgs lookup SCENE --encoder DIR"
         )
 

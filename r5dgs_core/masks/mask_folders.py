@@ -56,7 +56,7 @@ class Precomputed:
         self._colors = masks.color_table(found)
         if self._colors and unknown is not None:
             raise errors.ConfigError(
-                f"--unknown {unknown}: the masks in {folder} are coded by colour, of which none says that; leave it out"
+                f"--unknown {unknown}: the masks in {folder} are coded by colour and have no such value; leave it out"
             )
         own_names = self.folder / OBJECTS
         self.own_names = own_names if own_names.is_file() else None

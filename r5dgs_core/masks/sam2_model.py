@@ -89,8 +89,8 @@ def _transformers() -> Any:
         ) from error
     except RuntimeError as error:  # transformers imports other installed packages
         raise errors.BackendError(
-            f"transformers cannot be imported ({error}). Remedy: where a torchvision that does not fit torch is "
-            "installed, remove it: pip uninstall torchvision; nothing here needs it"
+            f"transformers cannot be imported ({error}). Remedy: if the installed torchvision does not fit "
+            "torch, remove it, as it is not needed: pip uninstall torchvision"
         ) from error
     return transformers
 

@@ -74,7 +74,7 @@ def follow(model: Sam2, frames: Frames, key: int, marked: Tensor) -> Iterator[tu
         video_storage_device=model.device,
         dtype=torch.float32,
     )
-    state.processed_frames = frames  # pyright: ignore[reportAttributeAccessIssue]  # of which two methods are asked
+    state.processed_frames = frames  # pyright: ignore[reportAttributeAccessIssue]  # used like a dict
     for k, logits in enumerate(marked):
         mask = full_size(logits[None], (model.size, model.size)) > 0
         state.add_mask_inputs(state.obj_id_to_idx(k), key, mask[None].float())

@@ -33,7 +33,7 @@ def choose_backend(backend: str, means: torch.Tensor) -> str:
             reason = cuda.obstacle(means.device, means.dtype)
             if reason is None:
                 return "cuda"
-            _warn_once(f"rasterizer: using the slow reference on the GPU, as backend 'cuda' cannot draw: {reason}")
+            _warn_once(f"rasterizer: using the slow reference on the GPU, as backend 'cuda' is not available: {reason}")
         return "reference"
     if backend == "cuda":
         reason = cuda.obstacle(means.device, means.dtype)

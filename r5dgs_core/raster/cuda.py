@@ -162,8 +162,8 @@ def find_kernels() -> Kernels | str:
             return "gsplat is not installed; remedy: pip install 'r5dgs[cuda]'"
         what = (str(error).splitlines() or [""])[0]
         return (
-            f"gsplat {version} does not load ({type(error).__name__}: {what}); remedy: see that nvcc of CUDA "
-            f"{torch.version.cuda} and a C++ compiler that it accepts are there; `python -c 'from gsplat.cuda import "
+            f"gsplat {version} does not load ({type(error).__name__}: {what}); remedy: check that nvcc of CUDA "
+            f"{torch.version.cuda} and a compatible C++ compiler are installed; `python -c 'from gsplat.cuda import "
             "_backend'` shows the whole message"
         )
     if _backend._C is None:

@@ -179,7 +179,7 @@ class Stage:
         if sky is None:
             return None
         if not 0 <= sky.scene < len(self._scenes):
-            raise ValueError(f"sky: scene {sky.scene} of {len(self._scenes)} is not there")
+            raise ValueError(f"sky: expected a scene below {len(self._scenes)}, got {sky.scene}")
         scene, turned = self._scenes[sky.scene], scene_renderer.in_world_of(camera, sky.matrix)
         return scene_renderer.tensor(scene_renderer.behind(scene, turned))
 

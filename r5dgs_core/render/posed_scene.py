@@ -303,7 +303,7 @@ def affine(matrix: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _rows(given: Gathered, index: int, instance: Instance) -> tuple[int, int]:
     """First gathered row of an instance, and the one past its last."""
     if not 0 <= instance.scene < len(given.starts) - 1:
-        raise ValueError(f"instance {index}: scene {instance.scene} of {len(given.starts) - 1} is not there")
+        raise ValueError(f"instance {index}: expected a scene below {len(given.starts) - 1}, got {instance.scene}")
     first, end = given.starts[instance.scene : instance.scene + 2]
     start, stop = instance.start, instance.start + instance.count
     if not 0 <= start <= stop <= end - first:

@@ -138,7 +138,7 @@ def check_loaded(folder: Path, info: dict[str, Any], unused: Sequence[str] = ())
     """
     absent = sorted(str(name) for name in info.get("missing_keys", ()) if not str(name).startswith(tuple(unused)))
     wrong = sorted(str(each[0] if isinstance(each, tuple) else each) for each in info.get("mismatched_keys", ()))
-    for names, what in ((absent, "are missing"), (wrong, "have other shapes than config.json says")):
+    for names, what in ((absent, "are missing"), (wrong, "have shapes that differ from config.json")):
         if names:
             raise errors.BackendError(
                 f"{folder}: {len(names)} of the model's weights {what} ({names[0]}, ...); copy the model again, "

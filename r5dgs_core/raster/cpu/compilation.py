@@ -35,7 +35,7 @@ from numba.core import event as numba_events
 log = logging.getLogger(__name__)
 
 NOTICE = "rasterizer: compiling its kernels for this machine, once; 10 to 30 s"
-NOTICE_UNKEPT = "rasterizer: compiling its kernels, as there is no place to keep them; 10 to 30 s in every process"
+NOTICE_UNKEPT = "rasterizer: compiling its kernels, which cannot be cached; 10 to 30 s in every process"
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True}

@@ -159,7 +159,7 @@ def test_ids_of_videos_that_stay_are_not_called_those_of_the_scene(trained, tiny
     said = capsys.readouterr().out
     assert "the incoming ids stay" in said and "within single videos" in said and "r5dgs train" not in said
     assert mask_notes.read(out).videos == videos
-    with pytest.raises(errors.DatasetError, match="hold within a video only"):
+    with pytest.raises(errors.DatasetError, match="are valid per video only"):
         datasets.read(tiny.root, str(out)).require_one_numbering()
     assert json.loads((out / mask_repair.SUMMARY).read_text())["numbering"] == "video"
 

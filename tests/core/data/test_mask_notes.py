@@ -76,7 +76,7 @@ def test_masks_numbered_per_video_are_not_trained_with(copied, tmp_path):
     tiny_datasets.number_by_camera(copied, copied / "object_mask", (1, 2))
     dataset = datasets.read(copied)
     assert len({view.mask_video for view in dataset.train}) == 6
-    with pytest.raises(errors.DatasetError, match=r"hold within a video only \(6 of them.*--masks none.*associate"):
+    with pytest.raises(errors.DatasetError, match=r"are valid per video only \(6 videos.*--masks none.*associate"):
         run.train(copied, tmp_path / "run", tiny_datasets.settings("train.iterations=2"))
     assert not (tmp_path / "run").exists()
     datasets.read(copied, "none").require_one_numbering()

@@ -131,7 +131,7 @@ def test_velocity_of_another_width_is_no_known_layout(traced):
 
 def test_trace_and_freegave_need_their_last_time(traced):
     (traced / "cfg_args").write_text("Namespace(light=True)")
-    with pytest.raises(CheckpointError, match=r"cfg_args: 'max_time': expected .* found nothing; say it with --t-max"):
+    with pytest.raises(CheckpointError, match=r"cfg_args: 'max_time': expected .* found nothing; give it with --t-max"):
         importer.import_run(traced)
     scene = importer.import_run(traced, importer.Options(t_max=0.6, knots=3))
     np.testing.assert_allclose(scene.track_times, [0.0, 0.3, 0.6])
@@ -174,7 +174,7 @@ def test_other_folders_are_told_apart(tmp_path, deformed):
     with pytest.raises(CheckpointError, match=f"name the run folder itself, {deformed}"):
         run_folder.open_run(inside)
     (deformed / "deform" / "iteration_20000" / "hexplane.pth").write_bytes(b"")
-    with pytest.raises(CheckpointError, match="unknown layout: nothing is known of hexplane.pth"):
+    with pytest.raises(CheckpointError, match="unknown layout: unexpected hexplane.pth"):
         run_folder.open_run(deformed)
 
 

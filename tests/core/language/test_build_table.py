@@ -332,7 +332,7 @@ def test_the_encoder_of_the_table_answers_other_words(file, capsys):
     assert main.main(["query", str(file), "elephant, lemon", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["note"] == "nothing matches 'elephant'"
     assert main.main(["query", str(file), "lemon", "--encoder", "other"]) == 3
-    assert "cannot be asked with" in capsys.readouterr().err
+    assert "cannot be used with" in capsys.readouterr().err
 
 
 def test_naming_an_object_changes_that_alone(file, capsys):

@@ -266,7 +266,7 @@ def test_the_command_makes_goes_on_and_says_what_comes_next(tiny, folder, tmp_pa
     assert "2 of 6 videos were done before" in told and "--masks none" in told and "r5dgs associate RUN" in told
     dataset = datasets.read(tiny.root, str(tmp_path / "m"))
     assert all(datasets.load_mask(view).max() > 0 for view in dataset.train)
-    with pytest.raises(errors.DatasetError, match="hold within a video only"):
+    with pytest.raises(errors.DatasetError, match="are valid per video only"):
         dataset.require_one_numbering()
     with pytest.raises(errors.DatasetError, match=r"other settings \(points\)"):
         cli_masks.run_masks(tiny.root, **options | {"points": 3})

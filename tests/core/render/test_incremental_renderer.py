@@ -221,7 +221,7 @@ def test_no_scene_at_all_leaves_black():
 @pytest.mark.parametrize(
     ("instance", "message"),
     [
-        (Instance(0, 5, np.eye(4), scene=2), "scene 2 of 2"),
+        (Instance(0, 5, np.eye(4), scene=2), "scene below 2, got 2"),
         (Instance(450, 5, np.eye(4), scene=1), "leave the scene's 400"),
         (Instance(0, 5, np.eye(4), tint=(1.0, -1.0, 1.0)), "tint"),
         (Instance(0, 5, np.eye(4), world=np.zeros((4, 4))), "flattens"),
