@@ -173,7 +173,7 @@ def _timed(
             else:
                 raise errors.DatasetError(
                     f"{path}: {name!r}: expected a registered image, or one of a camera that is registered once, found "
-                    "neither; was it left out by COLMAP? Remove it here",
+                    "neither; if COLMAP left it out, remove it from this file",
                     code="D16",
                 )
     return frames

@@ -422,7 +422,7 @@ def _attach_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hashe
         return views
     notes = mask_notes.read(folder)
     if not notes.finished:
-        _log.warning("%s: masks are missing; give the command that makes them again", folder)
+        _log.warning("%s: masks are missing; run the command that makes them again", folder)
     videos = notes.video_of()
     lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
 

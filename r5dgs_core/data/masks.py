@@ -114,9 +114,9 @@ def color_table(paths: Iterable[Path]) -> dict[int, int]:
         if foreign := shown - found - {0}:
             color = min(foreign)
             raise errors.DatasetError(
-                f"{path}: shows ({color >> 16}, {color >> 8 & 255}, {color & 255}), which no mask of colours like "
-                f"{colored} does: does it hold ids or colours? Write all masks in one way, best with one channel of "
-                "ids",
+                f"{path}: contains ({color >> 16}, {color >> 8 & 255}, {color & 255}), which masks coded by colour "
+                f"like {colored} lack: does it hold ids or colours? Write all masks in one way, best with one channel "
+                "of ids",
                 code="D19",
             )
     return {0: 0} | {color: i + 1 for i, color in enumerate(sorted(found - {0}))}

@@ -55,9 +55,9 @@ def find(
         return np.zeros(3)
     if np.spacing(away) > RESOLUTION * spread:
         raise errors.DatasetError(
-            f"{place}: the cameras stand {spread:.3g} units apart but {away:.3g} units from the world's origin: not "
-            "even 64-bit numbers tell their places apart. Remedy: subtract a constant from all positions in the camera "
-            "files where they are made, before they are rounded"
+            f"{place}: the cameras stand {spread:.3g} units apart but {away:.3g} units from the world's origin: too "
+            "far for 64-bit numbers to resolve their positions. Remedy: subtract a constant from all positions in the "
+            "program that writes the camera files, before they are rounded"
         )
     digits = -math.floor(math.log10(spread))
     return np.array([round(float(value), digits) for value in middle]) + 0.0  # turns -0.0 into 0.0

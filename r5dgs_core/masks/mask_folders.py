@@ -50,8 +50,8 @@ class Precomputed:
         found = [path for path in self._paths.values() if path is not None]
         if not found:
             raise errors.DatasetError(
-                f"{folder}: expected masks such as {views[0].name}.png, found none; masks are PNG files called like "
-                "their images"
+                f"{folder}: expected masks such as {views[0].name}.png, found none; masks are PNG files with the "
+                "names of their images"
             )
         self._colors = masks.color_table(found)
         if self._colors and unknown is not None:

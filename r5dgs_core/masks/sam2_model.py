@@ -116,7 +116,7 @@ def _load(kind: Any, folder: Path) -> Any:
     except Exception as error:  # the library raises many types for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise errors.BackendError(
-            f"{folder}: the model cannot be loaded ({reason[:300]}); is a file damaged or cut off? Get it again"
+            f"{folder}: the model cannot be loaded ({reason[:300]}); a file may be damaged: download it again"
         ) from error
     encoder_base.check_loaded(folder, found)
     return model.eval().requires_grad_(False)

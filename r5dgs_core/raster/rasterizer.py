@@ -170,7 +170,7 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
         if tensor.dtype != means.dtype or tensor.device != means.device:
             raise ValueError(
                 f"{name}: expected {means.dtype} on {means.device}, as the means are, got {tensor.dtype} on "
-                f"{tensor.device}; remedy: {name}.to(means), or the means in the kind of the others"
+                f"{tensor.device}; remedy: {name}.to(means), or convert the means"
             )
     cameras.check(camera)
     if background is not None:
@@ -218,7 +218,7 @@ def _check_background(background: Any, means: torch.Tensor, camera: Camera, dept
     if not background.is_floating_point():
         raise ValueError(
             f"background: expected floating-point values, got {background.dtype}; remedy: background.float(), "
-            "divided by 255 where they are 8 bit colours"
+            "divided by 255 for 8-bit colours"
         )
     _check_device("background", background, means)
 

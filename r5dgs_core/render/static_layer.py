@@ -110,7 +110,7 @@ class Backdrop:
         if channels.shape[1] != expected:
             raise ValueError(f"channels: expected {expected} as in the backdrop, got {channels.shape[1]}")
         if (labels is None) != (self._labels is None):
-            raise ValueError("labels: expected for the backdrop and for what moves, or for neither")
+            raise ValueError("labels: expected for static and moving Gaussians, or for neither")
         numbers = None if labels is None else cpu_backend.to_numbers(labels)
         shapes = [cpu_backend.to_array(t) for t in (means, quats, scales, opacities)]
         with self._lock:

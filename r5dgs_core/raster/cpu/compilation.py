@@ -215,7 +215,7 @@ def _cache_folder(chosen: str) -> str | None:
             tried.append(f"{base} ({error.strerror})")
             continue
         if danger is not None:  # never load machine code that other users can replace
-            log.warning("rasterizer: no compiled code is kept in %s, as %s; remedy: remove it", folder, danger)
+            log.warning("rasterizer: compiled code is not cached in %s, as %s; remedy: remove it", folder, danger)
             tried.append(f"{base} (others can write there)")
             continue
         with contextlib.suppress(OSError):

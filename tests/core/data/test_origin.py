@@ -56,7 +56,7 @@ def test_far_scenes_get_an_origin_among_their_cameras_that_is_short_to_write(sca
 
 
 def test_cameras_that_float64_cannot_tell_apart_are_refused(tmp_path):
-    with pytest.raises(errors.DatasetError, match=r"data: .*not even 64-bit numbers.*subtract a constant"):
+    with pytest.raises(errors.DatasetError, match=r"data: .*too far for 64-bit numbers.*subtract a constant"):
         datasets.read(made(tmp_path / "data", 1.0, (1e12, 0.0, 0.0)).root)
     with pytest.raises(errors.DatasetError, match="within 1e"):
         origin.find(1e10 * RING + 2e15, "here")
