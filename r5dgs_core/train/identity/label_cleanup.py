@@ -1,12 +1,12 @@
-"""Which object each Gaussian shows, once its neighbours and its motion have had their say.
+"""Clean-up of object labels by spatial neighbours, motion and outlier removal.
 
-The vote of the masks (`identity_training.votes`) leaves Gaussians undecided that lie on an outline, that few masks
-show, or that wrong masks claim. For these, and for none whose own votes are decided, what lies around them and what
-they move with decides. `regrouping` is the rule of the other label, the motion group.
+The vote of the masks (`identity_training.votes`) leaves Gaussians undecided that lie on an outline, are shown by few
+masks, or are claimed by wrong masks. Only the labels of undecided Gaussians change, according to their neighbours and
+to the group that they move with. `regrouping` is the corresponding rule for motion groups.
 
-Notation: N Gaussians, C classes (0 the background); v the votes [N, C] in pixels of blending weight, p the shares of a
-Gaussian's votes, each divided by how sure its class is where nothing else is near (`certainty`: masks that miss an
-object in one image of five leave its very middle a share of 0.8), and t / (t + 1 px) the trust in t pixels of votes.
+Notation: N Gaussians, C classes (0 the background); v the votes [N, C] in pixels of blending weight; p the shares of a
+Gaussian's votes, each divided by the `certainty` of its class (if masks miss an object in one image of five, even its
+interior has a share of only 0.8); t / (t + 1 px) the trust in t pixels of votes.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ from ..observed_motion import GroupTrack
 
 log = logging.getLogger(__name__)
 
-CHANGES = "label_changes"  # name of the counts in a checkpoint: those of `Changes`, in its order
+CHANGES = "label_changes"  # name of the counts in a checkpoint, in the order of `Changes`
 
 NEIGHBOURS = 8
-OWN = 4.0  # a Gaussian's own votes count as much as so many neighbourhoods,
-MOTION = 0.5  # the group that it moves with as half of one
-DOUBT = 1.0  # pixels of votes that are trusted by half
-UNDECIDED = 0.55  # of the votes for its label and another one: a Gaussian with more for its label keeps it,
-UNDECIDED_BACKGROUND = 0.45  # and so does what would come from the background to an object, with more than this
-APART = 5.0  # of the spacing of an object's members: parts that lie further off are not joined to it
-SMALL = 0.05  # of an object's opacity: larger parts are its own
-SUPPORTED = 0.65  # share of the votes of a part with which it stays
-FEWEST = 9  # members of an object that can have parts
-MOVES = 0.1  # of its radius: an object that moves by less says nothing by its motion
-AGREED = 0.5  # share of the votes in the middle of the usual object: with less, masks do not agree on who is who
-AT_ONCE = 1 << 16  # Gaussians whose neighbours are asked at once; bounds memory
+OWN = 4.0  # weight of a Gaussian's own votes relative to its neighbourhood
+MOTION = 0.5  # weight of the group that it moves with relative to its neighbourhood
+DOUBT = 1.0  # votes with a trust of one half, pixels
+UNDECIDED = 0.55  # share of own label in the votes for it and the new one, above which an object's Gaussian keeps it
+UNDECIDED_BACKGROUND = 0.45  # the same for Gaussians of the background
+APART = 5.0  # longest link between members of an object / their typical spacing
+SMALL = 0.05  # share of an object's total opacity above which a part is never an outlier
+SUPPORTED = 0.65  # trusted share of a part's votes above which it is no outlier
+FEWEST = 9  # smallest number of members for statistics of an object
+MOVES = 0.1  # displacement in radii above which an object counts as moving
+AGREED = 0.5  # median certainty of the objects below which the masks contradict each other
+AT_ONCE = 1 << 16  # Gaussians per block; bounds memory
 
 
 @dataclass(frozen=True)
 class Changes:
-    """How many labels were changed, and by what.
+    """Counts of changed labels by cause.
 
     Attributes:
-        neighbours: By what lies around a Gaussian.
-        motion: By what it moves with, where its neighbours alone would not have.
-        outliers: Because they lie apart from their object and little speaks for it.
-        gaussians: Of how many.
+        neighbours: Changed by the spatial neighbours.
+        motion: Changed by the motion group, where the neighbours alone would not have changed it.
+        outliers: Changed because they lie apart from their object and have few votes for it.
+        gaussians: Number of Gaussians in total.
     """
 
     neighbours: int = 0
@@ -69,21 +69,21 @@ def clean(
     going: np.ndarray | None = None,
     moving: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Changes]:
-    """Labels after neighbours, motion and outliers.
+    """Clean labels by neighbours, motion and outlier removal.
 
-    An object is never left without Gaussians, and a Gaussian that cannot be seen does not come to an object. Where
-    masks contradict each other even about the middles of objects, nothing is changed.
+    An object never loses all its Gaussians, and nearly transparent Gaussians never join an object. No label changes if
+    the masks contradict each other even in the interior of objects.
 
     Args:
-        votes: Of the masks. [N, C]
-        labels: Class of each Gaussian as these, or what stands for them, say. [N]
+        votes: Votes of the masks. [N, C]
+        labels: Class of each Gaussian by the votes, or by its motion group if it has none. [N]
         points: Centres in the bind state. [N, 3]
         opacities: [N]
-        going: Class of the body that it moves with, 0 for none; None where that is not known. [N]
-        moving: Classes whose motion tells them from what rests. [C] bool
+        going: Class of the body that a Gaussian moves with, 0 for none; None if unknown. [N]
+        moving: Classes that can be told from the background by their motion. [C] bool
 
     Returns:
-        Classes [N] int64, and what was changed.
+        Classes [N] int64, and the counts of changes.
     """
     start, count = labels.astype(np.int64), votes.shape[1]
     if len(votes) < 2 or count < 2:
@@ -119,17 +119,19 @@ def clean(
 def certainty(
     shares: np.ndarray, labels: np.ndarray, total: np.ndarray, opacities: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Share that a class has where all that is near has its label: 1 for clean masks, less for masks that miss it.
+    """Return the share of votes that a class has in its interior: 1 for clean masks, less if masks miss it.
+
+    The interior consists of Gaussians whose neighbours all have the same label.
 
     Args:
-        shares: Of the votes. [N, C]
+        shares: Shares of the votes. [N, C]
         labels: [N]
         total: Votes, pixels. [N]
         opacities: [N]
-        nearest: Rows of what is near each Gaussian, itself too. [N, k]
+        nearest: Rows of the neighbours of each Gaussian, including itself. [N, k]
 
     Returns:
-        The shares; nan for classes with fewer than nine such Gaussians. [C]
+        Median share per class; nan for classes with fewer than nine interior Gaussians. [C]
     """
     inner = (labels[nearest] == labels[:, None]).all(axis=1) & (total > DOUBT)
     inner &= opacities > visibility.SEEN_OPACITY
@@ -142,7 +144,7 @@ def certainty(
 
 
 def changes_of(tensors: Mapping[str, Any]) -> dict[str, int] | None:
-    """The counts of a checkpoint by the names of `Changes`; None where labels were not cleaned."""
+    """Return the counts in a checkpoint by the names of `Changes`; None if labels were not cleaned."""
     if CHANGES not in tensors:
         return None
     names = [field.name for field in dataclasses.fields(Changes)]
@@ -150,7 +152,7 @@ def changes_of(tensors: Mapping[str, Any]) -> dict[str, int] | None:
 
 
 def bound(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Centres in the bind state, at the last knot of their groups' tracks. [N, 3]
+    """Return the centres in the bind state, at the last knot of their groups' tracks. [N, 3]
 
     Args:
         groups: The motion groups.
@@ -168,7 +170,7 @@ def bound(groups: Sequence[GroupTrack], motion_ids: np.ndarray, means: np.ndarra
 def companions(
     groups: Sequence[GroupTrack], motion_ids: np.ndarray, points: np.ndarray, object_ids: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each Gaussian moves with, for `clean`.
+    """Return the body that each Gaussian moves with, for `clean`.
 
     Args:
         groups: The motion groups.
@@ -177,8 +179,8 @@ def companions(
         object_ids: Object id of each class. [C]
 
     Returns:
-        Class of the body that it goes with, 0 where it rests or follows as a shadow [N], and whether each class moves
-        by more than a tenth of its radius [C] bool.
+        Class of the body, 0 for Gaussians at rest and shadows [N], and a mask of the classes that move by more than a
+        tenth of their radius [C] bool.
     """
     rows = {int(object_id): row for row, object_id in enumerate(object_ids)}
     owners, moving = np.zeros(len(groups), np.int64), np.zeros(len(object_ids), bool)
@@ -200,7 +202,7 @@ def companions(
 def _pull(
     labels: np.ndarray, going: np.ndarray | None, moving: np.ndarray | None, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class that motion speaks for, and with how much weight: none where what it moves with and its object rest."""
+    """Return the class that motion votes for and its weight; 0 if that class (for 0: the own one) is at rest."""
     if going is None or moving is None:
         return np.zeros(len(labels), np.int64), np.zeros(len(labels), np.float32)
     told = np.append(moving, np.zeros(count - len(moving), bool))
@@ -218,10 +220,10 @@ def _decide(
     nearest: np.ndarray,
     pull: tuple[np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of some Gaussians, and where it was motion that changed them. [n] and [n] bool
+    """Return the labels of some Gaussians, and a mask of those changed by motion. [n] and [n] bool
 
-    A Gaussian's votes are 4 p times trust, plus the mean p of its neighbours by distance, opacity and trust, plus a
-    half for the class that it moves with.
+    The tally of a Gaussian is 4 p times trust, plus the mean p of its neighbours (weighted by distance, opacity and
+    trust), plus a half for the class that it moves with.
     """
     own = labels[rows]
     spacing = np.maximum(np.median(distances[:, 1:], axis=1), 1e-30)
@@ -252,8 +254,10 @@ def _without_outliers(
     points: np.ndarray,
     opacities: np.ndarray,
 ) -> np.ndarray:
-    """Labels where small parts that lie apart from their object, and that little speaks for, go to what else their
-    votes say, else to the background. Arguments as of `clean`. [N]"""
+    """Relabel small parts that lie apart from their object and have few votes for it. [N]
+
+    They join the class with most of their other votes, or else the background. Arguments as for `clean`.
+    """
     result = labels.copy()
     for k in range(1, votes.shape[1]):
         rows = np.flatnonzero(labels == k)
@@ -275,7 +279,7 @@ def _without_outliers(
 
 
 def _parts(points: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, int]:
-    """Part of each point, where what lies within `APART` of the usual spacing hangs together, and their number."""
+    """Return the connected component of each point and their number; links reach `APART` times the typical spacing."""
     width = min(NEIGHBOURS + 1, len(points))
     distances, nearest = map(np.asarray, spatial.KDTree(points).query(points, width))
     shown = visibility.seen(opacities)
@@ -288,7 +292,7 @@ def _parts(points: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _keep_objects(before: np.ndarray, after: np.ndarray, count: int) -> np.ndarray:
-    """The labels, but those of before for objects that would be left without Gaussians. [N]"""
+    """Return the new labels, with the old ones for objects that would lose all their Gaussians. [N]"""
     lost = (np.bincount(before, minlength=count) > 0) & (np.bincount(after, minlength=count) == 0)
     lost[0] = False
     return np.where(lost[before], before, after)

@@ -1,8 +1,8 @@
-"""What the images can tell of a body's motion at each time: how much is seen of it, how it is turned, if it is there.
+"""Evidence of the images on each body at each time: visibility, observability of rotation, and absence.
 
-A body of one colour looks the same however it is turned, and one that nobody sees may be anywhere: there the tracks
-should go on smoothly instead of following noise. And where masks do not show a body, it is either hidden, not yet
-marked, or not there at all; in the last case it must not be drawn, or training would make it transparent.
+Rotation of a body of uniform colour and motion of a hidden body cannot be observed; their tracks should be smooth
+instead of following noise. A body without a mask at some time is either hidden, not labelled, or absent. If it is
+absent, it must not be rendered, as training would make it transparent.
 
 Notation: M objects, S observed times.
 """
@@ -21,22 +21,22 @@ from ..train_views import TrainView, nearest_knot, spread
 from .plane_sweep import camera_key
 from .triangulation import Places
 
-TEXTURE = 0.1  # change of colour per radian (root mean square) that tells a rotation
-STIFFEST = 100.0  # how much smoother a track must be where nothing is seen
-CLEARER = 0.03  # mean difference of colour that noise may make
-DISC = 0.6  # share of a body's radius that is looked at
-HIDDEN = 0.1  # share of it behind other objects with which a view says nothing
-FEWEST_FRAMES, MOST_FRAMES = 2, 15  # of a camera, for what it sees without the object
+TEXTURE = 0.1  # change of colour per radian (root mean square) that makes rotation observable
+STIFFEST = 100.0  # factor on the smoothness of a track if nothing is visible
+CLEARER = 0.03  # mean colour difference that noise may cause
+DISC = 0.6  # radius of the compared disc / radius of the body
+HIDDEN = 0.1  # share of the disc covered by other objects above which a view is ignored
+FEWEST_FRAMES, MOST_FRAMES = 2, 15  # frames of a camera for the colours without the object
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of each body at each time.
+    """Evidence on each body at each time.
 
     Attributes:
-        shift_stiffness: How smooth its displacements must be, at least 1. [M, S]
-        turn_stiffness: How smooth its rotations must be about each axis, world. [M, S, 3, 3]
-        absent: Times at which it is not there. [M, S] bool
+        shift_stiffness: Factor on the smoothness of displacements, at least 1. [M, S]
+        turn_stiffness: Factor on the smoothness of rotations about each axis, world. [M, S, 3, 3]
+        absent: Times at which the body is absent. [M, S] bool
     """
 
     shift_stiffness: np.ndarray
@@ -45,11 +45,11 @@ class Evidence:
 
 
 def gather(views: Sequence[TrainView], places: Places, times: np.ndarray) -> Evidence:
-    """Look at all views.
+    """Gather the evidence from all views.
 
     Args:
         views: Training views.
-        places: Where the objects are.
+        places: Positions of the objects.
         times: The observed times. [S]
     """
     stiff = shift_stiffness(places.evidence)
@@ -57,23 +57,23 @@ def gather(views: Sequence[TrainView], places: Places, times: np.ndarray) -> Evi
 
 
 def shift_stiffness(evidence: np.ndarray) -> np.ndarray:
-    """How smooth displacements must be: 1 where a body is seen as usual, more where less of it is. [M, S]"""
+    """Return the smoothness of displacements: 1 at usual visibility, more if less of a body is visible. [M, S]"""
     return 1 / np.maximum(evidence, 1 / STIFFEST)
 
 
 def turn_stiffness(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.ndarray:
-    """How smooth rotations must be about each axis: matrices in world axes, the identity where texture tells the turn.
+    """Return the smoothness of rotations about each axis, in world axes: the identity if texture determines rotation.
 
-    The change of the image as the body turns is estimated with a ball in its place, from the texture inside its mask.
-    What smooth shading (a quadratic over the mask) explains is not counted: it stays as the body turns.
+    The change of the image with rotation is estimated for a ball in the body's place, with the texture inside its mask.
+    Smooth shading (a quadratic over the mask) is removed first, as it does not turn with the body.
 
     Args:
         views: Training views.
-        places: Where the objects are.
+        places: Positions of the objects.
         times: The observed times. [S]
 
     Returns:
-        Symmetric matrices, eigenvalues of at least 1. [M, S, 3, 3]
+        Symmetric matrices with eigenvalues of at least 1. [M, S, 3, 3]
     """
     m, count = places.measured.shape
     change = np.zeros((m, count, 3, 3))
@@ -99,7 +99,7 @@ def turn_stiffness(views: Sequence[TrainView], places: Places, times: np.ndarray
 
 
 def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, int] | None:
-    """Squared change of colour per radian, summed over the pixels inside a mask, camera axes [3, 3]; their number."""
+    """Return the squared colour change per radian, summed over a mask, camera axes [3, 3], and the number of pixels."""
     inside = np.asarray(ndimage.binary_erosion(here, iterations=2), bool)
     if inside.sum() < 12:
         return None
@@ -108,31 +108,32 @@ def _change_per_turn(part: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, in
     b, a = np.meshgrid(np.arange(height) - rows.mean(), np.arange(width) - cols.mean(), indexing="ij")
     radius2 = max((a[here] ** 2 + b[here] ** 2).max(), 1.0)
     image = part.astype(np.float64) / 255
-    near = np.asarray(ndimage.binary_dilation(inside), bool)  # the gradient of a pixel looks at its neighbours
+    near = np.asarray(ndimage.binary_dilation(inside), bool)  # the gradient of a pixel needs its neighbours
     shape = np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], -1)
     smooth = shape @ np.linalg.lstsq(shape[near], image[near], rcond=None)[0]
     texture = np.where(near[..., None], image - smooth, 0.0)
     gy, gx = (g[inside] for g in np.gradient(texture, axis=(0, 1)))  # [n, 3] each
     a, b = a[inside][:, None], b[inside][:, None]
-    depth = np.sqrt(np.maximum(radius2 - a * a - b * b, 0.0))  # of the ball's front, towards the camera
+    depth = np.sqrt(np.maximum(radius2 - a * a - b * b, 0.0))  # depth of the ball's front surface, towards the camera
     # The point (a, b, -depth) moves by w x point: (-depth w_y - b w_z, depth w_x + a w_z) in the image.
     slopes = np.stack([gy * depth, -gx * depth, gy * a - gx * b], -1).reshape(-1, 3)
     return slopes.T @ slopes / 3, int(inside.sum())
 
 
 def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.ndarray:
-    """Times at which an object is not there, though cameras look at its place and nothing hides it.
+    """Find the times at which an object is absent although cameras see its place and nothing hides it.
 
-    No mask shows it then, and where it should be most views show what the camera sees there without the object (known
-    from the times at which the object is marked elsewhere), and not the object's colour.
+    At such a time no mask shows the object. In most views, the pixels at its expected place have the colours that the
+    camera sees there without the object (known from times at which its mask is elsewhere), and not the object's colour.
 
     Args:
         views: Training views.
-        places: Where the objects are, or would be.
+        places: Positions of the objects, interpolated where they are not visible.
         times: The observed times. [S]
 
     Returns:
-        True where it is absent; times that no view tells of are as the nearest unmarked one that is told. [M, S] bool
+        True if absent. Times without evidence are filled from the nearest time of the same gap between masks that has
+        evidence. [M, S] bool
     """
     votes = np.zeros(places.measured.shape)
     asked = np.zeros(places.measured.shape)
@@ -169,7 +170,7 @@ def absent(views: Sequence[TrainView], places: Places, times: np.ndarray) -> np.
 
 
 def _without(frames: Sequence[TrainView], rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Median colour of pixels over the frames in which no object covers them [n, 3], and which ever are free [n]."""
+    """Return the median colour of pixels over frames without an object there [n, 3], and a mask of known colours."""
     colors = np.stack([v.image[rows, columns] for v in frames]) / 255
     free = np.stack([_ids(v, rows, columns) == 0 for v in frames])
     known = np.asarray(free.any(0))
@@ -184,7 +185,7 @@ def _ids(view: TrainView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _usual_colors(views: Sequence[TrainView], places: Places) -> np.ndarray:
-    """Mean colour of each object over all masks. [M, 3]"""
+    """Return the mean colour of each object over all masks. [M, 3]"""
     total, count = np.zeros((len(places.object_ids), 3)), np.zeros(len(places.object_ids))
     for view in views:
         if view.mask is not None:
@@ -196,7 +197,7 @@ def _usual_colors(views: Sequence[TrainView], places: Places) -> np.ndarray:
 
 
 def _disc(view: TrainView, center: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows of the pixels that the middle of a ball covers; none where it is cut off by the frame."""
+    """Return columns and rows of the pixels in the centre of a projected ball; empty if the frame's border cuts it."""
     pixels, depth = cameras.project(view.camera, center[None])
     if not depth[0] > radius:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

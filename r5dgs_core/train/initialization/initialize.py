@@ -1,4 +1,4 @@
-"""The state that training starts from: Gaussians from hulls and the plane sweep, tracks from triangulated masks.
+"""Initial state of training: Gaussians from visual hulls and the plane sweep, tracks from triangulated masks.
 
 Group numbering: 0 is the pinned background, 1..M the objects in the order of their ids, then one shadow per object.
 """
@@ -19,22 +19,22 @@ from . import evidence, place_gaussians, plane_sweep, scatter, shadows, triangul
 log = logging.getLogger(__name__)
 
 MASKS = "Remedy: object_mask/train/IMAGE.png files"
-SAME_TIME = 0.1  # share of a camera's step in time within which the times of cameras are one
-FEWEST_EYES = 3  # cameras that place a scene from the images of one time
-SEEN_AT_ALL = 1e-3  # what a time counts at which an object is placed but nowhere seen whole
+SAME_TIME = 0.1  # share of a camera's time step within which times are equal
+FEWEST_EYES = 3  # smallest number of cameras that can place a scene from the images of one time
+SEEN_AT_ALL = 1e-3  # score of a time at which an object is located but nowhere wholly visible
 
 
 @dataclass(frozen=True)
 class FirstTracks:
-    """Where bodies are before training, without rotation.
+    """Initial tracks of the bodies, without rotation.
 
     Attributes:
         times: Knots, increasing. [S]
         centers: Centres of the bodies, row 0 for the pinned group. [B, 3]
         translations: Triangulated displacements at the knots. [B, S, 3]
         casters: Body that each shadow group follows. [W]
-        plane_normal: Unit normal of the support plane, or None. [3]
-        slope: Slope of the shadows along it. [3]
+        plane_normal: Unit normal of the supporting plane, or None. [3]
+        slope: Shift of a shadow along the plane per unit that its caster rises. [3]
     """
 
     times: np.ndarray
@@ -47,17 +47,17 @@ class FirstTracks:
 
 @dataclass(frozen=True)
 class Start:
-    """What training starts from.
+    """Initial state of training.
 
     Attributes:
-        gaussians: Canonical Gaussians; each body in its state at its reference time.
-        tracks: Where the bodies are at the observed times.
+        gaussians: Canonical Gaussians; each body is in its state at its reference time.
+        tracks: Initial tracks at the observed times.
         object_ids: Object id of each body; row 0 is the background. [B]
-        places: Where the masks put the objects.
+        places: Positions of the objects by the masks.
         first_time: Index of the time at which training begins.
         plane: Unit normal and offset (n . x = h) of the supporting plane, or None.
-        sky: Coefficients of the sky, or None where none was found. [9, 3]
-        evidence: What the images can tell of the objects' motion.
+        sky: Coefficients of the sky, or None if none was found. [9, 3]
+        evidence: Evidence of the images on the objects' motion.
     """
 
     gaussians: Gaussians
@@ -71,11 +71,11 @@ class Start:
 
 
 def observed_times(views: Sequence[TrainView], limit: int = 128) -> np.ndarray:
-    """Knots of the tracks: the distinct observed times.
+    """Return the knots of the tracks: the distinct observed times.
 
-    Times of cameras that are a little out of step are one knot: those within a tenth of the step that each camera
-    takes. Where more than ``limit`` are left, a spread of them over their order, so that knots are dense where images
-    are. The first and the last observed time are knots.
+    Times of slightly unsynchronised cameras, within a tenth of each camera's time step, share one knot. If more than
+    ``limit`` knots remain, they are sampled evenly by index, so that knots are dense where images are. The first and
+    the last observed time are always knots.
     """
     of_camera: dict[bytes, set[float]] = {}
     for view in views:
@@ -102,18 +102,18 @@ def start(
     cloud: tuple[np.ndarray, np.ndarray] | None = None,
     still: bool = False,
 ) -> Start:
-    """Place Gaussians and tracks.
+    """Create the initial Gaussians and tracks.
 
     Args:
         views: Training views in normalised coordinates.
         config: Configuration of the run.
-        find_sky: Whether there may be sky behind the scene; not where the background's colour is given.
-        rng: Source of the draws.
+        find_sky: True if the background may contain sky; False if its colour is fixed.
+        rng: Random generator.
         cloud: Points and colours in [0, 1] of a reconstruction, normalised coordinates. [P, 3] each
-        still: Whether nothing moves, so that all images show one time.
+        still: True if nothing moves, so that all images show one time.
 
     Returns:
-        The start of the training.
+        The initial state.
     """
     init = config.init
     times = observed_times(views)
@@ -149,7 +149,7 @@ def start(
         carved = visual_hull.carve(then, int(object_id), centers[row + 1], places.radii[row], count, rng)
         clouds.append((*carved, row + 1))
     scenes = plane_sweep.backdrops(_at_once(views, times, first) if unmasked and by_field else views)
-    # Points at random need the sweep for the sky and the plane alone.
+    # With random points, the sweep serves only to find the sky and the plane.
     swept = min(init.background_points, 5000) if at_random else init.background_points
     search = plane_sweep.Sweep(scenes, swept, init.sweep_depths)
     eyes = np.stack([v.camera.center for v in views])
@@ -192,16 +192,16 @@ def start(
 def supporting_plane(
     background: np.ndarray, places: triangulation.Places, eyes: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, float] | None:
-    """The plane that carries the objects: the one with most background points, objects and cameras on one side of it.
+    """Fit the plane that carries the objects: most background points, with objects and cameras on one side.
 
     Args:
         background: Background points. [P, 3]
-        places: Where the objects are.
+        places: Positions of the objects.
         eyes: Centres of the cameras. [V, 3]
-        rng: Source of the draws (RANSAC).
+        rng: Random generator (RANSAC).
 
     Returns:
-        Unit normal towards the cameras and offset h in n . x = h, or None where no plane holds a fifth of the points.
+        Unit normal towards the cameras and offset h in n . x = h; None if no plane contains a fifth of the points.
     """
     tolerance = 0.05
     if len(background) < 50:
@@ -233,13 +233,13 @@ def supporting_plane(
 
 
 def _at_once(views: Sequence[TrainView], times: np.ndarray, knot: int) -> Sequence[TrainView]:
-    """Views of one observed time, which show what moves at one place; all where few cameras look at that time."""
+    """Return the views of one observed time, in which moving objects have one place; all views if these are too few."""
     then = [v for v in views if nearest_knot(times, v.t) == knot]
     return then if len({plane_sweep.camera_key(v.camera) for v in then}) >= FEWEST_EYES else views
 
 
 def _first_time(places: triangulation.Places, count: int) -> int:
-    """The time at which most objects are well seen; of equal ones the middle one, so that drift is least."""
+    """Return the time at which most objects are well visible; of similar ones the middle one, to minimise drift."""
     if len(places.object_ids) == 0:
         return 0
     total = np.where(places.measured, places.visibility + SEEN_AT_ALL, 0.0).sum(0)
@@ -248,7 +248,7 @@ def _first_time(places: triangulation.Places, count: int) -> int:
 
 
 def _reference_time(visibility: np.ndarray, measured: np.ndarray, first: int) -> int:
-    """The well-seen time of an object that is nearest to the first one."""
+    """Return the time nearest to ``first`` at which an object is well visible."""
     score = np.where(measured, visibility + SEEN_AT_ALL, 0.0)
     good = np.flatnonzero(score >= 0.75 * score.max())
     return int(good[np.argmin(np.abs(good - first))])

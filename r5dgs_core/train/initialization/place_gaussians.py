@@ -1,4 +1,4 @@
-"""Gaussians as they are first placed: of bodies, of the background, and of shadows on the plane that carries them.
+"""Initial Gaussians of bodies, of the background, and of shadows on the supporting plane.
 
 Notation: P points. Lengths are in normalised coordinates.
 """
@@ -17,9 +17,9 @@ from ...scene import sh_color
 from . import shadows
 
 SHADOW_OPACITY = 0.03
-SHADOW_LIFT = (0.02, 0.01)  # least height over the plane and its spread
+SHADOW_LIFT = (0.02, 0.01)  # smallest height above the plane, and range above it
 SHADOW_THICKNESS = 0.01
-SCALES = (0.005, 0.2)  # bounds of the first standard deviations
+SCALES = (0.005, 0.2)  # limits of the initial standard deviations
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,11 @@ class Points:
 
 
 def solid(clouds: Sequence[tuple[np.ndarray, np.ndarray, int]], opacity: float) -> Points:
-    """Round Gaussians as wide as their distance to each other, over all clouds.
+    """Return isotropic Gaussians with the spacing of their neighbours as size, over all clouds.
 
     Args:
         clouds: Centres [P, 3], colours [P, 3] and motion group of each cloud.
-        opacity: Of all of them.
+        opacity: Opacity of all of them.
     """
     means = np.concatenate([where for where, _, _ in clouds])
     return Points(
@@ -70,16 +70,16 @@ def shadow(
     count: int,
     rng: np.random.Generator,
 ) -> Points:
-    """Faint, flat, dark Gaussians on the plane where the light throws a body's shadow.
+    """Return faint, flat, dark Gaussians where the shadow of a body falls on the plane.
 
     Args:
-        center: Of the body. [3]
-        radius: Of the body.
-        light: Unit direction that the light travels in. [3]
+        center: Centre of the body. [3]
+        radius: Radius of the body.
+        light: Unit direction in which the light travels. [3]
         plane: Unit normal and offset of the supporting plane.
         group: Motion group of the shadow.
-        count: Gaussians wanted.
-        rng: Source of the draws.
+        count: Number of Gaussians.
+        rng: Random generator.
     """
     normal, _ = plane
     jitter = rng.normal(size=(count, 3)) * 0.6 * radius
@@ -98,7 +98,7 @@ def shadow(
 
 
 def gaussians_of(parts: Sequence[Points], sh_degree: int) -> Gaussians:
-    """Canonical Gaussians of all parts, in their order."""
+    """Return the canonical Gaussians of all parts, in their order."""
     means, colors, labels, opacities, log_scales, quats = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("means", "colors", "labels", "opacities", "log_scales", "quats")
@@ -119,7 +119,7 @@ def gaussians_of(parts: Sequence[Points], sh_degree: int) -> Gaussians:
 
 
 def _neighbour_scales(points: np.ndarray) -> np.ndarray:
-    """Logarithm of the mean distance to the three nearest neighbours, bounded. [P, 3]"""
+    """Return the logarithm of the mean distance to the three nearest neighbours, clipped to `SCALES`. [P, 3]"""
     if len(points) < 4:
         return np.full((len(points), 3), np.log(0.05))
     distance, _ = KDTree(points).query(points, k=4)
@@ -127,7 +127,7 @@ def _neighbour_scales(points: np.ndarray) -> np.ndarray:
 
 
 def _quat_from_z(normal: np.ndarray) -> np.ndarray:
-    """Rotation that takes the z axis to ``normal``, wxyz."""
+    """Return the rotation from the z axis to ``normal``, wxyz."""
     axis = np.cross([0.0, 0, 1], normal)
     quat = np.array([1 + normal[2], *axis])
     return np.array([0.0, 1, 0, 0]) if np.linalg.norm(quat) < 1e-6 else quat / np.linalg.norm(quat)

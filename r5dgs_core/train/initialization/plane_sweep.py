@@ -1,8 +1,8 @@
-"""Initialisation of the static background: a plane sweep over what every camera sees behind the objects.
+"""Plane sweep that places the initial static background.
 
-Each camera's images are reduced to one picture without objects (median over time of the pixels that no mask covers).
-For a grid of its rays, a range of depths is tried; a depth is good where the other cameras see the same colour there.
-Rays on which infinity is as good as any depth show sky and place nothing: the learned background colour takes them.
+The images of each camera are reduced to one image without objects (median over time of the unmasked pixels). For a grid
+of its rays, a range of depths is compared; at a good depth the other cameras see the same colour. Rays on which
+infinity is as good as any depth show sky and place no points; the learned background represents them.
 
 Notation: B backdrops, [h, w] a grid of rays, D depths.
 """
@@ -26,20 +26,20 @@ from . import sky
 
 MAX_BACKDROPS = 24
 MAX_NEIGHBOURS = 8
-MAX_FRAMES = 31  # of one camera, for the median
-MEDIAN_VALUES = 1 << 23  # colours that are sorted at a time
-COST_VALUES = 1 << 22  # depths of rays that are compared at a time
+MAX_FRAMES = 31  # frames per camera for the median
+MEDIAN_VALUES = 1 << 23  # colours per sorted band
+COST_VALUES = 1 << 22  # colour differences per compared band
 NEAREST, FARTHEST = 0.4, 60.0  # normalised units; the cameras' focus is at about 4
 INFINITE = 1e5
-PLANE_REACH = 12.0  # how far from a camera its rays may be placed on the supporting plane beyond what was found of it
-SAME = 0.012  # colour difference that tells nothing
+PLANE_REACH = 12.0  # largest depth of rays that extend the plane beyond its region, normalised units
+SAME = 0.012  # insignificant colour difference
 GOOD = 0.12  # larger colour differences are no match
 CONFIRMATIONS = 2  # other cameras that must agree on a depth
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What one camera sees without the objects: image [H, W, 3] in [0, 1] and where it is known [H, W]."""
+    """View of one camera without the objects: image [H, W, 3] in [0, 1] and mask of known pixels [H, W]."""
 
     camera: cameras.Camera
     image: np.ndarray
@@ -47,7 +47,7 @@ class Backdrop:
 
 
 def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
-    """Median over time of the unmasked pixels, one per distinct camera."""
+    """Return the median over time of the unmasked pixels, one per distinct camera."""
     result = []
     for group in by_camera(views, MAX_BACKDROPS):
         frames = spread(group, MAX_FRAMES)
@@ -58,11 +58,11 @@ def backdrops(views: Sequence[TrainView]) -> list[Backdrop]:
 
 
 def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
-    """Median of the pixels that are free, 0 where none is, band by band so that little memory is taken.
+    """Return the median of the free pixels, 0 if a pixel is never free; computed in bands to save memory.
 
     Args:
         images: F images. [H, W, 3] uint8
-        free: Which of their pixels count. [F, H, W] bool
+        free: Mask of the pixels that count. [F, H, W] bool
 
     Returns:
         Colours in [0, 1]. [H, W, 3] float32
@@ -86,7 +86,7 @@ def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
 
 
 def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
-    """Views that share pose, lens and size; a spread of ``limit`` cameras where there are more."""
+    """Group views by camera (pose, lens and size); ``limit`` cameras spread evenly if there are more."""
     groups: dict[bytes, list[TrainView]] = {}
     for view in views:
         groups.setdefault(camera_key(view.camera), []).append(view)
@@ -94,15 +94,15 @@ def by_camera(views: Sequence[TrainView], limit: int) -> list[list[TrainView]]:
 
 
 def camera_key(camera: cameras.Camera) -> bytes:
-    """Equal for cameras of the same pose, lens and image size."""
+    """Return a key that is equal for cameras of the same pose, lens and image size."""
     size = np.array([camera.width, camera.height])
     return np.round(camera.T_cam_world, 5).tobytes() + np.round(camera.intrinsics, 3).tobytes() + size.tobytes()
 
 
 def _free(frames: Sequence[TrainView]) -> np.ndarray:
-    """Pixels that show the background in each frame of a camera. [F, H, W] bool
+    """Mask of the background pixels in each frame of a camera. [F, H, W] bool
 
-    Of what a mask does not know is background what no mask of the camera ever knows.
+    Pixels that are unknown in all masks of the camera count as background.
     """
     free = np.ones((len(frames), *frames[0].image.shape[:2]), bool)
     told = np.zeros(free.shape[1:], bool)
@@ -130,17 +130,17 @@ class Placed:
 
 @dataclass(frozen=True)
 class Rays:
-    """What the sweep found along the rays of one backdrop.
+    """Result of the sweep along the rays of one backdrop.
 
     Attributes:
         backdrop: Index of the backdrop.
         directions: Ray directions scaled to depth 1, world. [h, w, 3]
         colors: Colour of each ray. [h, w, 3]
         depths: Best depth of each ray. [h, w]
-        costs: Its colour difference to the other cameras, infinite where nothing was comparable. [h, w]
-        flat: Whether most depths are about as good, as on sky and on plain surfaces. [h, w] bool
-        sky: Whether infinity is about as good. [h, w] bool
-        known: Whether the colour is known. [h, w] bool
+        costs: Colour difference to the other cameras at that depth, infinite if not comparable. [h, w]
+        flat: True if most depths are about as good, as on sky and on uniform surfaces. [h, w] bool
+        sky: True if infinity is about as good. [h, w] bool
+        known: True if the colour is known. [h, w] bool
         neighbours: Backdrops that it was compared with.
     """
 
@@ -156,12 +156,12 @@ class Rays:
 
 
 class Sweep:
-    """A plane sweep over all backdrops.
+    """Plane sweep over all backdrops.
 
     Args:
         scenes: Backdrops of the cameras.
-        count: Number of points that will be asked for; sets how many rays are tried.
-        depths: Depths tried per ray, evenly spaced in inverse depth.
+        count: Number of points that will be placed; determines the number of rays.
+        depths: Depths per ray, evenly spaced in inverse depth.
     """
 
     def __init__(self, scenes: Sequence[Backdrop], count: int, depths: int):
@@ -204,7 +204,7 @@ class Sweep:
     def _compare(
         self, i: int, directions: np.ndarray, depths: np.ndarray, colors: np.ndarray, neighbours: Sequence[int]
     ) -> torch.Tensor:
-        """Colour difference of rays [h, w, 3] at depths [D] or [h, w, D] to the neighbours, band by band. [h, w, D]"""
+        """Colour difference of rays [h, w, 3] at depths [D] or [h, w, D] to the neighbours, in bands. [h, w, D]"""
         others = [(self.scenes[j].camera, self._images[j], self._known[j]) for j in neighbours]
         height, width = directions.shape[:2]
         rows = max(1, COST_VALUES // (width * depths.shape[-1] * max(1, len(others))))
@@ -217,7 +217,7 @@ class Sweep:
         return torch.cat(bands)
 
     def distinct_points(self) -> np.ndarray:
-        """Points on rays with one clear depth, for finding planes. [P, 3]"""
+        """Return points on rays with one distinct depth, for fitting planes. [P, 3]"""
         found = [
             self.scenes[r.backdrop].camera.center + (r.directions * r.depths[..., None])[good]
             for r in self.rays
@@ -228,21 +228,20 @@ class Sweep:
     def place(
         self, count: int, plane: tuple[np.ndarray, float] | None, find_sky: bool, rng: np.random.Generator
     ) -> Placed:
-        """Draw background points and find the sky.
+        """Draw background points and fit the sky.
 
         Rays on which the supporting plane is as good as the best depth are placed on the plane: within the region in
-        which it was found, and, where the sky is known, everywhere near that is not sky. Rays that show sky place
-        nothing, nor do those on which any depth will do. The others are placed at their best depth if other cameras
-        confirm it.
+        which it was found and, if the sky is known, everywhere near that is not sky. Rays of the sky and rays without a
+        distinct depth place no points. The others are placed at their best depth if other cameras confirm it.
 
         Args:
-            count: Number of points wanted.
+            count: Number of points.
             plane: Unit normal and offset of the supporting plane, or None.
-            find_sky: Whether there may be sky; not where the background's colour is given.
-            rng: Source of the draws.
+            find_sky: True if there may be sky; False if the background's colour is fixed.
+            rng: Random generator.
 
         Returns:
-            At most ``count`` points; none where there is no parallax or nothing but sky.
+            At most ``count`` points; none without parallax or if everything is sky.
         """
         if not self.rays:
             return Placed(np.zeros((0, 3)), np.zeros((0, 3)), None)
@@ -278,9 +277,9 @@ class Sweep:
     def _confirmed(self, points: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Mask of points at whose depth other cameras found a surface, too. [P] bool
 
-        A match between repeated or smooth patterns gives a depth that no other camera's best match agrees with. This
-        is the geometric consistency check of multi-view stereo: at least `CONFIRMATIONS` other cameras (one, if there
-        are only two cameras) have a depth within one step of the sweep beside the point's pixel.
+        Matches between repeated or smooth patterns give depths that do not agree with the best matches of other
+        cameras. This is the geometric consistency check of multi-view stereo: at least `CONFIRMATIONS` other cameras
+        (one, if there are only two cameras) have a depth within one step of the sweep next to the point's pixel.
 
         Args:
             points: Points on all rays, in the order of the rays. [P, 3]
@@ -309,7 +308,7 @@ class Sweep:
         return up / max(float(np.linalg.norm(up)), 1e-9)
 
     def _on_plane(self, rays: Rays, plane: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Depth at which each ray meets a plane, and the colour difference there (infinite where it does not)."""
+        """Return the depth at which each ray meets a plane, and the colour difference there (infinite if it misses)."""
         normal, height = plane
         center = self.scenes[rays.backdrop].camera.center
         slope = rays.directions @ normal
@@ -323,19 +322,19 @@ class Sweep:
 
 
 def _flatten(grids: Sequence[np.ndarray]) -> np.ndarray:
-    """Values of all rays in one row: grids [h, w, ...] to [P, ...]."""
+    """Concatenate the values of all rays: grids [h, w, ...] to [P, ...]."""
     return np.concatenate([grid.reshape(-1, *grid.shape[2:]) for grid in grids])
 
 
 def plane_axes(normal: np.ndarray) -> np.ndarray:
-    """Two unit vectors that span the plane of a unit normal, perpendicular to each other. [2, 3]"""
+    """Return two orthogonal unit vectors that span the plane of a unit normal. [2, 3]"""
     u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     u /= np.linalg.norm(u)
     return np.stack([u, np.cross(normal, u)])
 
 
 class _Support:
-    """The part of a plane that distinct points outline: their convex hull in the plane, stray ones left out."""
+    """Region of a plane covered by distinct points: their convex hull in the plane, without outliers."""
 
     def __init__(self, points: np.ndarray, plane: tuple[np.ndarray, float]):
         normal, height = plane
@@ -349,7 +348,7 @@ class _Support:
         self._sides = ConvexHull(flat).equations if len(flat) >= 10 else None
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Whether points [..., 3] near the plane lie in that part. [...]"""
+        """True for points [..., 3] near the plane inside the region. [...]"""
         if self._sides is None:
             return np.zeros(points.shape[:-1], bool)
         # The sides' half-planes; searching a triangulation takes seconds where many points lie outside.
@@ -358,7 +357,7 @@ class _Support:
 
 
 def _cost(world: torch.Tensor, color: torch.Tensor, others) -> torch.Tensor:
-    """Colour difference to the better half of the neighbours that see the point. [h, w, D]"""
+    """Mean colour difference to the better half of the neighbours that see the point. [h, w, D]"""
     gaps = []
     for camera, image, known in others:
         T = torch.from_numpy(camera.T_cam_world).float()
@@ -384,7 +383,7 @@ def _cost(world: torch.Tensor, color: torch.Tensor, others) -> torch.Tensor:
 
 
 def _smooth(cost: torch.Tensor) -> torch.Tensor:
-    """Mean of the finite costs in a 3 x 3 block of rays: a surface is smooth across neighbouring rays. [h, w, D]"""
+    """Mean of the finite costs in a 3 x 3 block of rays, as surfaces are mostly smooth across rays. [h, w, D]"""
     finite = torch.isfinite(cost)
     volume = torch.where(finite, cost, 0.0).permute(2, 0, 1)[:, None]
     weight = finite.float().permute(2, 0, 1)[:, None]

@@ -1,4 +1,4 @@
-"""Backgrounds that need no matching of images: points at random where cameras look, and those of a reconstruction."""
+"""Initial backgrounds without matching of images: random points, and points of a reconstruction."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..train_views import TrainView
 from .plane_sweep import Backdrop
 from .visual_hull import pixel_indices
 
-REACH = 1.5  # half the side of the cube that points are drawn from, in distances of the cameras from their focus
+REACH = 1.5  # half the side of the sampled cube / distance of the cameras from their focus
 BATCHES = 64
 
 
 def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw points that at least two cameras see, or one where there is only one.
+    """Draw random points that at least two cameras see (one if there is only one camera).
 
     Args:
-        scenes: What each camera sees; normalised coordinates.
-        count: Points wanted; fewer where the cameras see hardly any of the space about their focus.
-        rng: Source of the draws.
+        scenes: Backdrops of the cameras; normalised coordinates.
+        count: Number of points; fewer are returned if the cameras see little of the space around their focus.
+        rng: Random generator.
 
     Returns:
         Points [P, 3] and colours near middle grey [P, 3].
@@ -49,17 +49,18 @@ def everywhere(scenes: Sequence[Backdrop], count: int, rng: np.random.Generator)
 def behind_objects(
     points: np.ndarray, colors: np.ndarray, views: Sequence[TrainView], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a reconstruction that belong to the background.
+    """Select the points of a reconstruction that belong to the background.
 
     Args:
         points: Points, normalised coordinates. [P, 3]
         colors: Their colours. [P, 3]
         views: Training views.
-        count: Most points that are wanted.
-        rng: Source of the draws.
+        count: Largest number of points.
+        rng: Random generator.
 
     Returns:
-        Those that masks put on objects in less than a third of the views that have them in the frame. [Q, 3] each
+        Points covered by objects in at most a third of the views that have them in the frame, and their colours. [Q, 3]
+        each
     """
     shown, covered = np.zeros(len(points)), np.zeros(len(points))
     for view in views:

@@ -1,8 +1,8 @@
-"""Where shadows start: the direction of the light, found from how the support darkens while objects move above it.
+"""Direction of the light, estimated from the darkening of the supporting plane below moving objects.
 
-A point x at height above the supporting plane n . x = h, lit along the direction l, throws its shadow on
-x - ((n . x - h) / (n . l)) l. For a moving object the support is darker there than it usually is; the direction along
-which this holds best, over all objects, times and cameras, is the light's.
+A point x above the supporting plane n . x = h, lit along the direction l, casts its shadow on x - ((n . x - h) / (n .
+l)) l. Below a moving object, the plane is darker there than usual. The direction with the largest mean darkening over
+all objects, times and cameras is that of the light.
 
 Notation: L candidate directions, M objects, S times.
 """
@@ -21,14 +21,14 @@ from .triangulation import Places
 from .visual_hull import pixel_indices
 
 CANDIDATES = 400
-LOWEST_SINE = 0.25  # light from under 15 degrees throws shadows too long to follow
+LOWEST_SINE = 0.25  # below 15 degrees, shadows are too long to follow
 MIN_DARKENING = 0.01  # share of brightness; less is no evidence of a direction
-SAMPLES = 9  # points of a shadow's disc that are looked at
+SAMPLES = 9  # sampled points per shadow
 
 
 @dataclass(frozen=True)
 class Light:
-    """Direction in which light travels, unit [3], and the darkening that supports it (0 where it was assumed)."""
+    """Unit direction in which light travels [3], and the measured darkening (0 if the direction is a default)."""
 
     direction: np.ndarray
     darkening: float
@@ -42,18 +42,18 @@ def find_light(
     plane: tuple[np.ndarray, float],
     rng: np.random.Generator,
 ) -> Light:
-    """Find the direction of the light.
+    """Estimate the direction of the light.
 
     Args:
         views: Training views.
-        scenes: What each camera usually sees behind the objects.
-        places: Where the objects are at each time.
+        scenes: Usual image of each camera without the objects.
+        places: Positions of the objects at each time.
         times: The observed times. [S]
         plane: Unit normal and offset of the supporting plane.
-        rng: Source of the sampled points.
+        rng: Random generator for the sampled points.
 
     Returns:
-        The direction that the images support best; straight down where none is supported.
+        The direction with the largest mean darkening; straight down if that is too small.
     """
     normal, height = plane
     directions = _directions(normal)
@@ -88,18 +88,18 @@ def find_light(
 
 
 def cast(points: np.ndarray, light: np.ndarray, plane: tuple[np.ndarray, float]) -> np.ndarray:
-    """Shadows of points on the plane along the light. [..., 3]"""
+    """Project points onto the plane along the light. [..., 3]"""
     normal, height = plane
     return points - ((points @ normal - height) / (light @ normal))[..., None] * light
 
 
 def slope(light: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """How far a shadow shifts in the plane per unit that its caster rises. [3]"""
+    """Return the shift of a shadow along the plane per unit that its caster rises. [3]"""
     return normal - light / (light @ normal)
 
 
 def _directions(normal: np.ndarray) -> np.ndarray:
-    """Directions against the normal, evenly spread, straight down first. [L, 3]"""
+    """Return evenly spread directions towards the plane, straight down first. [L, 3]"""
     k = np.arange(CANDIDATES) + 0.5
     sine = 1 - (1 - LOWEST_SINE) * k / CANDIDATES
     angle = np.pi * (1 + 5**0.5) * k
@@ -118,7 +118,7 @@ def _disc(normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _darkening(view: TrainView, backdrop: Backdrop) -> tuple[np.ndarray, np.ndarray]:
-    """Share of brightness that a view lacks, and where this can be said. [H, W] each"""
+    """Return the relative loss of brightness in a view, and a mask of pixels where it is known. [H, W] each"""
     usual = backdrop.image.mean(-1)
     now = view.image.mean(-1) / 255
     known = backdrop.known & (usual > 0.02)

@@ -1,7 +1,7 @@
-"""The sky at the start: what lies behind everything, as a smooth function of the viewing direction.
+"""Initial sky: a smooth function of the viewing direction behind everything.
 
-Rays that miss the supporting plane and share one smooth colour over direction are sky; it is fitted from the highest
-rays downwards and taken for sky only where a good share of those rays agrees with it.
+Rays that miss the supporting plane and share one smooth colour function are sky. The function is fitted from the
+highest rays downwards, and is accepted only if enough of these rays agree with it.
 
 Notation: P rays.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from ...scene import sh_color
 
 DEGREE = 2
-AGREES = 0.025  # colour difference up to which a ray is sky
+AGREES = 0.025  # largest colour difference at which a ray is sky
 MIN_SHARE = 0.25  # share of the candidate rays that must agree
 ROUNDS = 6
 
@@ -26,11 +26,11 @@ def fit(
     Args:
         directions: Unit viewing directions, world. [P, 3]
         colors: Colours of the rays, in [0, 1]. [P, 3]
-        candidates: Rays that may show sky: those that do not meet the supporting plane. [P] bool
+        candidates: Rays that may show sky: those that miss the supporting plane. [P] bool
         up: Mean upward direction of the cameras, unit. [3]
 
     Returns:
-        Coefficients [9, 3] and which rays are sky [P] bool, or None where there is no smooth sky (a room).
+        Coefficients [9, 3] and a mask of the rays that show sky [P] bool; None if there is no smooth sky (indoors).
     """
     if candidates.sum() < 50:
         return None
@@ -54,6 +54,6 @@ def fit(
 
 
 def _damping() -> np.ndarray:
-    """Weight of the damping per basis function: none for the constant. [9]"""
+    """Weight of the damping per basis function; 0 for the constant. [9]"""
     degrees = np.repeat(np.arange(DEGREE + 1), 2 * np.arange(DEGREE + 1) + 1)
     return degrees.astype(np.float64) ** 2

@@ -1,4 +1,4 @@
-"""Fewer Gaussians to start from, where a cap is below what was placed."""
+"""Thinning of the initial Gaussians to the configured cap."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ WIDEST = 0.25  # normalised units; wider ones would soon be pruned
 
 
 def thin(gaussians: Gaussians, cap: int, rng: np.random.Generator) -> Gaussians:
-    """Keep ``cap`` Gaussians, the same share of every motion group and one of each as long as there is room.
+    """Keep ``cap`` Gaussians: the same share of every motion group, and at least one of each if possible.
 
-    Those that stay grow by the square root of the factor by which they became fewer, so that surfaces stay covered, but
-    not beyond `WIDEST`.
+    The remaining ones grow by the square root of the reduction so that surfaces stay covered, up to a size of `WIDEST`.
 
     Args:
         gaussians: The Gaussians before training.
         cap: Largest number of them, at least 1.
-        rng: Source of the draws; not asked where there are few enough already.
+        rng: Random generator; not used if no thinning is necessary.
 
     Returns:
-        The Gaussians that stay, in their order; ``gaussians`` itself where there are few enough.
+        The remaining Gaussians in their order; ``gaussians`` itself if there are at most ``cap``.
     """
     count = len(gaussians)
     if count <= cap:
         return gaussians
     drawn = rng.permutation(count)
     ids = gaussians.motion_ids.numpy()[drawn]
-    turn = np.zeros(count)  # when a Gaussian is taken: its place in its group, as a share of the group
+    turn = np.zeros(count)  # order of selection: rank in the group / size of the group
     for group in np.unique(ids):
         members = ids == group
         turn[members] = np.arange(members.sum()) / members.sum()

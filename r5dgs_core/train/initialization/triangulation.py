@@ -1,8 +1,8 @@
-"""Where each object is at each observed time, from its masks alone.
+"""Positions of the objects at the observed times, triangulated from their masks.
 
-A mask's centroid gives a ray per view. One path per object is fitted to the rays of all times: near them, and with
-little acceleration. Where several views see the object the rays decide; where one does, or none, the path goes on
-smoothly, and at constant velocity beyond the last sighting.
+The centroid of a mask gives a ray per view. One path per object is fitted to the rays of all times, close to the rays
+and with small acceleration. If several views show the object, their rays determine its position; otherwise the path
+continues smoothly, and at constant velocity beyond the last sighting.
 
 Notation: M objects, S observed times, V views. The path's time u runs from 0 to 1 over the observed span.
 """
@@ -21,26 +21,26 @@ from ..train_views import TrainView, nearest_knot
 
 log = logging.getLogger(__name__)
 
-RAY_NOISE = 0.01  # distance of a centroid's ray from the object's middle, normalised units
-ACCELERATION = 10.0  # standard deviation of the path's acceleration, units per squared span: about that of a throw
-VELOCITY = 30.0  # the same of its velocity: brings a path to rest, slowly, where nothing is seen for long
-DEPTH_NOISE = 3.0  # what is known of an object's depth beforehand: it is about that of the cameras' focus
-CUT_OFF = 0.003  # weight of masks that the image's border cuts
-PLACED = 0.05  # standard deviation of a place that counts as measured, normalised units
+RAY_NOISE = 0.01  # standard deviation of a centroid's ray from the object's centre, normalised units
+ACCELERATION = 10.0  # standard deviation of the path's acceleration, units per squared span (as of a thrown object)
+VELOCITY = 30.0  # standard deviation of its velocity, units per span; long gaps slowly bring the path to rest
+DEPTH_NOISE = 3.0  # standard deviation of the prior depth, that of the cameras' focus, normalised units
+CUT_OFF = 0.003  # weight of masks that the image border cuts
+PLACED = 0.05  # largest standard deviation of a measured position, normalised units
 ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places of the objects over time.
+    """Positions of the objects over time.
 
     Attributes:
         object_ids: Ids that occur in the masks. [M]
-        centers: Centres, along a smooth path where they could not be measured. [M, S, 3]
-        measured: Times at which the masks tell the centre. [M, S] bool
+        centers: Centres, on a smooth path where they could not be measured. [M, S, 3]
+        measured: Times at which the masks determine the centre. [M, S] bool
         visibility: Share of the views at that time that show the whole object, weighted by its area. [M, S]
-        radii: Radius of a ball that holds the object. [M]
-        evidence: Area that the masks of that time show, as a share of what is usual for the object, at most 1. [M, S]
+        radii: Radius of a ball that contains the object. [M]
+        evidence: Visible area of the object relative to its median over time, at most 1. [M, S]
     """
 
     object_ids: np.ndarray
@@ -63,16 +63,16 @@ class _Sighting:
 
 
 def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> Places:
-    """Find every object at every observed time.
+    """Locate every object at every observed time.
 
     Args:
-        views: Training views; those without a mask are passed over.
+        views: Training views; those without a mask are ignored.
         times: Observed times, increasing. [S]
-        min_share: Smaller masks do not vote, as a share of the image.
+        min_share: Size of the smallest mask to use, as a share of the image.
 
     Returns:
-        The places. An object that is never seen from two sides gets the depth of the cameras' focus. One that a single
-        mask shows is left out: its place is unknown, and most often that mask is wrong.
+        The positions. An object that is never visible from two sides gets the depth of the cameras' focus. An object in
+        a single mask is left out, as its position is unknown and the mask is most likely wrong.
     """
     found = _sightings(views, times, min_share)
     ids = np.array(sorted(found), np.int64)
@@ -103,7 +103,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
 
 
 def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> dict[int, list[_Sighting]]:
-    """Sightings of each object that more than one mask shows."""
+    """Return the sightings of each object that more than one mask shows."""
     found: dict[int, list[_Sighting]] = {}
     masked = [v for v in views if v.mask is not None]
     for view in masked:
@@ -144,7 +144,7 @@ def _sight(view: TrainView, knot: int, object_id: int, min_share: float) -> _Sig
 
 
 def _touching(mask: np.ndarray, object_id: int, rows: np.ndarray, cols: np.ndarray) -> float:
-    """Share of an outline at which another object begins, in front of it or behind; 0 to 1."""
+    """Share of an object's outline that borders on other objects, 0 to 1."""
     part = mask[max(rows.min() - 1, 0) : rows.max() + 2, max(cols.min() - 1, 0) : cols.max() + 2]
     here = part == object_id
     ring = ndimage.binary_dilation(here) & ~here
@@ -152,7 +152,7 @@ def _touching(mask: np.ndarray, object_id: int, rows: np.ndarray, cols: np.ndarr
 
 
 def _votes(seen: Sequence[_Sighting]) -> list[_Sighting]:
-    """The sightings that say where the object is: those of the whole object, where a time has two of them."""
+    """Return the sightings to use: at times with at least two sightings of the whole object, only these."""
     whole = np.zeros(max(x.knot for x in seen) + 1, np.int64)
     for x in seen:
         whole[x.knot] += x.whole
@@ -160,13 +160,13 @@ def _votes(seen: Sequence[_Sighting]) -> list[_Sighting]:
 
 
 def _path(seen: Sequence[_Sighting], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The path that is nearest to the sightings' rays.
+    """Fit the path nearest to the rays of the sightings (iteratively reweighted least squares).
 
-    Rays that miss it by much more than the others weigh less (masks that something in front cuts), and so does
-    an acceleration that is much larger than expected (an impact).
+    Rays with large residuals (masks cut by an occluder) and accelerations much larger than expected (impacts) are
+    down-weighted.
 
     Returns:
-        Centres [S, 3] and the times at which rays tell them [S] bool.
+        Centres [S, 3], and a mask of the times at which rays determine them [S] bool.
     """
     count = len(times)
     at = np.array([x.knot for x in seen])
@@ -204,7 +204,7 @@ def _path(seen: Sequence[_Sighting], times: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _bends(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Accelerations and velocities of a path as linear maps of its places [B, S], and their precisions [B]."""
+    """Return accelerations and velocities as linear maps of a path's positions [B, S], and their precisions [B]."""
     count = len(times)
     if count < 2:
         return np.zeros((0, count)), np.zeros(0)
@@ -213,7 +213,9 @@ def _bends(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     secants = (np.eye(count)[1:] - np.eye(count)[:-1]) / h[:, None]
     middle = 0.5 * (h[1:] + h[:-1])
     accelerations = np.diff(secants, axis=0) / middle[:, None]
-    share = np.concatenate([middle, h]) * (count - 1)  # of the span that each stands for
+    share = np.concatenate([middle, h]) * (
+        count - 1
+    )  # share of the span that each represents, times the number of intervals
     noise = np.repeat([ACCELERATION, VELOCITY], [count - 2, count - 1])
     return np.concatenate([accelerations, secants]), share / noise**2
 
@@ -221,7 +223,7 @@ def _bends(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _agreement(
     seen: Sequence[_Sighting], weights: np.ndarray, projectors: np.ndarray, origins: np.ndarray
 ) -> np.ndarray:
-    """How well each ray agrees with the others of its time, in (0, 1]; 1 where they leave the point open. [n]"""
+    """Return the agreement of each ray with the others of its time, in (0, 1]; 1 if the point is not determined. [n]"""
     at = np.array([x.knot for x in seen])
     agreement = np.ones(len(seen))
     for s in np.unique(at):

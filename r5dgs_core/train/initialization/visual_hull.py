@@ -1,4 +1,4 @@
-"""Depth-free initialisation of objects: points inside the visual hull of their masks at one time.
+"""Initial points of objects: random points inside the visual hull of the masks at one time.
 
 Notation: V views at the reference time, P candidate points.
 """
@@ -22,24 +22,24 @@ def carve(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw points that all views agree to lie in the object.
+    """Draw points that are inside an object according to its masks.
 
-    A view whose mask shows the object and that has the point in its frame votes: for it where the mask shows the
-    object, against it where the mask shows background, not at all where another object may hide it or the mask says
-    nothing. The bounds start strict (no vote against it) and are relaxed until enough points are found, so that noisy
-    masks still give a start.
+    Each view whose mask shows the object votes on the points in its frame: for a point if its pixel shows the object,
+    against it if its pixel shows the background, and not at all if another object or an unknown region covers it. At
+    first no vote against a point is allowed; the limit is relaxed until enough points are found, so that noisy masks
+    also give a result.
 
     Args:
         views: Views at the reference time.
         object_id: The object.
         center: Its triangulated centre. [3]
-        radius: Radius of a ball that holds it.
-        count: Number of points wanted.
-        rng: Source of the draws.
+        radius: Radius of a ball that contains it.
+        count: Number of points.
+        rng: Random generator.
 
     Returns:
-        Points [count, 3] and their colours, mean over the views that show the object there [count, 3] in [0, 1];
-        when nothing at all can be carved, points of a small ball in the object's mean colour (gray if never seen).
+        Points [count, 3] and their colours, averaged over the views that show the object there [count, 3] in [0, 1]. If
+        no point can be carved, points of a small ball in the object's mean colour (grey if it is never visible).
     """
     direction = rng.normal(size=(24 * count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -75,7 +75,7 @@ def carve(
 
 
 def pixel_indices(view: TrainView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns, rows and validity of the pixels that points [P, 3] fall into; indices are clipped where not valid."""
+    """Return columns, rows and validity of the pixels of points [P, 3]; invalid indices are set to 0."""
     pixels, _ = cameras.project(view.camera, points)
     height, width = view.image.shape[:2]
     with np.errstate(invalid="ignore"):

@@ -1,14 +1,14 @@
-"""The representation `field`: a deformation field for the observed time and the TRD for what follows (5DGS, R5DGS).
+"""Representation `field`: a deformation field for the observed time, and the TRD for extrapolation (5DGS, R5DGS).
 
 Notation: N Gaussians, R of them moved by the networks, T the horizon of the deformation field. Network times are scene
-times moved and scaled so that the observed ones lie in [0, 1]; where they do already, they are used as they are.
+times, shifted and scaled so that the observed ones lie in [0, 1]; if they already do, they are used as they are.
 
-Within the horizon a training step draws a start t' = t -+ h, lets the field bring the Gaussians there and the TRD carry
-them to t in one step; past it, the TRD carries them from T to t. The TRD starts at positions without gradient: it is
-taught by its displacement, the field by the position itself.
+Within the horizon, a training step draws a start t' = t -+ h; the field moves the Gaussians to t', and the TRD from
+there to t in one step. Past the horizon, the TRD moves them from T to t. The TRD starts at positions without gradient:
+its displacement trains the TRD, the position itself trains the field.
 
-Source: TRACE's training scheme; movers alone, fits to places and to motion without images, and the cross-Gaussian twist
-loss are ours.
+Source: TRACE's training scheme. Ours are the restriction to movers, the fits to positions and to motion without images,
+    and the cross-Gaussian twist loss.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ from .field_motion import Clock, Motion
 
 log = logging.getLogger(__name__)
 
-HORIZON = 14 / 15  # of the last observed time, as 0.70 of 0.75
+HORIZON = 14 / 15  # default horizon as a share of the observed span (0.70 of 0.75 in NVFi)
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Moved Gaussians at a time.
+    """State of the moved Gaussians at a time.
 
     Attributes:
-        rows: Which ones. [R]
+        rows: Rows of the Gaussians. [R]
         before: Canonical centres. [R, 3]
-        offsets: Added to them. [R, 3]
-        quats: Rotations after the canonical ones, unit wxyz. [R, 4]
-        log_scales: Added to the log scales. [R, 3]
+        offsets: Offsets from them. [R, 3]
+        quats: Rotations applied after the canonical ones, unit wxyz. [R, 4]
+        log_scales: Changes of the log scales. [R, 3]
     """
 
     rows: Tensor
@@ -61,10 +61,10 @@ class Moved:
 
 
 class FieldRepresentation:
-    """Gaussians moved one by one by `Motion`, with shading that follows their rotations.
+    """Gaussians moved one by one by `Motion`, with shading that depends on their rotations.
 
     Args:
-        tracks: Where the masks put the objects, or tracks that were trained; the field may be fitted to them.
+        tracks: Initial tracks by the masks, or trained tracks; the field may be fitted to them.
         first: Knot of the tracks at which the Gaussians are canonical.
         config: The run's configuration.
     """
@@ -79,7 +79,7 @@ class FieldRepresentation:
         self._tracks = tracks
         self._first = first
         self._last: Moved | None = None
-        self._iteration = config.field.warm_up  # of training; a field that is only looked at is past the warm-up
+        self._iteration = config.field.warm_up  # a field that is not in training is past the warm-up
 
     @property
     def params(self) -> dict[str, Tensor]:
@@ -91,7 +91,7 @@ class FieldRepresentation:
         return gating.kind(self._tracks.bodies, self._config) == "measured"
 
     def movers(self, gaussians: Gaussians) -> Tensor:
-        """Rows that the networks move, none while training warms up. [R] int64"""
+        """Return the rows that the networks move; none during the warm-up. [R] int64"""
         if self._iteration < self._config.field.warm_up:
             return torch.zeros(0, dtype=torch.int64)
         return gating.movers(gaussians.motion_ids, self._tracks.bodies, self.times, self._config)
@@ -114,7 +114,7 @@ class FieldRepresentation:
             colors = shade.seen_colors(
                 means.detach(), params["sh"], np.asarray(camera.center)[None], rest=params["sh_rest"]
             )
-            # The harmonics of what moves live in its own frame and turn with it.
+            # The harmonics of moved Gaussians are defined in their own frames.
             seen = means.detach()[rows] - torch.from_numpy(np.asarray(camera.center)).float()
             seen = rotations.rotate(rotations.conjugate(moved.quats.detach()), seen / seen.norm(dim=1, keepdim=True))
             both = torch.cat([params["sh"][rows], params["sh_rest"][rows]], dim=1)
@@ -138,7 +138,7 @@ class FieldRepresentation:
         )
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """Fit field and TRD to the places of the objects, before the first image is looked at."""
+        """Fit field and TRD to the positions of the objects before the first image."""
         section = self._config.field
         self._iteration = 0
         gating.release(gaussians, self._tracks, self._config)
@@ -149,7 +149,7 @@ class FieldRepresentation:
     def fit(
         self, gaussians: Gaussians, tracks: Tracks, field_steps: int, trd_steps: int, draw: torch.Generator
     ) -> None:
-        """Fit field and TRD to the motion of tracks, without images; what belongs to no body is fitted to rest."""
+        """Fit field and TRD to the motion of tracks, without images; Gaussians of no body are fitted to rest."""
         rows = self.movers(gaussians)
         means, ids = gaussians.means.detach()[rows], gaussians.motion_ids[rows]
         groups = gating.bodies_of(ids, tracks, 0)
@@ -158,7 +158,7 @@ class FieldRepresentation:
         field_fitting.fit_trd(self.motion, means, groups, trd_steps, self._config.field.twist, draw)
 
     def move(self, gaussians: Gaussians, t: float, draw: torch.Generator | None = None) -> Moved:
-        """Where the movers are at a time: in training by a drawn path through field and TRD, else by the rule."""
+        """Return the movers at a time: with ``draw`` by a random path through field and TRD, else by `Motion.at`."""
         rows = self.movers(gaussians)
         before = gaussians.params["means"].detach()[rows]
         deltas = self._train_path(before, t, draw) if draw is not None else self.motion.at(before, t)
@@ -175,7 +175,7 @@ class FieldRepresentation:
         return motion.through(means, start, t, h)
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Distance from rest until the gate closes, stiffness of the groups, and L_rigid in the variant that has it."""
+        """Return the sum of distance from rest (until the gate), stiffness, and L_rigid for variant ``r5dgs_extra``."""
         moved, self._last = self._last, None
         if moved is None or len(moved.rows) == 0:
             return None
@@ -199,10 +199,10 @@ class FieldRepresentation:
         return sum(terms[1:], terms[0]) if terms else None
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """A field reaches all times already."""
+        """Do nothing: a field covers all times already."""
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Set still what rests, once, where movers are measured; fit the TRD to the motion that there is by now."""
+        """Freeze Gaussians at rest once, if movers are measured, and periodically fit the TRD to the current motion."""
         section = self._config.field
         self._iteration = iteration
         if self._measured and iteration == gating.gate_step(self._config):
@@ -217,7 +217,7 @@ class FieldRepresentation:
             field_fitting.fit_trd(self.motion, means, groups, section.trd_steps, section.twist, draw)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Weights by ``field.NAME`` and ``trd.NAME``, and the times."""
+        """Return the weights by ``field.NAME`` and ``trd.NAME``, the times and the groups."""
         named = {n: p.detach() for n, p in self.params.items()}
         tracks = self._tracks
         named |= {"field.times": torch.from_numpy(self.times), "field.casters": tracks.casters}
@@ -225,14 +225,14 @@ class FieldRepresentation:
         return named | {"field.bodies": torch.tensor(tracks.bodies), "field.plane_normal": tracks.plane_normal}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `tensors`."""
+        """Restore the state from `tensors`."""
         _load(self.motion, tensors)
         self.light = tensors["light"].clone().requires_grad_(True)
         self._iteration = int(tensors["field.iteration"])
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
-        """See `Representation.group_classes`: a body's object; those of a shadow or of no body are background."""
+        """See `Representation.group_classes`: the object of each body; background for shadows and for no body."""
         others = len(tensors["field.casters"]) + 1
         return np.concatenate([np.arange(int(tensors["field.bodies"])), np.zeros(others, np.int64)])
 
@@ -240,7 +240,7 @@ class FieldRepresentation:
     def observed_motion(
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
-        """See `Representation.observed_motion`: groups are the classes and the shadows."""
+        """See `Representation.observed_motion`: the groups are the classes and the shadows."""
         motion = _motion_of(tensors["field.times"].numpy(), config)
         _load(motion, tensors)
         gaussians = {n.removeprefix("gaussians."): p for n, p in tensors.items() if n.startswith("gaussians.")}
@@ -263,7 +263,7 @@ class FieldRepresentation:
 
 
 def _motion_of(times: np.ndarray, config: Config) -> Motion:
-    """Networks as they start, on the clock of the observed times."""
+    """Return untrained networks with the clock of the observed times."""
     section = config.field
     first, last = float(times[0]), float(times[-1])
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
@@ -286,7 +286,7 @@ def _motion_of(times: np.ndarray, config: Config) -> Motion:
 
 
 def _parameters(motion: Motion) -> dict[str, Tensor]:
-    """Weights of both networks, by ``field.NAME`` and ``trd.NAME``."""
+    """Weights of both networks by ``field.NAME`` and ``trd.NAME``."""
     named: dict[str, Tensor] = {f"field.{n}": p for n, p in motion.field.named_parameters()}
     named.update({f"trd.{n}": p for n, p in motion.trd.named_parameters()})
     return named
@@ -303,15 +303,15 @@ def _load(motion: Motion, tensors: dict[str, Tensor]) -> None:
 def from_tracks(
     tracks: Tracks, light: Tensor, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
 ) -> FieldRepresentation:
-    """A field that goes on from tracks: fitted to their motion, with the Gaussians brought to one time.
+    """Return a field that continues from tracks: it is fitted to their motion, with all Gaussians at one time.
 
     Args:
         tracks: The trained tracks.
         light: The trained light of the shading. [3]
-        gaussians: Changed in place: each body from its own canonical state to where it is at ``first``.
+        gaussians: Changed in place: each body moves from its own canonical state to its pose at ``first``.
         first: Knot at which the field's Gaussians are canonical.
         config: The run's configuration.
-        draw: Source of the draws.
+        draw: Random generator.
     """
     made = FieldRepresentation(tracks, first, config)
     with torch.no_grad():
@@ -323,13 +323,13 @@ def from_tracks(
 
 
 def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tensor | None = None) -> None:
-    """Move each group of Gaussians, which start where they were seen best, to where it is at one knot, in place.
+    """Move each group of Gaussians from its own reference time to its pose at one knot, in place.
 
     Args:
         gaussians: The Gaussians.
-        tracks: The tracks that they moved by.
+        tracks: Tracks of their groups.
         knot: The knot.
-        light: Light of their shading, where there is some. [3]
+        light: Light of their shading; None leaves colours unchanged. [3]
     """
     with torch.no_grad():
         poses = tracks.poses(float(tracks.times[knot]))
@@ -343,7 +343,7 @@ def bring_together(gaussians: Gaussians, tracks: Tracks, knot: int, light: Tenso
         sh = torch.cat([gaussians.sh, gaussians.sh_rest], dim=1).double().numpy()
         vectors, turns = gaussians.shading.double().numpy(), poses.quats[ids].double().numpy()
         sh = sh_color.rotate(sh, turns)
-        # What is unlit at that time starts dark; training goes on from there with factors of 1 at rest.
+        # Unlit surfaces start dark; factors at rest are dropped, as training assumes 1.
         sh, vectors, _ = shading.rebind(sh, vectors, np.ones(len(sh)), turns, light.double().numpy())
         gaussians.sh.copy_(torch.from_numpy(sh[:, :1]))
         gaussians.sh_rest.copy_(torch.from_numpy(sh[:, 1:]))

@@ -1,8 +1,8 @@
-"""Fits of the deformation field and the TRD to motion alone, without images: quick, and what images leave open.
+"""Fits of the deformation field and the TRD to motion alone, without images.
 
-Images show a Gaussian's velocity at its own place only, v + w x p: its spin w is free, and a field puts rotation into
-velocities that depend on the place. The cross-Gaussian twist loss closes that: the twist of one Gaussian must carry
-another Gaussian of the same group too.
+They are fast and determine what images leave open. Images only show a Gaussian's velocity v + w x p at its own
+position: its spin w is free, and a field puts rotation into velocities that depend on position. The cross-Gaussian
+twist loss removes this ambiguity: the twist of one Gaussian must also move another Gaussian of the same group.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from .rigidity import QUAT_WEIGHT
 
 ROWS = 512  # Gaussians per step of a fit
 RATE = 2e-3
-ALONE = -1  # group of Gaussians that move each on its own: none carries another
+ALONE = -1  # group of Gaussians that each move on their own, without partners
 
 
 def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tensor]) -> None:
-    """Adam with a rate that falls to a twentieth; gradients are left as they were found."""
+    """Minimise with Adam and a rate that decays to a twentieth; gradients are cleared at the end."""
     named = [p for p in parameters if p.requires_grad]
     optimizer = torch.optim.Adam(named, lr=RATE, fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / max(steps, 1)))
@@ -37,14 +37,14 @@ def _optimise(parameters: Iterator[Tensor], steps: int, loss: Callable[[], Tenso
 
 
 def _sample(count: int, generator: torch.Generator) -> Tensor:
-    """Rows of a step. [<= ROWS] int64"""
+    """Draw the rows of a step. [<= ROWS] int64"""
     return torch.randint(0, count, (min(ROWS, count),), generator=generator)
 
 
 def fit_field(
     motion: Motion, means: Tensor, groups: Tensor, tracks: Tracks, first: int, steps: int, generator: torch.Generator
 ) -> None:
-    """Fit the field to the motion of the tracks, relative to the knot that canonical Gaussians are at.
+    """Fit the field to the motion of the tracks, relative to the knot at which the Gaussians are canonical.
 
     Args:
         motion: Changed in place.
@@ -52,8 +52,8 @@ def fit_field(
         groups: Their motion groups. [R]
         tracks: Tracks; all knots up to the horizon are fitted.
         first: Knot at which the Gaussians are canonical.
-        steps: Steps; each looks at four times.
-        generator: Source of the draws.
+        steps: Steps; each evaluates four times.
+        generator: Random generator.
     """
     if len(means) == 0 or steps == 0:
         return
@@ -86,18 +86,18 @@ def fit_field(
 def fit_trd(
     motion: Motion, means: Tensor, groups: Tensor, steps: int, twist: float, generator: torch.Generator
 ) -> None:
-    """Fit the TRD to the motion of the field between times that are a step apart, forwards and backwards.
+    """Fit the TRD to the motion of the field over intervals of about one step, forwards and backwards.
 
     Args:
         motion: Its TRD is changed in place.
         means: Canonical centres of the movers. [R, 3]
-        groups: Their motion groups, for the twist loss; `ALONE` where one is in none. [R]
+        groups: Their motion groups, for the twist loss; `ALONE` for no group. [R]
         steps: Steps of the fit.
         twist: Weight of the cross-Gaussian twist loss.
-        generator: Source of the draws.
+        generator: Random generator.
     """
     first = motion.start
-    if len(means) == 0 or steps == 0 or motion.horizon <= first:  # at a single time nothing moves
+    if len(means) == 0 or steps == 0 or motion.horizon <= first:  # a single time has no motion
         return
 
     def loss() -> Tensor:
@@ -131,16 +131,16 @@ def cross_twist(
     groups: Tensor,
     generator: torch.Generator,
 ) -> Tensor:
-    """Mean squared distance by which the twist of each Gaussian misses where another of its group went.
+    """Return the mean squared error of moving a Gaussian by the twist of another Gaussian of its group.
 
     Args:
-        motion: Integrates.
-        begin: Where the Gaussians were. [R, 3]
-        goal: Where they went. [R, 3]
-        state: Their twists.
-        span: Scene time between the two.
+        motion: Integrates the twists.
+        begin: Start positions. [R, 3]
+        goal: End positions. [R, 3]
+        state: Twists of the Gaussians.
+        span: Scene time between start and end.
         groups: Their motion groups. [R]
-        generator: Draws the partners.
+        generator: Random generator for the partners.
     """
     partner = _partners(groups, generator)
     crossed, _ = motion.carry(begin[partner], state, span, motion.step)
@@ -148,7 +148,7 @@ def cross_twist(
 
 
 def _partners(groups: Tensor, generator: torch.Generator) -> Tensor:
-    """For each row a row of the same group, drawn by a random shift within the group; itself if alone. [R] int64"""
+    """Return a row of the same group for each row, by a random cyclic shift; itself if `ALONE`. [R] int64"""
     order = torch.argsort(groups, stable=True)
     partner = torch.arange(len(groups))
     start = int((groups == ALONE).sum())

@@ -1,7 +1,7 @@
-"""Field and TRD together: where Gaussians are at any time, in the observed interval and past it.
+"""Deformation field and TRD combined: states of Gaussians at any time, observed or extrapolated.
 
-Notation: R moved Gaussians, T the horizon of the deformation field. Network times are scene times moved and scaled so
-that the observed ones lie in [0, 1]; where they do already, they are used as they are.
+Notation: R moved Gaussians, T the horizon of the deformation field. Network times are scene times, shifted and scaled
+so that the observed ones lie in [0, 1]; if they already do, they are used as they are.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from ...motion import point_dynamics, rotations
 
 @dataclass(frozen=True)
 class Clock:
-    """From scene time to the networks' time: (t - origin) / scale."""
+    """Conversion of scene time to the networks' time: (t - origin) / scale."""
 
     origin: float
     scale: float
 
     @staticmethod
     def of(times: np.ndarray) -> Clock:
-        """The clock of the observed times: the identity where they lie in [0, 1] and fill a quarter of it."""
+        """Return the clock of the observed times: the identity if they lie in [0, 1] and fill a quarter of it."""
         first, last = float(times[0]), float(times[-1])
         scale = point_dynamics.time_unit(first, last)
         return Clock(0.0 if scale == 1.0 else first, scale)
@@ -35,16 +35,16 @@ class Clock:
 
 
 class Motion:
-    """Field and TRD with the clock that they share.
+    """Deformation field and TRD with their common clock.
 
     Args:
         field: The deformation field.
         trd: The TRD network.
-        clock: From scene time to theirs.
+        clock: Conversion of scene time to network time.
         start: First observed scene time.
         horizon: Scene time T.
         step: Scene time h that the TRD bridges in training.
-        chunk: Gaussians that pass the networks at once.
+        chunk: Gaussians per forward pass.
     """
 
     def __init__(
@@ -66,15 +66,15 @@ class Motion:
         self.chunk = chunk
 
     def deltas(self, means: Tensor, t: float) -> deformation.Deltas:
-        """The field at a scene time, held past the horizon."""
+        """Evaluate the field at a scene time, clamped to the horizon."""
         return self.field(means, self.clock(min(t, self.horizon)), self.chunk)
 
     def state(self, positions: Tensor, t: float) -> MotionState:
-        """The TRD's answer for Gaussians that are somewhere at a scene time, per unit of network time."""
+        """Evaluate the TRD at positions and a scene time, per unit of network time."""
         return self.trd(positions, self.clock(t), self.chunk)
 
     def carry(self, positions: Tensor, state: MotionState, duration: float, step: float) -> tuple[Tensor, Tensor]:
-        """Positions and rotations after a signed scene time, by TRACE's integrator. [R, 3], [R, 4]"""
+        """Return positions and rotations after a signed scene time, by TRACE's integrator. [R, 3], [R, 4]"""
         return point_dynamics.rk2(
             positions,
             state.equiv_velocity,
@@ -86,13 +86,16 @@ class Motion:
         )
 
     def at(self, means: Tensor, t: float) -> deformation.Deltas:
-        """Where Gaussians are at any time: by the field up to T, by the TRD from there on."""
+        """Return the state of Gaussians at any time: by the field up to T, then by the TRD."""
         deltas = self.deltas(means, t)
         step = point_dynamics.TRACE_STEP * self.clock.scale
         return deltas if t <= self.horizon else self.through(means, self.horizon, t, step)
 
     def through(self, means: Tensor, start: float, t: float, step: float) -> deformation.Deltas:
-        """By the field to ``start``, by the TRD from there to ``t``. The TRD's start has no gradient."""
+        """Move Gaussians by the field to ``start`` and by the TRD from there to ``t``.
+
+        The TRD starts at positions without gradient.
+        """
         deltas = self.deltas(means, start)
         begin = (means + deltas.offsets).detach()
         end, turns = self.carry(begin, self.state(begin, start), t - start, step)

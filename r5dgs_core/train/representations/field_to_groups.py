@@ -1,7 +1,7 @@
-"""What a trained field hands to baking: states of its Gaussians at the knots, group motions fitted to them, dynamics.
+"""Conversion of a trained field for baking: states of its Gaussians at the knots, fitted group motions, dynamics.
 
-Notation: N Gaussians, R of them moved, S knots up to the horizon T, B classes (0 the background). Bind state: at T.
-The motion of a group is the robust Kabsch fit of its members' centres from T to each knot.
+Notation: N Gaussians, R of them moved, S knots up to the horizon T, B classes (0 the background). Bind state: at T. The
+motion of a group is the robust Kabsch fit of its members' centres from T to each knot.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from . import regrouping as regroup
 from . import shading
 from .field_motion import Motion
 
-SHADOW_RIDGE = 0.05  # pull of a shadow's map towards the projection onto the plane, as a share of the caster's motion
+SHADOW_RIDGE = 0.05  # ridge weight of the projection in the fit of a shadow's map / mean square of the caster's motion
 
 
 def knots(times: np.ndarray, horizon: float) -> np.ndarray:
-    """Times at which the field is sampled: the observed ones up to the horizon, and the horizon. [S]"""
+    """Return the times at which the field is sampled: the observed ones before the horizon, and the horizon. [S]"""
     before = times[times < horizon - 1e-9 * max(1.0, abs(horizon))]
     return np.concatenate([before, [horizon]])
 
@@ -53,12 +53,12 @@ def observed_motion(
         labels: Class of each Gaussian. [N]
         object_ids: Object id of each class. [B]
         alone: Motion id of movers that belong to no group.
-        seen: Knots of the training at which each object was placed by its masks. [B - 1, K] bool
+        seen: Knots of the training at which each object was located by its masks. [B - 1, K] bool
         times: These knots. [K]
-        shadows: Caster, a class, of each group from B on.
+        shadows: Caster (a class) of each group from B on.
         normal: Normal of the plane that carries shadows. [3]
         light: Light of the shading. [3]
-        regrouping: ``off`` leaves Gaussians in the groups that they were made for.
+        regrouping: "off" leaves Gaussians in their original groups.
     """
     at = knots(times, motion.horizon)
     rows, means = movers, gaussians["means"][movers]
@@ -86,11 +86,11 @@ def observed_motion(
     motion_ids = np.zeros(len(labels), np.int64)
     own = gaussians["motion_ids"].numpy()[rows.numpy()]
     own = np.where(own == alone, labels[rows.numpy()], own)
-    if not own.any():  # nobody said what belongs to what before training: the labels do
+    if not own.any():  # training had no groups, so the labels define them
         own = labels[rows.numpy()].astype(np.int64)
     motion_ids[rows.numpy()] = own
-    resting = ~np.isin(labels, own)  # objects of which nothing moves are groups all the same,
-    resting[rows.numpy()] = False  # but what moves goes with its group even where the masks call it background
+    resting = ~np.isin(labels, own)  # objects without movers are groups, too,
+    resting[rows.numpy()] = False  # but movers stay in their groups even if the masks label them as background
     motion_ids[resting] = labels[resting]
     opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].numpy()[rows.numpy()].astype(np.float64)))
     nearest = np.abs(times[None] - at[:, None]).argmin(1)
@@ -104,7 +104,7 @@ def observed_motion(
     if regrouping != "off":
         made_for = own
         own, groups, moves = regroup.tidy(path, own, opacities, fit)
-        if len(shadows) == 0:  # none was made in training, yet the floor may imitate some
+        if len(shadows) == 0:  # without shadow groups, background Gaussians may imitate shadows
             casters = regroup.imitators(path, own, opacities, groups, normal)
             shadows = np.unique(casters[casters > 0]).tolist()
             if shadows:
@@ -124,15 +124,15 @@ def _groups(
     shadows: Sequence[int],
     normal: np.ndarray,
 ) -> list[GroupTrack]:
-    """The groups fitted to their members: the pinned one, a body per object, the shadows.
+    """Fit the groups to their members: the pinned one, a body per object, the shadows.
 
     Args:
-        path: Centres of what moves, at the knots. [R, S, 3]
-        ids: Its groups. [R]
+        path: Centres of the movers at the knots. [R, S, 3]
+        ids: Groups of the movers. [R]
         opacities: [R]
         object_ids: Object id of each class. [B]
-        observed: Knots at which each class was placed by its masks. [B, S] bool
-        shadows: Caster, a class, of each group from B on.
+        observed: Knots at which each class was located by its masks. [B, S] bool
+        shadows: Caster (a class) of each group from B on.
         normal: Normal of the plane that carries shadows. [3]
     """
     still = rotations.identity(path.shape[1]), np.zeros((path.shape[1], 3))
@@ -154,7 +154,7 @@ def _groups(
 
 
 def _track(path: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre at the last knot, rotations [S, 4] and displacements of the centre [S, 3] since then."""
+    """Return the centre at the last knot, and rotations [S, 4] and displacements [S, 3] relative to it."""
     count = path.shape[1]
     quats, shifts = rotations.identity(count), np.zeros((count, 3))
     if len(path) == 0:
@@ -167,7 +167,7 @@ def _track(path: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _follow(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Linear map from a caster's displacements to its shadow's, near the projection onto the plane. [3, 3]"""
+    """Fit the linear map from a caster's displacements to its shadow's, regularised towards the projection. [3, 3]"""
     flat = np.eye(3) - np.outer(normal, normal)
     if len(path) == 0:
         return flat
@@ -178,13 +178,13 @@ def _follow(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: n
 
 
 def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: np.ndarray) -> bool:
-    """Whether a shadow went on with its caster, better than if it had stayed: learned early, judged at the last knots.
+    """True if a shadow learned early follows its caster at the last knots better than if it were at rest.
 
     Args:
-        path: Centres of its Gaussians at the knots. [n, S, 3]
-        weights: Of these. [n]
+        path: Centres of the shadow's Gaussians at the knots. [n, S, 3]
+        weights: Weights of these. [n]
         leader: Displacements of the caster. [S, 3]
-        normal: Of the plane. [3]
+        normal: Normal of the plane. [3]
     """
     last = len(leader) - 1 - max(2, round(model_selection.HELD_OUT * len(leader)))
     if last < 2 or len(path) == 0:
@@ -197,7 +197,7 @@ def follows(path: np.ndarray, weights: np.ndarray, leader: np.ndarray, normal: n
 
 
 def _about_own_centre(points: np.ndarray, state, scale: float) -> np.ndarray:
-    """Velocity, angular velocity and their rates per scene time, about each Gaussian's own centre. [R, 12]"""
+    """Return velocity, angular velocity and their rates per scene time, about each Gaussian's own centre. [R, 12]"""
     v, w, a, e = (
         x.numpy().astype(np.float64)
         for x in (

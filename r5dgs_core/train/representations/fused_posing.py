@@ -1,4 +1,4 @@
-"""Canonical Gaussians to splats in the world: group poses, activations and shading in one fused pass.
+"""Canonical Gaussians to splats: group poses, activations and shading in one fused pass.
 
 For a Gaussian of group g, with rotation R, quaternion q_g, displacement d and centre c of the group:
 
@@ -7,8 +7,8 @@ For a Gaussian of group g, with rotation R, quaternion q_g, displacement d and c
     colour' = max(0, rgb) max(0, 1 + (R^T l - l) . g_i)
 
 ``l`` is one light direction and ``g_i`` a vector per Gaussian: the first-order change of diffuse shading as the body
-turns in fixed light. Both passes are one loop over the Gaussians; the backward pass sums per group over a fixed
-number of chunks in a fixed order, so that results do not depend on the number of threads.
+turns in fixed light. Both passes are one loop over the Gaussians; the backward pass sums per group over a fixed number
+of chunks in a fixed order, so that results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CHUNKS = 16
 
 @dataclass(frozen=True)
 class Splats:
-    """Activated Gaussians in the world: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3]."""
+    """Posed, activated Gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], colors [N, 3]."""
 
     means: Tensor
     quats: Tensor
@@ -51,16 +51,16 @@ def pose(
     """Move canonical Gaussians with their groups and activate their parameters.
 
     Args:
-        means: Canonical centres, world. [N, 3]
+        means: Canonical centres. [N, 3]
         quats: Canonical rotations wxyz, any positive norm. [N, 4]
         log_scales: Logarithms of the standard deviations. [N, 3]
-        opacity_logits: Before the sigmoid. [N]
+        opacity_logits: Opacities before the sigmoid. [N]
         colors: RGB before clamping at zero. [N, 3]
-        shading: The vector g of each Gaussian; zeros where colours do not change. [N, 3]
-        light: The direction l, world; it is used as given, not normalised. [3]
+        shading: Shading vector g of each Gaussian; zeros for constant colours. [N, 3]
+        light: The light vector l; it is not normalised. [3]
         motion_ids: Group of each Gaussian. [N] int64
-        group_poses: Poses of the G groups at the wanted time.
-        centers: Centres that the groups turn about. [G, 3]
+        group_poses: Poses of the G groups at the time of the splats.
+        centers: Centres of rotation of the groups. [G, 3]
 
     Returns:
         Splats for the rasterizer; differentiable in everything but ``motion_ids`` and ``centers``.

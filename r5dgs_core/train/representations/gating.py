@@ -1,9 +1,9 @@
-"""Which Gaussians a field moves: those on objects, all of them, or those that are found to move.
+"""Selection of the Gaussians that a field moves: those on objects, all of them, or those that are found to move.
 
-A Gaussian that is found to rest is folded into its mean state over the observed times and joins group 0, which the
-networks never see again: applied to what they were not trained on, networks move it. Its group travels with a Gaussian
-through splitting and checkpoints, so no other state is needed. One that belongs to no body and may move all the same
-carries the id after the last group, `free_id`.
+A Gaussian at rest is set to its mean state over the observed times and joins group 0, which the networks never process
+again, as they would move Gaussians that they were not trained on. Its group is kept through splitting and in
+checkpoints, so no other state is necessary. Gaussians that belong to no body but may move have the id after the last
+group, `free_id`.
 
 Notation: N Gaussians, R of them moved by the networks, S sampled times.
 """
@@ -22,27 +22,27 @@ from ...model.tracks import Tracks
 from ...motion import rotations
 from .field_motion import Motion
 
-TURN = 0.1  # of a difference of quaternions or log scales beside a distance in normalised units
-SMOOTH = 1e-3  # distance below which the distance from rest is smoothed
-SAMPLES = 9  # times at which displacements are looked at
+TURN = 0.1  # weight of differences of quaternions and log scales relative to distances in normalised units
+SMOOTH = 1e-3  # smoothing of the distance from rest near 0, normalised units
+SAMPLES = 9  # sampled times
 
 
 def free_id(tracks: Tracks) -> int:
-    """Motion id of Gaussians that may move and belong to no body: the one after the bodies and their shadows."""
+    """Return the motion id of Gaussians that may move but belong to no body: the one after bodies and shadows."""
     return tracks.groups
 
 
 def kind(bodies: int, config: Config) -> str:
-    """Which Gaussians move: ``field.movers``, or ``measured`` where it is ``labelled`` and no mask labels anything."""
+    """Return ``field.movers``, with ``measured`` in place of ``labelled`` if there are no masks."""
     return "measured" if config.field.movers == "labelled" and bodies < 2 else config.field.movers
 
 
 def movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -> Tensor:
-    """Rows that the networks move; none at a single time, and where the user says that nothing does. [R] int64
+    """Return the rows that the networks move; none at a single time or if ``needs.tracks`` is "off". [R] int64
 
     Args:
         motion_ids: Group of each Gaussian. [N]
-        bodies: Bodies, the background included.
+        bodies: Number of bodies, including the background.
         times: The observed times. [S]
         config: The run's configuration.
     """
@@ -54,31 +54,33 @@ def movers(motion_ids: Tensor, bodies: int, times: np.ndarray, config: Config) -
 
 
 def release(gaussians: Gaussians, tracks: Tracks, config: Config) -> None:
-    """Let the networks move what is on no object too, in place, where movers are measured."""
+    """Let the networks also move Gaussians of the background, in place, if movers are measured."""
     if kind(tracks.bodies, config) == "measured":
         gaussians.motion_ids[gaussians.motion_ids == 0] = free_id(tracks)
 
 
 def bodies_of(motion_ids: Tensor, tracks: Tracks, outside: int) -> Tensor:
-    """Motion groups, with ``outside`` for Gaussians that are in none that moves as one. [N]"""
+    """Return motion groups, with ``outside`` for Gaussians that belong to no rigid group. [N]"""
     one = (motion_ids < free_id(tracks)) & ((motion_ids > 0) | (tracks.bodies > 1))
     return torch.where(one, motion_ids, outside)
 
 
 def gate_step(config: Config) -> int:
-    """Step after which resting Gaussians are set still: a share of the field's run, once all times take part."""
+    """Return the step after which Gaussians at rest are frozen, by ``field.gate`` but not before all times entered."""
     steps, section = config.train.iterations, config.field
     begun = max(section.tracks_share * steps, section.warm_up)
     return max(round(begun + section.gate * (steps - begun)), config.curriculum.steps(steps)[1])
 
 
 def restlessness(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
-    """Mean distance of Gaussians from their canonical state, by the distance itself: what no image moves comes to rest.
+    """Return the mean distance of Gaussians from their canonical state.
+
+    The distance is not squared, so that Gaussians that no image moves come to rest exactly.
 
     Args:
-        offsets: From the canonical centres. [R, 3]
-        quats: After the canonical rotations, unit wxyz. [R, 4]
-        log_scales: Added to the canonical ones. [R, 3]
+        offsets: Offsets from the canonical centres. [R, 3]
+        quats: Rotations applied after the canonical ones, unit wxyz. [R, 4]
+        log_scales: Changes of the log scales. [R, 3]
     """
     rest = torch.tensor([1.0, 0.0, 0.0, 0.0])
     change = torch.cat([offsets, TURN * (quats - rest), TURN * log_scales], dim=-1)
@@ -87,13 +89,13 @@ def restlessness(offsets: Tensor, quats: Tensor, log_scales: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Rest:
-    """Gaussians about their mean state over some times.
+    """Mean state of Gaussians over some times.
 
     Attributes:
-        offsets: From the canonical centre to the mean one. [R, 3]
-        quats: From the canonical rotation to the mean one, unit wxyz. [R, 4]
-        log_scales: From the canonical log scales to the mean ones. [R, 3]
-        unrest: Largest distance by which any point of the one-sigma ellipsoid may leave its place in that state. [R]
+        offsets: Offset of the mean centre from the canonical one. [R, 3]
+        quats: Rotation from the canonical to the mean orientation, unit wxyz. [R, 4]
+        log_scales: Change from the canonical to the mean log scales. [R, 3]
+        unrest: Upper bound of the displacement of any point of the one-sigma ellipsoid from the mean state. [R]
     """
 
     offsets: Tensor
@@ -104,10 +106,10 @@ class Rest:
 
 @torch.no_grad()
 def rest(motion: Motion, means: Tensor, log_scales: Tensor, times: np.ndarray) -> Rest:
-    """Mean state of Gaussians over some times, and how far they leave it.
+    """Return the mean state of Gaussians over some times, and their deviation from it.
 
     Args:
-        motion: Moves them.
+        motion: Motion of the Gaussians.
         means: Canonical centres. [R, 3]
         log_scales: Canonical log scales. [R, 3]
         times: Scene times. [S]
@@ -127,17 +129,17 @@ def rest(motion: Motion, means: Tensor, log_scales: Tensor, times: np.ndarray) -
 
 @torch.no_grad()
 def settle(gaussians: Gaussians, rows: Tensor, motion: Motion, times: np.ndarray, limit: float) -> Tensor:
-    """Set Gaussians that rest still, in their mean state, in place.
+    """Freeze Gaussians at rest in their mean state, in place.
 
     Args:
         gaussians: Changed in place.
-        rows: Those that the networks move. [R]
-        motion: Moves them.
+        rows: Rows that the networks move. [R]
+        motion: Motion of the Gaussians.
         times: The observed times.
-        limit: What leaves its place by less rests; normalised units.
+        limit: Displacement below which a Gaussian is at rest, normalised units.
 
     Returns:
-        Rows that were set still. [<= R] int64
+        Rows that were frozen. [<= R] int64
     """
     sampled = times[np.unique(np.linspace(0, len(times) - 1, SAMPLES).round().astype(int))]
     found = rest(motion, gaussians.means[rows], gaussians.log_scales[rows], sampled)

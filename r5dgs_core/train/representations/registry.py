@@ -1,6 +1,6 @@
-"""The representations by name, each imported by the runs and checkpoints that use it.
+"""Registry of the motion representations by name.
 
-A scene at rest loads neither tracks nor networks.
+Each is imported only when it is used; a static scene loads neither tracks nor networks.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from .representation import FIELD, STILL, TRACKS, Representation
 
 
 def make(start: initialize.Start, config: Config, still: bool = False) -> Representation:
-    """The representation that training starts with: the one asked for, or the tracks that a field starts from.
+    """Create the initial representation: the configured one, or tracks if a field starts from them.
 
     Args:
-        start: What training starts from.
+        start: Initial state of training.
         config: The run's configuration.
-        still: Whether nothing moves.
+        still: True if nothing moves.
     """
     if still:
         return static.StillRepresentation(start)
@@ -42,7 +42,7 @@ def make(start: initialize.Start, config: Config, still: bool = False) -> Repres
 def leave_tracks(
     motion: Representation, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
 ) -> Representation:
-    """The field that goes on from trained tracks, see `field.from_tracks`."""
+    """Return the field that continues from trained tracks, see `field.from_tracks`."""
     from . import field
     from .tracks import TracksRepresentation
 
@@ -51,19 +51,19 @@ def leave_tracks(
 
 
 def for_state(motion: Representation, name: str, first: int, config: Config) -> Representation:
-    """The representation that goes on from a checkpoint of the representation ``name``.
+    """Return the representation that continues from a checkpoint of the representation ``name``.
 
     Args:
-        motion: The one that the run starts with.
-        name: That of the checkpoint.
+        motion: The run's initial representation.
+        name: Representation of the checkpoint.
         first: Knot at which the Gaussians of a field are canonical.
         config: The run's configuration.
 
     Returns:
-        ``motion``, or a field if the checkpoint is of a run that has left its tracks for one.
+        ``motion``, or a field if the run of the checkpoint has already switched from tracks to a field.
 
     Raises:
-        CheckpointError: The configuration asks for another representation than the checkpoint has.
+        CheckpointError: The checkpoint has another representation than the configuration.
     """
     if config.train.representation == name == FIELD and motion.name == TRACKS:
         from . import field
@@ -86,19 +86,19 @@ def observed_motion(
     labels: np.ndarray,
     config: Config,
 ) -> ObservedMotion:
-    """`Representation.observed_motion` of the representation ``name``.
+    """Call `Representation.observed_motion` of the representation ``name``.
 
     Raises:
-        CheckpointError: This version has no such representation.
+        CheckpointError: This version does not have the representation.
     """
     return _class_of(name).observed_motion(tensors, object_ids, observed, labels, config)
 
 
 def group_classes(name: str, tensors: dict[str, Tensor]) -> np.ndarray:
-    """`Representation.group_classes` of the representation ``name``. [G]
+    """Call `Representation.group_classes` of the representation ``name``. [G]
 
     Raises:
-        CheckpointError: This version has no such representation.
+        CheckpointError: This version does not have the representation.
     """
     return _class_of(name).group_classes(tensors)
 

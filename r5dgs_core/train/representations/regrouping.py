@@ -1,12 +1,12 @@
-"""Which motion group each moving Gaussian belongs to: the one that it was made for, or one that explains it better.
+"""Regrouping: moving Gaussians join the motion group that explains their observed motion best.
 
-The label that says what a Gaussian shows is not the label that says how it moves: a Gaussian at the edge of an object,
-in its halo or in its shadow may show one thing and go with another. This is the rule of the second label. It needs no
-image: it compares where a Gaussian was at the observed times with where each group would have brought it.
+The object label of a Gaussian need not be its motion group: at the edge of an object, in its halo or in its shadow, a
+Gaussian may show one object and move with another. Regrouping needs no images: it compares the positions of a Gaussian
+at the observed times with those predicted by each group.
 
-Notation: R moving Gaussians with centres x_s at the knots s, last knot T; G groups, 0 the pinned one. A group g takes
-x_T to c_g + R_gs (x_T - c_g) + d_gs; the error of a Gaussian in it is the mean over the knots of the distance to x_s.
-All thresholds are shares of a group's radius, the distance from its centre that holds nine of ten of its voters.
+Notation: R moving Gaussians with centres x_s at the knots s, last knot T; G groups, 0 the pinned one. A group g moves
+x_T to c_g + R_gs (x_T - c_g) + d_gs; the error of a Gaussian in it is the mean distance to x_s over the knots. All
+thresholds are shares of a group's radius, the 90 % quantile of its voters' distances from its centre.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from ..observed_motion import GroupTrack, Moves
 
 log = logging.getLogger(__name__)
 
-BETTER = 0.5  # a Gaussian changes its group where another has less than this share of its error,
-NOTICED = 0.08  # its own error is more than this share of the radius,
-EXPLAINED = 0.3  # the other one is less than this share,
-NEAR = 1.5  # and it lies no further from the other group's members than this share
-FLOATING = 2.0  # of the distance that holds nine of ten members: what lies further off has no say
-ROUNDS = 8  # groups are fitted again to their new members, and asked again, until none moves
-REACH = 4.0  # how far beside its caster, along the plane, a shadow may lie
-STEEPEST = 4.0  # of a shadow's way over its caster's rise: light from 14 degrees above the plane
-FEWEST = 5  # Gaussians that make a shadow
-AT_ONCE = 8192  # Gaussians that are compared with the groups at once; bounds memory
+BETTER = 0.5  # largest error in the new group / error in the current group
+NOTICED = 0.08  # smallest error in the current group, radii
+EXPLAINED = 0.3  # largest error in the new group, radii
+NEAR = 1.5  # largest distance from the members of the new group, radii
+FLOATING = 2.0  # distance above which a member is a floater / 90 % quantile of the distances
+ROUNDS = 8  # largest number of rounds of regrouping and refitting
+REACH = 4.0  # largest distance of a shadow from its caster along the plane, radii
+STEEPEST = 4.0  # largest shift of a shadow / rise of its caster: light from 14 degrees above the plane
+FEWEST = 5  # smallest number of Gaussians in a shadow
+AT_ONCE = 8192  # Gaussians per block; bounds memory
 
 
 def tidy(
@@ -43,17 +43,17 @@ def tidy(
     fit: Callable[[np.ndarray], list[GroupTrack]],
     made_for: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[GroupTrack], Moves]:
-    """Bring Gaussians to the groups that explain their motion, and fit the groups to them.
+    """Regroup Gaussians and refit the groups until no Gaussian changes its group.
 
     Args:
         path: Centres at the knots. [R, S, 3]
         ids: Their groups. [R]
         opacities: [R]
-        fit: The groups for given ids, with poses relative to the last knot.
-        made_for: Groups that they were made for, where those are others: what is counted. [R]
+        fit: Fits the groups to given ids, with poses relative to the last knot.
+        made_for: Original groups for the counts, if they are not ``ids``. [R]
 
     Returns:
-        Groups of the Gaussians [R], the groups fitted to them, and what was moved.
+        Groups of the Gaussians [R], the groups fitted to them, and the counts of changes.
     """
     start, groups = ids if made_for is None else made_for, fit(ids)
     for _ in range(ROUNDS):
@@ -71,9 +71,9 @@ def tidy(
 
 
 def voters(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """Weights of members in their group's motion: their opacities, without those that float apart. [n]
+    """Return the weights of members in the fit of their group: their opacities, or 0 for floaters. [n]
 
-    Faint members have little say by their weight; to leave them out makes tracks worse (measured against true poses).
+    Faint members are not excluded: without them, tracks are less accurate (measured against true poses).
 
     Args:
         points: Centres at the last knot. [n, 3]
@@ -88,7 +88,7 @@ def voters(points: np.ndarray, opacities: np.ndarray) -> np.ndarray:
 
 
 def radii(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Sequence[GroupTrack]) -> np.ndarray:
-    """Distance from each group's centre that holds nine of ten of its voters, 0 without members. [G]
+    """Return the radius of each group: the 90 % quantile of its voters' distances, 0 without members. [G]
 
     Args:
         points: Centres at the last knot. [R, 3]
@@ -105,11 +105,11 @@ def radii(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
 
 
 def errors(path: np.ndarray, rows: np.ndarray, group: GroupTrack) -> np.ndarray:
-    """Error of some Gaussians in one group. [n]
+    """Return the error of some Gaussians in one group. [n]
 
     Args:
         path: Centres at the knots. [R, S, 3]
-        rows: Which of them. [n]
+        rows: Rows of the Gaussians. [n]
         group: The group, with poses relative to the last knot.
     """
     rotmats, result = rotations.quats_to_rotmats(group.quats), np.zeros(len(rows))
@@ -124,7 +124,7 @@ def errors(path: np.ndarray, rows: np.ndarray, group: GroupTrack) -> np.ndarray:
 
 
 def regroup(path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Sequence[GroupTrack]) -> np.ndarray:
-    """The group of each Gaussian after those that another group explains better went there.
+    """Return the group of each Gaussian after one round of regrouping.
 
     Args:
         path: Centres at the knots. [R, S, 3]
@@ -135,9 +135,9 @@ def regroup(path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
     Returns:
         Groups. [R] int64
 
-    Source: the rule is that of our study of a prototype on one scene, with lengths restated as shares of a radius. On
-        ten fields of five scenes each threshold but `NEAR` may be halved or doubled at less than 0.1 dB; to ask only
-        at a sixth of this `NEAR` loses up to 0.9 dB.
+    Source: the rule of our study of a prototype on one scene, with lengths as shares of a radius. On ten fields of five
+        scenes, halving or doubling any threshold but `NEAR` changes less than 0.1 dB; a sixth of this `NEAR` loses up
+        to 0.9 dB.
     """
     sizes = radii(path[:, -1], ids, opacities, groups)
     own = np.zeros(len(path))
@@ -147,7 +147,7 @@ def regroup(path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
     best, chosen = np.full(len(path), np.inf), ids.astype(np.int64)
     for g, (group, size) in enumerate(zip(groups, sizes, strict=True)):
         rows = np.flatnonzero((ids != g) & (own > 0))
-        # What rests is measured by what it came from: the pinned group has no size.
+        # The pinned group has no radius, so that of the current group is used.
         scale = sizes[ids[rows]] if g == 0 else np.full(len(rows), size)
         rows, scale = rows[scale > 0], scale[scale > 0]
         noticed = own[rows] > NOTICED * scale
@@ -165,11 +165,11 @@ def regroup(path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Se
 def imitators(
     path: np.ndarray, ids: np.ndarray, opacities: np.ndarray, groups: Sequence[GroupTrack], normal: np.ndarray
 ) -> np.ndarray:
-    """Bodies whose shadow Gaussians of the background imitate: they move along a plane as the body above it does.
+    """Return the caster of background Gaussians that imitate a shadow: they move along a plane below a moving body.
 
     Args:
         path: Centres at the knots. [R, S, 3]
-        ids: Their groups; those in group 0 are asked. [R]
+        ids: Their groups; only those in group 0 are tested. [R]
         opacities: [R]
         groups: The groups, with poses relative to the last knot.
         normal: Unit normal of the plane. [3]
@@ -206,14 +206,14 @@ def imitators(
 def _alone(
     path: np.ndarray, rows: np.ndarray, leader: np.ndarray, plane: np.ndarray, normal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each Gaussian would be as a shadow of its own light: way along the plane per rise [n, 3], and error [n].
+    """Fit each Gaussian as a shadow with its own light: shift along the plane per rise [n, 3], and error [n].
 
     Args:
         path: Centres at the knots. [R, S, 3]
-        rows: Which of them. [n]
+        rows: Rows of the Gaussians. [n]
         leader: Displacements of the caster. [S, 3]
         plane: Projection onto the plane. [3, 3]
-        normal: Of the plane. [3]
+        normal: Normal of the plane. [3]
     """
     slopes, found = np.zeros((len(rows), 3)), np.zeros(len(rows))
     along, rise = leader @ plane, leader @ normal
@@ -227,13 +227,13 @@ def _alone(
 
 
 def _voting(points: np.ndarray, ids: np.ndarray, opacities: np.ndarray, group: int) -> np.ndarray:
-    """Rows of the members of a group that say where it is: those that can be seen and do not float apart."""
+    """Rows of the members that define a group's place: visible, and not floaters."""
     rows = np.flatnonzero(ids == group)
     return rows[(voters(points[rows], opacities[rows]) > 0) & visibility.seen(opacities[rows])]
 
 
 def _distances(points: np.ndarray, members: np.ndarray, limit: float) -> np.ndarray:
-    """Distance of points from the nearest member, infinite beyond a limit. [n]"""
+    """Return the distance of points from the nearest member, infinite beyond a limit. [n]"""
     if len(points) == 0 or len(members) == 0:
         return np.full(len(points), np.inf)
     return spatial.KDTree(members).query(points, distance_upper_bound=np.nextafter(limit, np.inf))[0]

@@ -1,8 +1,8 @@
-"""How Gaussians move in the observed time: the border that every representation keeps.
+"""Interface of motion representations, which move the Gaussians in the observed time.
 
-The trainer knows only `Representation`: splats at a time, what to optimise, a penalty, upkeep, and named tensors for
-the checkpoint. `tracks` moves Gaussians by one SE(3) track per object, `field` by a deformation field, `still` not at
-all. `registry` makes them by name.
+The trainer uses only `Representation`: splats at a time, parameters, a penalty, maintenance after each step, and named
+tensors for the checkpoint. `tracks` moves Gaussians by one SE(3) track per object, `field` by a deformation field, and
+`still` not at all. `registry` creates them by name.
 """
 
 from __future__ import annotations
@@ -24,77 +24,80 @@ TRACKS, FIELD, STILL = "tracks", "field", "still"
 
 
 class Representation(Protocol):
-    """The observed motion of N Gaussians, in training coordinates.
+    """Observed motion of N Gaussians, in training coordinates.
 
     Attributes:
-        name: Its name in the configuration.
+        name: Name in checkpoints: "tracks", "field" or "still".
     """
 
     name: str
 
     @property
     def params(self) -> dict[str, Tensor]:
-        """What the optimizer moves, by the names of the learning rates."""
+        """Parameters for the optimizer; the name before the first dot selects the learning rate."""
         ...
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """What is done once, before the first step."""
+        """Prepare before the first step."""
         ...
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
     ) -> fused_posing.Splats:
-        """Activated Gaussians in the world at a time, coloured as a camera sees them; differentiable.
+        """Return activated Gaussians at a time, with colours as seen by a camera; differentiable.
 
         Args:
             gaussians: The canonical Gaussians.
             camera: The camera, normalised coordinates.
             t: Scene time.
-            draw: Source of a training step's draws; None where a picture is wanted.
+            draw: Random generator of a training step; None to render an image.
+
+        Returns:
+            Splats in training coordinates.
         """
         ...
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """What is added to the loss of the step whose `splats` were asked for last, or None.
+        """Return a term for the loss of the current step (the last call of `splats`), or None.
 
         Args:
             gaussians: The canonical Gaussians.
             iteration: The step.
-            labels: Gives the class of each Gaussian. [N]
+            labels: Returns the class of each Gaussian. [N]
         """
         ...
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """An observed time joins the training: ``knot`` from its neighbours in direction ``towards`` (+1 or -1)."""
+        """Initialise ``knot`` from its neighbours in direction ``towards`` (+1 or -1), as it enters training."""
         ...
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Upkeep after ``iteration`` steps; ``draw`` is the training's source of draws."""
+        """Maintain the state after ``iteration`` steps; ``draw`` is the random generator of the training."""
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything that must be stored, by name."""
+        """Return the complete state, by name."""
         ...
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `tensors`."""
+        """Restore the state from `tensors`."""
         ...
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
-        """Class that a group's Gaussians have where no mask says otherwise, out of a checkpoint's `tensors`. [G]"""
+        """Return the default class of each group's Gaussians without masks, from a checkpoint's `tensors`. [G]"""
         ...
 
     @staticmethod
     def observed_motion(
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
-        """Motion groups out of a checkpoint's `tensors`.
+        """Return the motion groups from a checkpoint's `tensors`.
 
         Args:
-            tensors: By name, as stored, those of the Gaussians too.
+            tensors: Stored tensors by name, including those of the Gaussians.
             object_ids: Object id of each class, 0 first. [B]
-            observed: Knots at which each object was placed by its masks. [B - 1, S] bool
+            observed: Knots at which each object was located by its masks. [B - 1, S] bool
             labels: Class of each Gaussian. [N]
             config: The run's configuration.
         """

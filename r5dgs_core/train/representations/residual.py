@@ -1,4 +1,4 @@
-"""Residuals of flexible bodies: their tensors in a checkpoint, lighting, baking, and their row of the needs table."""
+"""Residual motion of non-rigid bodies: checkpoint tensors, shading, baking, and the row of the needs table."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ GAINS = checkpoint_content.RESIDUAL_GAINS
 
 
 def tensors_of(field: ResidualField) -> dict[str, Tensor]:
-    """A field as named tensors of a checkpoint."""
+    """Return a field as named tensors of a checkpoint."""
     named = {"nodes": field.nodes, "owners": field.owners, "values": field.values.detach()}
     return {f"{PREFIX}{name}": tensor for name, tensor in named.items()}
 
 
 def residual_of(tensors: Mapping[str, Tensor]) -> ResidualField | None:
-    """The field in a checkpoint's named tensors, None where all bodies are rigid."""
+    """Return the field in a checkpoint's tensors; None if all bodies are rigid."""
     if f"{PREFIX}values" not in tensors:
         return None
     nodes, owners, values = (tensors[f"{PREFIX}{name}"].clone() for name in ("nodes", "owners", "values"))
@@ -37,10 +37,10 @@ def residual_of(tensors: Mapping[str, Tensor]) -> ResidualField | None:
 def relight(
     change: Change, colors: Tensor, shading: Tensor, light: Tensor, rotmats: Tensor, groups: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours and shading vectors in which what turns on its own is lit by its own rotation.
+    """Shade the members of non-rigid bodies by their own rotations.
 
     Args:
-        change: The members of flexible bodies and how they turn.
+        change: The members and their rotations.
         colors: Colours of all Gaussians, before the shading. [N, 3]
         shading: The vectors g. [N, 3]
         light: The vector l. [3]
@@ -48,7 +48,7 @@ def relight(
         groups: Group of each member. [n]
 
     Returns:
-        Colours with the members' shading in them [N, 3], and vectors that are zero for the members [N, 3].
+        Colours that include the members' shading [N, 3], and shading vectors that are zero for the members [N, 3].
     """
     seen = rotations.rotate(rotations.conjugate(change.quats), (light @ rotmats)[groups])  # l from the member's frame
     factor = (1 + (shading[change.rows] * (seen - light)).sum(1, keepdim=True)).clamp(min=0)
@@ -60,15 +60,15 @@ def relight(
 def point_motion(
     field: ResidualField, tracks: Tracks, tensors: Mapping[str, Tensor]
 ) -> tuple[PointMotion, dict[str, np.ndarray]]:
-    """States of the members of flexible bodies at the knots, and the Gaussians that all tracks start from.
+    """Return the states of the members of non-rigid bodies at the knots, and the Gaussians that all tracks start from.
 
     Args:
-        field: Their residuals.
+        field: The residual field.
         tracks: Tracks of the bodies.
-        tensors: The checkpoint's, with all Gaussians.
+        tensors: Tensors of the checkpoint, with all Gaussians.
 
     Returns:
-        States at the knots in training coordinates; and parameters by name in which members have their shape of the
+        States at the knots in training coordinates; and parameters by name, in which members have their shape at the
         last knot, moved back to the canonical state.
     """
     names = ("means", "quats", "log_scales", "sh", "sh_rest", "shading")
@@ -107,13 +107,15 @@ def point_motion(
 def need(
     tensors: Mapping[str, Tensor], names: Mapping[int, str], config: Config, there: bool
 ) -> tuple[float, float, bool, str]:
-    """What the needs table says of residuals: largest gain, threshold, whether there are any, and the reason.
+    """Return value, threshold, decision and reason for the row "residuals" of the needs table.
+
+    The value is the largest gain, dB.
 
     Args:
-        tensors: The checkpoint's.
+        tensors: Tensors of the checkpoint.
         names: Names of the objects by id.
         config: The run's configuration.
-        there: Whether the scene has residuals.
+        there: True if the scene has residuals.
     """
     threshold, field = config.residual.threshold, residual_of(tensors)
     if GAINS not in tensors:

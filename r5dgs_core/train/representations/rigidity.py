@@ -1,6 +1,6 @@
 """Rigidity of objects under a deformation: L_rigid of the paper, and the distance from a group's best rigid motion.
 
-Notation: N Gaussians, C classes, class 0 the background; -1 stands for none.
+Notation: N Gaussians, C classes, class 0 the background; -1 for none.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from torch import Tensor
 from ...motion import rotations
 from ...playback.visibility import SEEN_OPACITY
 
-QUAT_WEIGHT = 0.05  # of a squared difference of quaternions beside a squared distance in normalised units
-SOFTENING = 1e-6  # length that keeps the slope of a distance finite at 0
+QUAT_WEIGHT = 0.05  # weight of squared quaternion differences relative to squared distances in normalised units
+SOFTENING = 1e-6  # length that keeps the gradient of a distance finite at 0
 
 
 def representatives(means: Tensor, labels: Tensor, opacities: Tensor) -> Tensor:
-    """The member nearest to the centroid of each object.
+    """Return the member nearest to the centroid of each object.
 
-    Only members of opacity over 0.3 stand for election and count for the centroid, or all where an object has none. Of
-    members at the same distance the first one is taken.
+    Only members with an opacity above 0.3 are candidates and count for the centroid, or all members if an object has
+    none. Ties go to the first member.
 
     Args:
         means: Canonical centres. [N, 3]
@@ -57,17 +57,17 @@ def anchors(means: Tensor, labels: Tensor, opacities: Tensor) -> Tensor:
 
 
 def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor) -> Tensor:
-    """Mean change of the members' distances to the representative of their object: L_rigid.
+    """Return the mean change of the members' distances to the representative of their object, L_rigid.
 
     Args:
         before: Canonical centres; no gradient reaches them. [N, 3]
         after: Centres at another time. [N, 3]
-        anchor_rows: Row of the representative of each Gaussian, -1 for none; representatives themselves and Gaussians
-            without one do not count. [N] int64
+        anchor_rows: Row of the representative of each Gaussian, -1 for none; representatives and Gaussians without one
+            do not count. [N] int64
 
     Returns:
-        The mean absolute change, a scalar in the unit of the centres; 0 where nobody counts. Rigid motions of each
-        object cost nothing. Its slope is finite everywhere, also where a member lies on its representative.
+        The mean absolute change, a scalar in the unit of the centres; 0 if no Gaussian counts. Rigid motions of each
+        object cost nothing. Its gradient is finite everywhere, even if a member coincides with its representative.
 
     Source: R5DGS (Gridusov, Popov, Kolyubin), Eq. 8; "before" is the canonical state, which the paper leaves open.
     """
@@ -81,14 +81,14 @@ def rigidity(before: Tensor, after: Tensor, anchor_rows: Tensor) -> Tensor:
 
 
 def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, groups: Tensor) -> Tensor:
-    """Mean squared distance from the best rigid motion of each group, and difference from its rotation and size.
+    """Return the mean squared deviation of positions, rotations and sizes from the best rigid motion of each group.
 
     Args:
         before: Canonical centres. [R, 3]
         after: Centres at another time. [R, 3]
         quats: Rotations since then, unit wxyz. [R, 4]
         log_scales: Change of the log scales. [R, 3]
-        groups: Motion groups; those of group 0, and of groups of fewer than four, do not count. [R] int64
+        groups: Motion groups; group 0 and groups of fewer than four do not count. [R] int64
     """
     with torch.no_grad():
         turn, shift, known = rigid_fits(before, after, groups)
@@ -101,15 +101,16 @@ def stiffness(before: Tensor, after: Tensor, quats: Tensor, log_scales: Tensor, 
 
 
 def rigid_fits(before: Tensor, after: Tensor, groups: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Least-squares rigid motion of each group of points (Kabsch).
+    """Fit the least-squares rigid motion of each group of points (Kabsch).
 
     Args:
         before: Points. [R, 3]
-        after: Where they went. [R, 3]
+        after: The points after the motion. [R, 3]
         groups: Group of each. [R]
 
     Returns:
-        Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and whether a group has points enough. [G]
+        Rotations, unit wxyz [G, 4], shifts [G, 3] of x -> q x q* + shift, and a mask of the groups with enough points.
+        [G]
     """
     count = int(groups.max()) + 1 if len(groups) else 0
     n = torch.bincount(groups, minlength=count).to(before.dtype)

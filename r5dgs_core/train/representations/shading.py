@@ -1,9 +1,9 @@
-"""Colours of bodies that turn in fixed light, taken over from one state of a body to another.
+"""Shading of bodies that turn in fixed light, and its transfer from one state of a body to another.
 
-With shading vectors g, light l and a factor r at rest the colour is c max(0, r + (R^T l - l) . g) for a rotation R
-since the first state; training has r = 1. Seen from a state that is turned by Q, with b = r + (Q^T l - l) . g, the
-same colours are those of c b, Q g / b and 1. Where b is small or below 0, as on what turns away from the light, they
-are those of c s, Q g / s and b / s with a small s: dark now, and lit as it was trained when it turns back.
+With shading vectors g, light l and a factor r at rest, the colour is c max(0, r + (R^T l - l) . g) for a rotation R
+since the first state; training has r = 1. From a state turned by Q, with b = r + (Q^T l - l) . g, the same colours are
+given by c b, Q g / b and 1. If b is small or negative, as on surfaces that face away from the light, they are given by
+c s, Q g / s and b / s with a small s: dark now, but lit as in training after turning back.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ MIN_FACTOR = 0.1  # the s above
 def rebind(
     sh: np.ndarray, shading: np.ndarray, rest: np.ndarray, quats: np.ndarray, light: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colours, shading vectors and factors at rest as seen from a turned state; no colour changes by it.
+    """Return colours, shading vectors and factors at rest for a turned state; all rendered colours stay the same.
 
     Args:
-        sh: Harmonics, in the frame of the new state already (`sh_color.rotate`). [N, K, 3]
+        sh: Harmonics, already in the frame of the new state (`sh_color.rotate`). [N, K, 3]
         shading: The vectors g. [N, 3]
         rest: The factors r. [N]
         quats: Rotation Q from the old state to the new one, unit wxyz, one for all or one for each. [4] or [N, 4]

@@ -1,6 +1,6 @@
-"""`still`: nothing moves, so that there are no tracks, no networks and nothing to learn but the Gaussians.
+"""Representation `still`: nothing moves, and only the Gaussians are trained.
 
-Whether that is so is seen in the images: no view changes from one time to another.
+It is chosen if no camera's image changes from one time to another.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from ..observed_motion import GroupTrack, ObservedMotion
 from ..train_views import TrainView
 from . import fused_posing
 
-BLOCK = 4  # pixels that are averaged before images are compared
-CHANGE = 3.0  # levels of 255 by which a block has to change
-NOISE = 8.0  # and standard deviations of the change that all blocks show
-NOTHING = 0.3  # levels, the least noise of 8-bit images
+BLOCK = 4  # side of the averaged blocks, px
+CHANGE = 3.0  # smallest significant change of a block, levels of 255
+NOISE = 8.0  # the same in standard deviations of the change over all blocks
+NOTHING = 0.3  # lower limit of the noise of 8-bit images, levels of 255
 
 
 class StillRepresentation:
     """Gaussians that never move.
 
     Args:
-        start: What training starts from.
+        start: Initial state of training.
     """
 
     name = "still"
@@ -44,12 +44,12 @@ class StillRepresentation:
         self.time = float(start.tracks.times[-1])
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
     ) -> fused_posing.Splats:
-        """See `representation.Representation.splats`; the same at all times."""
+        """See `representation.Representation.splats`; the result is the same at all times."""
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
             colors = sh_color.dc_to_rgb(params["sh"][:, 0])
@@ -70,21 +70,21 @@ class StillRepresentation:
         )
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Nothing."""
+        """Return None."""
         return None
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """Nothing: there is one knot."""
+        """Do nothing: there is only one knot."""
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Centres of the objects, and the last observed time."""
+        """Return the centres of the objects and the last observed time."""
         return {"still.centers": self.centers, "still.time": torch.tensor(self.time, dtype=torch.float64)}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `tensors`."""
+        """Restore the state from `tensors`."""
         self.centers, self.time = tensors["still.centers"], float(tensors["still.time"])
 
     @staticmethod
@@ -96,7 +96,7 @@ class StillRepresentation:
     def observed_motion(
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
-        """See `representation.Representation.observed_motion`: one knot, at which every group is where it is."""
+        """See `representation.Representation.observed_motion`: one knot, at which every group is at rest."""
         centers = tensors["still.centers"].numpy().astype(np.float64)
         rest, nowhere = rotations.identity(1), np.zeros((1, 3))
         groups = [GroupTrack(0, "pinned", centers[0], rest, nowhere, np.ones(1, bool))]
@@ -107,14 +107,14 @@ class StillRepresentation:
 
 
 def applies(views: Sequence[TrainView], config: Config) -> bool:
-    """Whether a run needs no motion: the user says so (``needs.tracks``), or nothing moves in the training views."""
+    """True if a run needs no motion: by the user's ``needs.tracks``, or because nothing moves in the training views."""
     return config.needs.tracks == "off" or (config.needs.tracks == "auto" and nothing_moves(views))
 
 
 def nothing_moves(views: Sequence[TrainView]) -> bool:
-    """Whether all images show one time, or each camera shows the same at all of its times.
+    """True if all images show one time, or no camera's image changes over time.
 
-    A camera that shows one time alone, as one that moves, leaves it open: then the answer is no.
+    False if a camera (such as a moving one) shows only one time, as its changes cannot be compared.
     """
     if len({view.t for view in views}) <= 1:
         return True
@@ -131,14 +131,14 @@ def nothing_moves(views: Sequence[TrainView]) -> bool:
 
 
 def _changes(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two images of one camera, as blocks, differ by more than noise in a block."""
+    """True if two images of one camera, as blocks, differ by more than noise in at least one block."""
     difference = np.abs(first - second)
     noise = max(1.4826 * float(np.median(difference)), NOTHING)
     return bool((difference > max(CHANGE, NOISE * noise)).any())
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    """Means of blocks, those at the right and lower border left out where they are not whole. [H, W, 3]"""
+    """Means of blocks; incomplete blocks at the right and lower border are left out. [H, W, 3]"""
     height, width = (max(1, size // BLOCK) for size in image.shape[:2])
     tall, wide = (min(BLOCK, size) for size in image.shape[:2])
     whole = image[: height * tall, : width * wide].astype(np.float32)

@@ -1,4 +1,4 @@
-"""`tracks`: Gaussians move by one SE(3) track per object, with turning shading and shadows that follow."""
+"""Representation `tracks`: one SE(3) track per object, with shading and shadows that follow the motion."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from ..observed_motion import GroupTrack, ObservedMotion
 from ..train_views import nearest_knot
 from . import fused_posing, residual
 
-ROUGHNESS_EVERY = 4  # the roughness of the tracks is added every so many steps, with so many times the weight
-REBASE_EVERY = 100
+ROUGHNESS_EVERY = 4  # steps between evaluations of the roughness; its weight is multiplied by this
+REBASE_EVERY = 100  # steps
 
 
 class TracksRepresentation:
     """One SE(3) track per object, with shading that turns in fixed light and shadows that follow their caster.
 
     Args:
-        start: What training starts from: its tracks, and where the masks put the objects, for knots that enter.
+        start: Initial state of training: tracks, positions of the objects for knots that enter, and evidence.
         config: The run's configuration.
     """
 
@@ -47,17 +47,17 @@ class TracksRepresentation:
         )
         self._entered = (start.first_time, start.first_time)
         self.residuals: ResidualField | None = None
-        self._gains: Tensor | None = None  # of the residuals by body, once they were tried
+        self._gains: Tensor | None = None  # gain of the residuals per body, dB, after the trial
         self._config = config
 
     @property
     def params(self) -> dict[str, Tensor]:
-        """Tracks, light direction, and residuals where bodies have any."""
+        """Tracks, light direction, and residuals of non-rigid bodies if there are any."""
         residuals = {} if self.residuals is None else {"residual": self.residuals.values}
         return {**self.tracks.params, "light": self.light, **residuals}
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """Nothing: the tracks start where the masks put them."""
+        """Do nothing: the tracks are initialised from the masks."""
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -69,7 +69,7 @@ class TracksRepresentation:
         if params["sh_rest"].shape[1] == 0:
             colors = sh_color.dc_to_rgb(params["sh"][:, 0])
         else:
-            # The harmonics live in each group's own frame, so the eye is taken back into it.
+            # The harmonics are defined in each group's own frame, so the camera is transformed into it.
             with torch.no_grad():
                 arm = centers + poses.displacements - torch.from_numpy(camera.center).float()
                 eyes = centers - (poses.rotmats.transpose(1, 2) @ arm[..., None])[..., 0]
@@ -110,7 +110,7 @@ class TracksRepresentation:
         return dataclasses.replace(splats, opacities=splats.opacities * there[gaussians.motion_ids])
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Roughness of the tracks, most where little is seen; now and then, with the weight of the steps in between."""
+        """Return the roughness of the tracks and the penalty of residuals, every `ROUGHNESS_EVERY` steps."""
         weight, section = self._config.losses.roughness, self._config.residual
         if iteration % ROUGHNESS_EVERY or (weight <= 0 and self.residuals is None):
             return None
@@ -121,9 +121,9 @@ class TracksRepresentation:
 
     @torch.no_grad()
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """Start a knot's poses: rotations go on steadily, displacements along the path that the masks tell.
+        """Initialise a knot's poses: rotations are extrapolated linearly, displacements follow the path of the masks.
 
-        Beyond the last mask of an object its displacement goes on steadily too: the images may show it all the same.
+        Beyond the last mask of an object, its displacement is extrapolated linearly, too, as images may still show it.
         """
         self.tracks.rebase()
         self._entered = (min(entered[0], knot), max(entered[1], knot))
@@ -149,12 +149,12 @@ class TracksRepresentation:
                 shifts[row, knot] = shifts[row, near] + torch.from_numpy(path[knot] - path[near]).float()
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Fold learned rotations into the base."""
+        """Fold learned rotations into the base rotations every `REBASE_EVERY` steps."""
         if iteration % REBASE_EVERY == 0:
             self.tracks.rebase()
 
     def tensors(self) -> dict[str, Tensor]:
-        """Tracks by ``tracks.NAME`` and the light direction."""
+        """Return the tracks by ``tracks.NAME``, the light direction, and the residuals if there are any."""
         named = track_state.tensors_of(self.tracks)
         named["tracks.entered"] = torch.tensor(self._entered)
         named["light"] = self.light.detach()
@@ -163,7 +163,7 @@ class TracksRepresentation:
         return named if self.residuals is None else named | residual.tensors_of(self.residuals)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `tensors`."""
+        """Restore the state from `tensors`."""
         self.tracks = track_state.tracks_of(tensors)
         first, last = tensors.get("tracks.entered", torch.tensor([0, len(self.tracks.times) - 1])).tolist()
         self._entered = (first, last)
@@ -173,7 +173,7 @@ class TracksRepresentation:
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
-        """See `Representation.group_classes`: a body's object; a shadow's Gaussians are background."""
+        """See `Representation.group_classes`: the object of each body; background for shadows."""
         bodies, shadows = len(tensors["tracks.centers"]), len(tensors["tracks.casters"])
         return np.concatenate([np.arange(bodies), np.zeros(shadows, np.int64)])
 
@@ -221,7 +221,7 @@ class TracksRepresentation:
 
 
 def first_tracks(first: initialize.FirstTracks) -> Tracks:
-    """Tracks that start where the masks put the bodies, without rotation."""
+    """Return tracks initialised with the positions from the masks, without rotation."""
     base = torch.zeros(*first.translations.shape[:2], 4)
     base[..., 0] = 1.0
     tracks = Tracks(
