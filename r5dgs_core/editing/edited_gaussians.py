@@ -1,4 +1,4 @@
-"""The Gaussians of an edited scene: rows of the file in a new order, some of them put elsewhere."""
+"""Gaussians of an edited scene: rows of the file in a new order, some of them transformed."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ..playback import affine_transform, posing
 from ..scene.scene import Scene
 from .edited_motion import Cluster
 
-TOLERANCE = 1e-5  # of the scene's size: what was moved by less was not moved
+TOLERANCE = 1e-5  # smallest displacement that counts, relative to the scene's extent
 
 
 def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[str, Any], bool]:
-    """What becomes of the Gaussians of the file.
+    """Collect the Gaussians of the edited scene from the file's.
 
     Args:
-        scene: The scene that was edited.
-        clusters: What is left of it.
+        scene: The original scene.
+        clusters: Remaining Gaussians by motion group.
 
     Returns:
-        Rows of the file in the new order, the arrays of the new scene, and whether all stayed where they were.
+        Rows of the file in the new order, the arrays of the new scene, and True if all Gaussians stayed in place.
     """
     ordered = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
     ordered.sort(key=lambda entry: entry[:3])
@@ -72,7 +72,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 
 def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
-    """How far a map moves Gaussians, at most, turning and scaling counted at their size."""
+    """Upper bound of the displacement of Gaussians under a map, including rotation and scaling of their extent."""
     linear = bind[:3, :3] - np.eye(3)
     means = scene.means[rows].astype(np.float64)
     size = float(np.exp(scene.log_scales[rows].max()))
@@ -81,12 +81,12 @@ def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
 
 
 def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> dict[str, np.ndarray]:
-    """Return the arrays of rows that an affine map of the bind state carries.
+    """Arrays of rows transformed by an affine map of the bind state.
 
     Args:
         scene: The scene.
         rows: The rows. [n]
-        bind: The map; None leaves the arrays as they are. [4, 4]
+        bind: The map, or None to keep the arrays unchanged. [4, 4]
 
     Returns:
         ``means quats log_scales sh``, and ``shading shading_rest`` if the scene has shading. [n, ...] each
@@ -108,7 +108,7 @@ def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> d
 
 
 def _residuals(scene: Scene, rows: slice, shift: int, linear: np.ndarray | None) -> tuple[np.ndarray, ...]:
-    """Residuals of rows of the file: rows in the new scene, offsets, rotations, growths; turned with the bind state."""
+    """Residuals of rows of the file, rotated with the bind state: new rows, offsets, rotations, growths."""
     if scene.residual_rows is None:
         return ()
     assert scene.residual_offsets is not None and scene.residual_quats is not None
@@ -125,7 +125,7 @@ def turned_residuals(
     quats: np.ndarray,  # [n, S, 4]
     linear: np.ndarray,  # [3, 3]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the offsets and rotations of residuals in a bind state that a linear map has carried. Shapes as given."""
+    """Offsets and rotations of residuals after a linear map of the bind state. Shapes as given."""
     turn = rotations.rotmats_to_quats(affine_transform.nearest_rotation(linear))
     turned = rotations.multiply(rotations.multiply(turn, quats.astype(np.float64)), rotations.conjugate(turn))
     return offsets @ linear.T, turned

@@ -1,8 +1,8 @@
-"""What an edited motion group is in a scene file: its track to t_max, and the model that goes on after it.
+"""Motion groups of an edited scene: the track up to t_max and the motion model after it.
 
-Notation: M(t) is the map from the file's bind state to the file's world that Blender shows, B = M(t_max) that of the
-new bind state, and P(t) = M(t) B^-1 the motion since then. A parent that moves all of a learned motion P0 by a
-similarity X makes it P = X P0 X^-1: what the file knows is then taken from there, sharper than Blender's numbers.
+Notation: M(t) is the map from the file's bind state to the file's world as shown by Blender, B = M(t_max) the map to
+the new bind state, and P(t) = M(t) B^-1 the motion since then. A parent that transforms a whole learned motion P0 by a
+similarity X gives P = X P0 X^-1. P0 then comes from the file, which is more precise than Blender's samples.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from ..motion.models import MotionModel
 from ..playback import affine_transform, scene_player
 from ..scene.scene import MotionGroup, Scene
 
-RIGID_TOLERANCE = 1e-3  # how far the linear part of a motion may be from a rotation
+RIGID_TOLERANCE = 1e-3  # allowed deviation of the linear part of a motion from a rotation
 _LENGTHS = ("velocity", "acceleration", "center_offset", "offset_displacement")
 _ANGLES = ("angular_velocity", "angular_acceleration", "offset_rotvec")
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Gaussians of one object and one motion group as they were left.
+    """Gaussians of one object and one motion group after editing.
 
     Attributes:
-        name: For notes.
+        name: Name for messages.
         object_id: Object that they belong to.
-        motion_id: Motion group in the file that they came from.
+        motion_id: Their motion group in the file.
         start: First row in the file.
         count: Number of rows.
-        mover: What they move with: pieces of one mover and one motion group stay together.
-        matrices: From the bind state of the file to its world, at the observed times and the later ones. [T, 4, 4]
-        pivot: Point that they turn about, at t_max; None for the group's, carried. [3]
-        parent: Linear part of what moves all of their learned motion. [3, 3]
+        mover: Key of the object that moves them; pieces with equal mover and motion group stay together.
+        matrices: Maps from the bind state of the file to its world, at the observed times and later ones. [T, 4, 4]
+        pivot: Centre of rotation at t_max; None for the transformed pivot of the group. [3]
+        parent: Linear part of the parent transform of their whole learned motion, or None. [3, 3]
         model: Their motion past t_max before ``parent``, or None for the file's.
-        allowed: Difference of positions that counts as none, world units.
-        tint: Factor on their display-referred colour. [3]
+        allowed: Position tolerance, world units.
+        tint: Factor on their display-referred colour, or None. [3]
     """
 
     name: str
@@ -57,11 +57,11 @@ class Piece:
 
 @dataclass(frozen=True)
 class Motion:
-    """A rigid motion at some times, since t_max.
+    """A rigid motion relative to t_max, sampled at T times.
 
     Attributes:
         quats: Unit wxyz. [T, 4]
-        linears: The linear parts, which are rotations where the motion is rigid. [T, 3, 3]
+        linears: The linear parts, which are rotations if the motion is rigid. [T, 3, 3]
         shifts: The translations. [T, 3]
     """
 
@@ -70,24 +70,24 @@ class Motion:
     shifts: np.ndarray
 
     def moves(self, pivot: np.ndarray) -> np.ndarray:
-        """Displacements of a pivot at t_max. [3] -> [T, 3]"""
+        """Displacements of a pivot given at t_max. [3] -> [T, 3]"""
         return self.linears @ pivot + self.shifts - pivot
 
     @property
     def bent(self) -> float:
-        """How far the linear parts are from rotations: 0 for a rigid motion."""
+        """Largest deviation of the linear parts from rotations; 0 for a rigid motion."""
         return float(np.abs(self.linears - rotations.quats_to_rotmats(self.quats)).max(initial=0.0))
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Pieces that move alike: what becomes a motion group.
+    """Pieces with a common motion, which form a new motion group.
 
     Attributes:
-        pieces: Its members; none for a group that had none before.
-        source: The group of the file that they come from.
-        motion: What Blender shows.
-        id: Of the new group.
+        pieces: Its members; empty for a group that was already empty.
+        source: Their group in the file.
+        motion: Motion shown by Blender.
+        id: Id of the new group.
     """
 
     pieces: list[Piece]
@@ -97,18 +97,18 @@ class Cluster:
 
     @property
     def first(self) -> Piece:
-        """Its largest member, which speaks for all."""
+        """Largest member, which represents the cluster."""
         return max(self.pieces, key=lambda piece: piece.count)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Moved(Cluster):
-    """A cluster as the motion group that it has become.
+    """A cluster with its new motion group.
 
     Attributes:
         group: The new group.
-        poses: Of it at the observed times. [S, 7]
-        same: Whether it moves as in the file.
+        poses: Its poses at the observed times. [S, 7]
+        same: True if it moves as in the file.
     """
 
     group: MotionGroup
@@ -118,15 +118,15 @@ class Moved(Cluster):
 
 @dataclass(frozen=True)
 class _Course:
-    """How a cluster moves while it is observed.
+    """Motion of a cluster in the observed time.
 
     Attributes:
-        poses: Of the new group. [S, 7]
-        pivot: At t_max. [3]
-        parent: Linear part of what moves all of the learned motion. [3, 3]
+        poses: Poses of the new group. [S, 7]
+        pivot: Its pivot at t_max. [3]
+        parent: Linear part of the parent transform of the whole learned motion. [3, 3]
         reach: Largest distance of a member from the pivot.
-        allowed: Difference of positions that counts as none.
-        same: Whether that is as in the file.
+        allowed: Position tolerance, world units.
+        same: True if the motion is as in the file.
     """
 
     poses: np.ndarray
@@ -138,7 +138,7 @@ class _Course:
 
 
 def _since_bind(matrices: np.ndarray, bind: int) -> Motion:
-    """The motion P of maps M. [T, 4, 4] and the index of t_max"""
+    """Motion P of the maps M, given the index of t_max. [T, 4, 4]"""
     maps = matrices @ np.linalg.inv(matrices[bind])
     quats = rotations.rotmats_to_quats(affine_transform.nearest_rotation(maps[:, :3, :3]))
     quats[bind] = (1.0, 0, 0, 0)
@@ -155,16 +155,16 @@ def _turned(quats: np.ndarray, moves: np.ndarray, parent: np.ndarray) -> tuple[n
 
 
 def _turn_of(parent: np.ndarray) -> tuple[np.ndarray, float]:
-    """What axes are turned and lengths are scaled by: below 0 for a mirror, which is a turn with all axes reversed.
+    """Rotation R and signed scale s of a similarity s R; s is negative for a mirror.
 
-    Places go through the mirror, axes of rotations through the turn alone. [3, 3] -> [3, 3] and a factor
+    Positions transform by both, rotation axes by R only. [3, 3] -> [3, 3] and s
     """
     scale = float(np.cbrt(np.linalg.det(parent)))
     return affine_transform.nearest_rotation(np.sign(scale) * parent), scale
 
 
 def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
-    """The model of `_turned`, its covariance included."""
+    """Transform a motion model as `_turned` does, including its covariance."""
     if (parent == np.eye(3)).all():
         return model
     turn, scale = _turn_of(parent)
@@ -180,7 +180,7 @@ def _turned_model(model: MotionModel, parent: np.ndarray) -> MotionModel:
 
 
 def _change(names: tuple[str, ...], maps: dict[str, np.ndarray]) -> np.ndarray:
-    """The change of basis of rates by name, such as "velocity.x". [P, P]"""
+    """Change of basis for rates given by name, such as "velocity.x". [P, P]"""
     change = np.eye(len(names))
     parts = [name.partition(".") for name in names]
     for i, (field, _, axis) in enumerate(parts):
@@ -196,14 +196,14 @@ def _track(
     """Poses of a group at the knots, relative to the new bind state.
 
     Args:
-        sampled: What Blender shows, at the S knots and later.
-        pivot: Of the group, at t_max. [3]
-        known: What the file has, turned: taken where Blender shows the same. [S, 7]
+        sampled: Motion shown by Blender, at the S knots and later.
+        pivot: Pivot of the group at t_max. [3]
+        known: Transformed poses of the file, used if Blender shows the same. [S, 7]
         reach: Largest distance of a member from the pivot.
-        allowed: Difference that counts as none, world units.
+        allowed: Position tolerance, world units.
 
     Returns:
-        The poses [S, 7], and whether they are the known ones.
+        The poses [S, 7], and True if they are the known ones.
     """
     quats, moves = sampled.quats[: len(known)], sampled.moves(pivot)[: len(known)]
     if (fit_drawn_curve.pose_errors(known[:, :4], known[:, 4:], quats, moves, reach) <= allowed).all():
@@ -214,12 +214,12 @@ def _track(
 
 
 def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cluster]:
-    """Groups of the new scene in order: the pinned one, then those of the file, then what moves otherwise now.
+    """Groups of the new scene in order: the pinned one, those of the file, then those with a new motion.
 
     Args:
-        scene: The scene that was edited.
-        pieces: What is left of it.
-        notes: Gets what cannot be kept.
+        scene: The original scene.
+        pieces: Its remaining Gaussians.
+        notes: List to which losses are appended.
     """
     last = len(scene.track_times) - 1
     pinned = scene.groups[0]
@@ -244,7 +244,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
             found.append(Cluster([piece], source, motion))
     used = {cluster.source.id for cluster in found}
     members = set(np.unique(scene.motion_ids).tolist())
-    for group in scene.groups[1:]:  # those without members were there before, so they stay
+    for group in scene.groups[1:]:  # groups that were already empty are kept
         if group.id not in used and group.id not in members:
             found.append(Cluster([], group, still))
     firsts: set[int] = set()
@@ -259,7 +259,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
 
 
 def _apart(motion: Motion, other: Motion, reach: float) -> np.ndarray:
-    """How far two motions bring points apart, at most, that lie within ``reach`` of the origin. [T]"""
+    """Upper bound of the distance between two motions of points within ``reach`` of the origin. [T]"""
     turned = np.linalg.norm(motion.linears - other.linears, axis=(-2, -1))
     return np.linalg.norm(motion.shifts - other.shifts, axis=-1) + reach * turned
 
@@ -272,13 +272,13 @@ def _reach(scene: Scene, piece: Piece, point: np.ndarray) -> float:
 
 
 def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[str]) -> list[Moved]:
-    """Find track and model of every cluster.
+    """Determine track and model of every cluster.
 
     Args:
-        scene: The scene that was edited.
-        found: What `clusters` gave.
+        scene: The original scene.
+        found: Result of `clusters`.
         times: The observed times and later ones. [T]
-        notes: Gets what cannot be kept.
+        notes: List to which losses are appended.
 
     Returns:
         The clusters in the same order.
@@ -288,7 +288,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     courses = [_course(scene, cluster, known) for cluster in found]
     later = np.asarray(times[len(scene.track_times) :], np.float64) - scene.t_max
     groups: dict[int, tuple[MotionGroup, bool]] = {}
-    for follows in (False, True):  # those that follow another come last
+    for follows in (False, True):  # groups that follow another come last
         for cluster, course in zip(found, courses, strict=True):
             if cluster.id == 0 or not cluster.pieces:
                 groups[cluster.id] = replace(cluster.source, id=cluster.id), True
@@ -314,7 +314,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
 
 
 def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
-    """How a cluster moves to t_max, by the file's own poses [G, S, 7] where Blender shows those."""
+    """Motion of a cluster up to t_max, with the file's own poses [G, S, 7] if Blender shows the same."""
     source, count = cluster.source, len(scene.track_times)
     if not cluster.pieces or cluster.id == 0:
         return _Course(scene.track_poses[source.id], np.asarray(source.pivot, np.float64), np.eye(3))
@@ -334,7 +334,7 @@ def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
 
 
 def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
-    """Where the pivot is at t_max; the file's own where that is it."""
+    """Pivot at t_max, exactly the file's if it is the same within the tolerance."""
     first = cluster.first
     own = np.asarray(cluster.source.pivot, np.float64)
     bind = first.matrices[len(scene.track_times) - 1]
@@ -352,16 +352,20 @@ def _go_on(
     later: np.ndarray,
     notes: list[str],
 ) -> tuple[MotionGroup, bool]:
-    """The new group of a cluster, with the motion model that it had or was given where Blender shows that, else one
-    that is fitted; and whether it moves as in the file, to t_max and after it.
+    """Build the new group of a cluster.
+
+    It keeps the given or the file's motion model if Blender shows the same motion past t_max; else a model is fitted.
 
     Args:
-        scene: The scene that was edited.
+        scene: The original scene.
         cluster: The cluster.
-        course: How it moves while it is observed.
-        leaders: What has become of the group that its own follows: course, new group, whether it moves as before.
+        course: Its motion in the observed time.
+        leaders: New versions of the group that its own follows: course, new group, True if that moves as before.
         later: Times since t_max. [L]
-        notes: Gets what cannot be kept.
+        notes: List to which losses are appended.
+
+    Returns:
+        The group, and True if it moves as in the file, before and after t_max.
     """
     source, first = cluster.source, cluster.first
     rows = slice(len(scene.track_times), None)

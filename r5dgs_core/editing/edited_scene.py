@@ -1,7 +1,7 @@
-"""A scene as somebody has edited it: the Gaussians that are left, where they were put, and how they move now.
+"""Write edits made in Blender into a scene: remaining Gaussians, their new positions and motion.
 
-What was not touched keeps the numbers of the file, to the bit; what was, is taken from the places that were sampled at
-the observed times and after them (`edited_motion`).
+Unedited parts keep the exact numbers of the file. Edited parts come from transforms sampled at the observed times and
+after them (`edited_motion`).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ __all__ = ("Piece", "edit")
 def edit(
     scene: Scene, pieces: Sequence[Piece], times: np.ndarray, table: Mapping[int, SceneObject]
 ) -> tuple[Scene, list[str]]:
-    """Write edits into a scene.
+    """Apply edits to a scene.
 
     Args:
-        scene: The scene that was edited.
-        pieces: What is left of it, or several times in it. Rows that no piece has are deleted.
-        times: The observed times and later ones, at which ``matrices`` of the pieces are. [T]
-        table: Names, aliases, captions and colours by object id; rows are not looked at. Objects of the scene that
-            pieces have and the table lacks keep theirs.
+        scene: The original scene.
+        pieces: Its remaining Gaussians, possibly repeated. Rows in no piece are deleted.
+        times: The observed times and later ones, at which the ``matrices`` of the pieces are given. [T]
+        table: Names, aliases, captions and colours by object id; its row ranges are ignored. Objects that are missing
+            in the table keep theirs.
 
     Returns:
-        The edited scene, and what it cannot hold or holds less exactly, as sentences.
+        The edited scene, and notes on losses, as sentences.
 
     Raises:
-        ValueError: A piece leaves the scene or flattens space.
+        ValueError: A piece exceeds the scene or has a singular matrix.
     """
     notes: list[str] = []
     pieces = [piece for piece in pieces if piece.count > 0]
@@ -64,7 +64,7 @@ def edit(
 
 
 def _objects(scene: Scene, table: Mapping[int, SceneObject], object_ids: np.ndarray) -> tuple[SceneObject, ...]:
-    """The table of objects: those that have Gaussians, those that had none before, and the background."""
+    """Objects of the new scene: those with Gaussians, those that were already empty, and the background."""
     old = {item.id: item for item in scene.objects}
     empty = {item.id for item in scene.objects if item.count == 0}
     wanted = sorted({0, *empty, *np.unique(object_ids).tolist()})
@@ -91,7 +91,7 @@ def _groups(
     kept: np.ndarray,
     motion_ids: np.ndarray,
 ) -> tuple[MotionGroup, ...]:
-    """The motion groups, with objects that are left and representatives at their new rows, -1 where they are gone."""
+    """Motion groups with updated object ids and rows of representatives, -1 if a representative was deleted."""
     ids = {item.id for item in objects}
     new_ids = {cluster.source.id: cluster.id for cluster in reversed(clusters) if cluster.source.id or not cluster.id}
     groups = []
@@ -121,7 +121,7 @@ def _groups(
 def _meanings(
     scene: Scene, objects: tuple[SceneObject, ...], kept: np.ndarray, object_ids: np.ndarray
 ) -> dict[str, Any]:
-    """Rows of the classifier and of the embeddings for the new table; a new object has those of what it was made of."""
+    """Rows of the classifier and the embeddings for the new objects; a new object inherits those of its source."""
     rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
     for item in objects:
         if item.id not in rows:
@@ -141,7 +141,7 @@ def _meanings(
 
 
 def _with_representatives(scene: Scene) -> Scene:
-    """The scene with a representative for each group that has lost its own."""
+    """Choose a representative for each group that has lost its own."""
     groups = list(scene.groups)
     for number, group in enumerate(groups):
         rows = np.flatnonzero(scene.motion_ids == number)

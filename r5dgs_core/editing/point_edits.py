@@ -1,11 +1,11 @@
-"""Gaussians that were edited point by point: moved, reshaped, recoloured, deleted or repeated.
+"""Point-wise edits of Gaussians: moved, reshaped, recoloured, deleted or duplicated points.
 
-An edit names a row of the scene for each point. `extend` appends the edited points to the scene, so that whatever
-handles ranges of a scene's rows handles them, too.
+An edit names a row of the scene for each point. `extend` appends the edited points to the scene, so that code for row
+ranges of a scene handles them too.
 
-An affine map that moves most points of an edit (Blender's *Apply Transform*, *Transform Geometry*) is found by
-comparing centres and returned beside the points. Shapes, harmonics and shading then follow it, though only centres were
-given.
+An affine map that moves most points of an edit (Blender's *Apply Transform*, *Transform Geometry*) is detected by
+comparing centres and returned with the points. Shapes, harmonics and shading then follow it, although the edit contains
+only centres.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 from ..scene.scene import Scene
 from . import edited_gaussians
 
-ROUNDING = 2e-6  # of the largest coordinate: what centres may be off that a map explains
-FEWEST = 5  # points that determine an affine map and confirm it
-TRIALS = 40  # maps that are tried before none is assumed
-SAMPLE = 4096  # points that maps are tried on
-SAME = 1e-6  # relative difference of scales and opacities that counts as none
+ROUNDING = 2e-6  # largest residual of centres under a map, relative to the largest coordinate
+FEWEST = 5  # number of points that determine and confirm an affine map
+TRIALS = 40  # number of RANSAC trials
+SAMPLE = 4096  # number of points that each map is tested on
+SAME = 1e-6  # relative tolerance of scales and opacities
 _PER_POINT = (
     *("means", "quats", "log_scales", "opacity_logits", "sh", "shading"),
     *("identities", "motion_ids", "object_ids", "dynamics", "canonical_means"),
@@ -32,15 +32,15 @@ _RESIDUALS = ("residual_offsets", "residual_quats", "residual_log_scales")
 
 @dataclass(frozen=True)
 class PointEdit:
-    """Points of one cloud after an edit. Values are in the bind frame; None stands for those of the scene.
+    """Points of one cloud after an edit. Values are in the bind frame; None keeps those of the scene.
 
     Attributes:
-        rows: Row of the scene that each point is; rows may repeat. [n] integers
+        rows: Row of each point in the scene; rows may repeat. [n] integers
         means: Centres. [n, 3]
-        quats: Rotations wxyz, of any length but zero. [n, 4]
+        quats: Rotations wxyz, of any non-zero length. [n, 4]
         scales: Standard deviations. [n, 3]
-        base: Harmonics of degree 0, and opacity from 0 to 1. [n, 4]
-        sh: Harmonics of higher degree, the first K of them. [n, K, 3]
+        base: Harmonics of degree 0, and opacity in [0, 1]. [n, 4]
+        sh: The first K harmonics of higher degree. [n, K, 3]
     """
 
     rows: np.ndarray
@@ -53,7 +53,7 @@ class PointEdit:
 
 @dataclass(frozen=True)
 class Place:
-    """Rows of an extended scene that hold the points of an edit, and the map from there to their final places.
+    """Rows of an extended scene with the points of an edit, and the map to their final positions.
 
     Attributes:
         start: First row.
@@ -70,15 +70,14 @@ def extend(scene: Scene, edits: Sequence[PointEdit]) -> tuple[Scene, list[Place]
     """Append edited points to a scene.
 
     Args:
-        scene: The scene; it stays as it is.
+        scene: The scene; not modified.
         edits: The edits.
 
     Returns:
-        The scene with the edited points behind its own, and the place of each edit. Object ids of the result are not
-        sorted.
+        The scene with the edited points appended, and the place of each edit. Object ids of the result are not sorted.
 
     Raises:
-        ValueError: A row is not in the scene, or an array has the wrong length or holds values that are not finite.
+        ValueError: A row is not in the scene, or an array has the wrong shape or contains values that are not finite.
     """
     places, parts, filled = [], [], len(scene.means)
     for edit in edits:
@@ -92,9 +91,9 @@ def extend(scene: Scene, edits: Sequence[PointEdit]) -> tuple[Scene, list[Place]
 
 
 def apply(scene: Scene, edit: PointEdit) -> tuple[Scene, Place]:
-    """Return a scene of the points of one edit, and their place in it.
+    """Return a scene with the points of one edit, and their place in it.
 
-    An edit that leaves consecutive rows as they are, but for an affine map, gives the scene itself.
+    If the edit only transforms consecutive rows by an affine map, the scene itself is returned.
 
     Raises:
         ValueError: As `extend`.
@@ -108,16 +107,16 @@ def apply(scene: Scene, edit: PointEdit) -> tuple[Scene, Place]:
 
 
 def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the affine map that moves at least half of the points, exactly but for rounding in float32.
+    """Find the affine map that moves at least half of the points, exactly up to float32 rounding.
 
-    Directions in which the points have no extent are mapped like the normal of a surface.
+    Directions without extent are mapped like the normal of a surface.
 
     Args:
         before: Points. [n, 3]
         after: The same points after the map. [n, 3]
 
     Returns:
-        The map [4, 4] and the points that it moves [n] bool; None if there is no such map that can be inverted.
+        The map [4, 4] and a mask of the points that it moves [n]; None if there is no such invertible map.
     """
     if len(before) < FEWEST:
         return None
@@ -138,7 +137,7 @@ def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
         found = _explained(tried, a[some], b[some], allowed).sum()
         best, count = (tried, found) if found > count else (best, count)
     inside = _explained(best, a, b, allowed)
-    for _ in range(3):  # a map through few points is less precise than their coordinates
+    for _ in range(3):  # refine, because a map through few points is imprecise
         if inside.sum() < FEWEST:
             return None
         best = _fit(a[inside], b[inside])
@@ -150,7 +149,7 @@ def affine_between(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _fit(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The affine map that brings points closest to others in the sense of least squares. [4, 4]"""
+    """Least-squares affine map between two sets of points. [4, 4]"""
     center, target = a.mean(0), b.mean(0)
     u, singular, vt = np.linalg.svd(a - center, full_matrices=False)
     flat = singular <= 1e-5 * singular[0]
@@ -161,7 +160,7 @@ def _fit(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         axes = linear @ vt[:2].T
         normal = np.cross(axes[:, 0], axes[:, 1]) * np.linalg.det(vt)
         linear += np.outer(normal / max(np.sqrt(np.linalg.norm(normal)), 1e-30), vt[2])
-    elif flat.any():  # a line or a point does not show how it turned
+    elif flat.any():  # the rotation of a line or a point is undetermined
         linear += (vt[flat].T @ vt[flat]) if flat.all() else np.full((3, 3), np.nan)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, target - linear @ center
@@ -186,7 +185,7 @@ def _check(scene: Scene, edit: PointEdit) -> None:
 
 
 def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray, Scene | None]:
-    """The map of an edit, and its points before that map; None for those of the scene."""
+    """Map of an edit, and its points before that map, or None if they equal those of the scene."""
     part = _selected(scene, rows)
     shapes = _given_shapes(part, edit)
     looks = _given_looks(part, edit)
@@ -201,13 +200,13 @@ def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray
         changed = means is not None
     if means is not None:
         part = replace(part, means=np.ascontiguousarray(means, np.float32))
-    if shapes or changed:  # what was learned of their own motion holds for the centres that they had
+    if shapes or changed:  # own motion was learned for the old centres
         part = replace(part, dynamics=None, canonical_means=None)
     return matrix, replace(part, **shapes, **looks) if shapes or looks or changed else None
 
 
 def _given_shapes(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
-    """Rotations and log scales that differ from those of a part."""
+    """Rotations and log scales that differ from those of ``part``."""
     found = {}
     if edit.quats is not None and not (edit.quats == part.quats).all():
         length = np.linalg.norm(edit.quats, axis=-1, keepdims=True)
@@ -222,7 +221,7 @@ def _given_shapes(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
 
 
 def _given_looks(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
-    """Harmonics and opacities that differ from those of a part."""
+    """Harmonics and opacities that differ from those of ``part``."""
     found = {}
     if edit.base is not None:
         opacity = edit.base[:, 3].astype(np.float64)
@@ -244,17 +243,17 @@ def _given_looks(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
 
 
 def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, Scene | None]:
-    """Take the map of most points out of an edit of centres.
+    """Factor the map of most points out of an edit of centres.
 
-    Copies of the same rows may have a map each: the map of the first copy is taken out of all.
+    Copies of the same rows may have different maps; that of the first copy is factored out of all.
 
     Args:
-        part: The points as they are in the scene. [n]
+        part: The points as in the scene. [n]
         rows: Their rows. [n]
         means: The new centres. [n, 3]
 
     Returns:
-        The map [4, 4], and the points before it; None if the map moves all of them.
+        The map [4, 4], and the points before it; None if the map moves all points.
     """
     copies = _copy_numbers(rows)
     matrix, result, changed = np.eye(4), part, False
@@ -273,7 +272,7 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
             continue
         back = np.linalg.inv(matrix)
         still = outside[(means[outside] == part.means[outside]).all(-1)]
-        if len(still) and found is not None:  # they stayed in place, so their shapes did
+        if len(still) and found is not None:  # their shapes stay in place too
             result = _moved(result, still, back)
         new = result.means.copy()
         new[outside] = means[outside] @ back[:3, :3].T + back[:3, 3]
@@ -282,7 +281,7 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
 
 
 def _copy_numbers(rows: np.ndarray) -> np.ndarray:
-    """Return the number of earlier occurrences of each row. [n]"""
+    """Number of earlier occurrences of each row. [n]"""
     order = np.argsort(rows, kind="stable")
     ordered = rows[order]
     starts = np.flatnonzero(np.diff(ordered, prepend=-1))
@@ -292,7 +291,7 @@ def _copy_numbers(rows: np.ndarray) -> np.ndarray:
 
 
 def _moved(part: Scene, chosen: np.ndarray, matrix: np.ndarray) -> Scene:
-    """A part with some of its points carried by an affine map. chosen [k]"""
+    """Transform some points by an affine map. chosen [k]"""
     arrays = {}
     for name, values in edited_gaussians.placed(part, chosen, matrix).items():
         whole = getattr(part, name)
@@ -312,9 +311,9 @@ def _consecutive(rows: np.ndarray) -> bool:
 
 
 def _selected(scene: Scene, rows: np.ndarray) -> Scene:
-    """A scene of some rows of another, which may repeat."""
+    """Scene of the given rows of another, which may repeat."""
     names = [name for name in (*_PER_POINT, "shading_rest") if getattr(scene, name) is not None]
-    chosen = slice(rows[0], rows[0] + len(rows)) if _consecutive(rows) else rows  # a slice copies nothing
+    chosen = slice(rows[0], rows[0] + len(rows)) if _consecutive(rows) else rows  # a slice does not copy
     arrays = {name: getattr(scene, name)[chosen] for name in names}
     if scene.residual_rows is not None:
         place = np.minimum(np.searchsorted(scene.residual_rows, rows), max(len(scene.residual_rows) - 1, 0))
@@ -326,7 +325,7 @@ def _selected(scene: Scene, rows: np.ndarray) -> Scene:
 
 
 def _appended(scene: Scene, parts: Sequence[Scene]) -> Scene:
-    """A scene with the points of others behind its own."""
+    """Scene with the points of ``parts`` appended."""
     every, arrays = [scene, *parts], {}
     for name in _PER_POINT:
         columns = [getattr(one, name) for one in every]
