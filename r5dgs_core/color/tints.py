@@ -1,4 +1,4 @@
-"""Recolouring Gaussians: a factor on their display-referred colour, exact for every viewing direction."""
+"""Tints of Gaussians: a factor on their display-referred colour, exact for every viewing direction."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from ..scene import spherical_harmonics
 
 
 def tint_sh(sh: np.ndarray, tint: np.ndarray) -> np.ndarray:
-    """Harmonics whose colour is that of ``sh`` times a factor per channel, from every direction.
+    """Multiply the colour of harmonics by a factor per channel, exactly in every direction.
 
-    The colour of 3DGS is 0.5 + sum_k Y_k sh_k, so the 0.5 has to be multiplied too. The clamp at 0 stays where it was.
+    The 3DGS colour is 0.5 + sum_k Y_k sh_k, so the 0.5 is multiplied too. The position of the clamp at 0 does not
+    change.
 
     Args:
         sh: Coefficients, 3DGS convention, display-referred sRGB. [..., K, 3]
-        tint: Factors, at least 0, display-referred sRGB. [3], or [..., 3] for one each
+        tint: Factors >= 0, display-referred sRGB. [3], or [..., 3] for individual factors
 
     Returns:
-        Coefficients, same dtype as ``sh``; ``sh`` itself where the factor is 1 throughout. [..., K, 3]
+        Coefficients, same dtype as ``sh``; ``sh`` itself if all factors are 1. [..., K, 3]
     """
     if (np.asarray(tint) == 1.0).all():
         return sh

@@ -1,12 +1,12 @@
-"""The inverse of a view transform, from samples of it: which scene-linear colour is displayed as a wanted one.
+"""Numerical inverse of a view transform: scene-linear colours that are displayed as given colours.
 
-A view transform (AgX, Filmic, with a look, an exposure, curves) is known here by a function alone, ``forward``, which
-displays scene-linear colours. Its inverse is a table in two steps. A curve for each channel, the inverse along greys,
-leaves a map that is nearly the identity; a grid holds that map, solved at each of its nodes by damped Newton steps on
-``forward`` itself. Codes are asinh(colour / KNEE): linear around black, logarithmic where it is bright, and defined for
-the negative values that stand for colours outside of the scene's gamut.
+A view transform (AgX, Filmic, with a look, an exposure, curves) is known here only as a function ``forward`` that maps
+scene-linear to display colours. Its inverse is a table in two steps. One curve per channel, the inverse along greys,
+leaves a map that is nearly the identity; a grid stores that map, solved at each node by damped Newton steps on
+``forward``. Codes are asinh(colour / KNEE): linear around black, logarithmic for bright colours, and defined for the
+negative values of colours outside the scene's gamut.
 
-What a view cannot display gets the colour that is displayed nearest to it.
+Display colours out of reach of the view are mapped to the nearest displayable ones.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ import numpy as np
 Forward = Callable[[np.ndarray], np.ndarray]  # scene linear [N, 3] to display, in [0, 1] [N, 3]
 
 KNEE = 0.05  # scene-linear colour at which codes turn from linear to logarithmic
-BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as white: 6.5 stops over middle grey
-MOST = 16.0  # times as bright is what the softest looks display as white
-SIZE = 33  # nodes of the grid along each channel
-STEP = 1 / 255  # of a display, in which errors are told
-VISIBLE = 1.5 * STEP  # colours that are farther off are another colour
-SOLVED = 0.5 * STEP  # nodes that are displayed this near to what is wanted are within the view's reach
+BRIGHTEST = 16.3  # scene-linear colour that most view transforms display as white, 6.5 stops above mid-grey
+MOST = 16.0  # white of the softest looks, in multiples of BRIGHTEST
+SIZE = 33  # grid nodes per channel
+STEP = 1 / 255  # 8-bit display step, the unit of errors
+VISIBLE = 1.5 * STEP  # smallest visible error
+SOLVED = 0.5 * STEP  # largest error of a node within the view's reach
 
-_CODES = 65536  # of the curves: display colours are rounded to so many, far finer than files keep them
-_CHUNK = 65536  # colours at a time, so that they stay in the processor's cache
+_CODES = 65536  # entries per curve, far finer than the precision of image files
+_CHUNK = 65536  # colours per block, sized for the CPU cache
 
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """A view transform's inverse; equal to itself alone.
+    """Inverse of a view transform. Compared by identity.
 
     Attributes:
-        curves: Place in the grid, in nodes, of each display colour. [3, 65536] float32
+        curves: Grid position, in nodes, of each display colour. [3, 65536] float32
         grid: Codes of the scene-linear colours at the nodes. [SIZE, SIZE, SIZE, 3] float32
-        scale: By what decoded colours are multiplied.
-        error: How far off colours within reach come out, of 255 steps: 95 % of them are nearer.
-        reach: Share of the grid's nodes, from greys to the most saturated, that the view can display.
+        scale: Factor on decoded colours.
+        error: 95th percentile of the error of colours within reach, in steps of 1/255.
+        reach: Fraction of the grid's nodes, from greys to the most saturated, that the view can display.
     """
 
     curves: np.ndarray
@@ -49,13 +49,13 @@ class Inverse:
     reach: float
 
     def scene_linear(self, display: np.ndarray) -> np.ndarray:
-        """The colours that are displayed as wanted, or as near to that as the view can.
+        """Scene-linear colours that are displayed as the given ones, or as near as the view can.
 
         Args:
             display: Display colours, clamped to [0, 1] here. [..., 3]
 
         Returns:
-            Scene linear; below 0 where the colour is outside of the gamut of the scene's space. [..., 3] float32
+            Scene-linear colours, negative outside the gamut of the scene's colour space. [..., 3] float32
         """
         flat = display.reshape(-1, 3)
         result = np.empty(flat.shape, np.float32)
@@ -65,18 +65,18 @@ class Inverse:
         return result.reshape(display.shape)
 
     def _places(self, display: np.ndarray) -> np.ndarray:
-        """Where in the grid display colours lie, in nodes. [N, 3]"""
+        """Grid positions of display colours, in nodes. [N, 3]"""
         index = (np.clip(display, 0, 1) * (_CODES - 1) + 0.5).astype(np.intp)
         return np.stack([curve[index[:, channel]] for channel, curve in enumerate(self.curves)], axis=-1)
 
 
 @dataclass(frozen=True)
 class Loss:
-    """Error of display colours under a view that is inverted.
+    """Error of display colours after inverting and reapplying a view transform.
 
     Attributes:
-        psnr: In dB, of colours that are rounded to 255 steps afterwards: at most 59.
-        unreached: Share of the colours that are off by more than `VISIBLE`.
+        psnr: PSNR in dB, including rounding to 8 bits; at most 59.
+        unreached: Fraction of the colours with an error above `VISIBLE`.
     """
 
     psnr: float
@@ -84,12 +84,12 @@ class Loss:
 
 
 def loss(forward: Forward, made: Inverse, display: np.ndarray, weights: np.ndarray) -> Loss:
-    """Measure how far display colours come out.
+    """Measure the error of display colours under an inverted view transform.
 
     Args:
-        forward: Displays scene-linear colours.
+        forward: Maps scene-linear to display colours.
         made: Its inverse.
-        display: The colours that are wanted. [N, 3]
+        display: The target colours. [N, 3]
         weights: Weight of each colour. [N]
 
     Returns:
@@ -97,17 +97,17 @@ def loss(forward: Forward, made: Inverse, display: np.ndarray, weights: np.ndarr
     """
     wanted = np.asarray(display, np.float64)
     off = np.asarray(forward(made.scene_linear(wanted)), np.float64) - wanted
-    squared = np.average(np.square(off).mean(axis=-1), weights=weights) + STEP**2 / 12  # that of rounding
+    squared = np.average(np.square(off).mean(axis=-1), weights=weights) + STEP**2 / 12  # variance of rounding
     return Loss(-10 * float(np.log10(squared)), float(np.average(np.abs(off).max(axis=-1) > VISIBLE, weights=weights)))
 
 
 def invert(forward: Forward, scale: float = 1.0) -> Inverse:
-    """Make the inverse of a view transform.
+    """Compute the inverse of a view transform.
 
     Args:
-        forward: Displays scene-linear colours; called a few dozen times with up to 110,000 of them.
-        scale: Of the colours: ``forward(scale * BRIGHTEST)`` should be about white, or that of colours up to `MOST`
-            times as bright; 2 ** -exposure.
+        forward: Maps scene-linear to display colours; called a few dozen times with up to 110,000 colours.
+        scale: Factor on the colours, 2 ** -exposure, such that ``forward(scale * BRIGHTEST)`` is about white; up to
+            `MOST` times as bright is allowed.
 
     Returns:
         The inverse.
@@ -118,7 +118,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
 
     top = _top(shown)
     greys = np.linspace(0, top, 2048)
-    # Where a curve is flat, the darkest of the colours that are displayed alike counts.
+    # In flat parts of a curve, use the darkest of the equally displayed colours.
     rising = np.maximum.accumulate(shown(np.repeat(greys[:, None], 3, axis=1)), axis=0)
     axis = np.linspace(0, top, SIZE)
     axes = [np.interp(axis, greys, rising[:, channel]) for channel in range(3)]
@@ -129,7 +129,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
     solved = _far(found, wanted) < SOLVED
     grid = _continue(codes.reshape(SIZE, SIZE, SIZE, 3), solved, top)
     display = np.linspace(0, 1, _CODES)
-    tiny = 1e-9 * np.arange(len(greys))  # np.interp asks for values that rise
+    tiny = 1e-9 * np.arange(len(greys))  # np.interp requires increasing values
     curves = [np.interp(display, rising[:, channel] + tiny, greys) for channel in range(3)]
     curves = (np.stack(curves) / top * (SIZE - 1)).astype(np.float32)
     made = Inverse(curves, grid.astype(np.float32), scale, 0.0, float(solved.mean()))
@@ -137,7 +137,7 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
 
 
 def _top(shown: Forward) -> float:
-    """The least code of a grey, from that of `BRIGHTEST` on, that is displayed as the brightest one that is tried."""
+    """Smallest grey code, from that of `BRIGHTEST` on, that is displayed as the brightest tested one."""
     tried = np.arcsinh(BRIGHTEST * np.geomspace(1.0, MOST, 17) / KNEE)
     white = shown(np.repeat(tried[:, None], 3, axis=1))
     return float(tried[np.argmax(_far(white, white[-1]) < SOLVED)])
@@ -148,30 +148,30 @@ def _decode(codes: np.ndarray) -> np.ndarray:
 
 
 def _far(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Distance of colours, in their worst channel. [N]"""
+    """Largest difference of colours over the channels. [N]"""
     return np.abs(found - wanted).max(axis=-1)
 
 
 def _squared(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Squared distance of colours. [...]"""
+    """Squared difference of colours. [...]"""
     off = found - wanted
-    return np.einsum("...k,...k->...", off, off)  # a sum over three is slow
+    return np.einsum("...k,...k->...", off, off)  # faster than sum over an axis of length three
 
 
 def _solve(
     shown: Forward, wanted: np.ndarray, codes: np.ndarray, top: float, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Codes that are displayed as wanted, by Levenberg-Marquardt steps with differences for derivatives.
+    """Find codes that are displayed as given, by Levenberg-Marquardt steps with finite differences.
 
     Args:
-        shown: Displays codes.
-        wanted: Display colours. [N, 3]
-        codes: Where to start. [N, 3]
-        top: Largest code, and of light below nothing the least one with its sign turned.
-        rounds: Number of steps; each shows four colours for each that is not solved yet.
+        shown: Maps codes to display colours.
+        wanted: Target display colours. [N, 3]
+        codes: Initial guess. [N, 3]
+        top: Largest code; -top is the smallest.
+        rounds: Number of steps; each evaluates four colours per unsolved one.
 
     Returns:
-        Codes, and how they are displayed. [N, 3] each
+        Codes, and their display colours. [N, 3] each
     """
     codes, found, delta = codes.copy(), shown(codes), 0.01
     damping = np.full(len(codes), 1e-4)
@@ -197,13 +197,13 @@ def _solve(
 def _retry(
     shown: Forward, wanted: np.ndarray, codes: np.ndarray, found: np.ndarray, top: float, rounds: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve the nodes that are not again, each from the solved one that is displayed nearest to what it wants."""
+    """Solve the unsolved nodes again, each from the solved node displayed nearest to its target."""
     solved = _far(found, wanted) < SOLVED
     shape = (SIZE, SIZE, SIZE)
     nearest = np.where(solved, np.arange(len(codes)), -1).reshape(shape)
     goal = wanted.reshape(*shape, 3)
     gap = np.where(solved.reshape(shape), _squared(found, wanted).reshape(shape), np.inf)
-    for _ in range(SIZE):  # from node to node, like a flood
+    for _ in range(SIZE):  # flood fill from node to node
         changed = False
         for into, out_of in _neighbours():
             candidate = nearest[out_of]
@@ -222,7 +222,7 @@ def _retry(
 
 
 def _neighbours() -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
-    """Slices of a grid and of the same shifted by a node, along each axis, both ways."""
+    """Pairs of slices of a grid, shifted by one node along each axis in both directions."""
     for axis in range(3):
         low, high = [slice(None)] * 3, [slice(None)] * 3
         low[axis], high[axis] = slice(None, -1), slice(1, None)
@@ -231,11 +231,11 @@ def _neighbours() -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
 
 
 def _continue(grid: np.ndarray, solved: np.ndarray, top: float) -> np.ndarray:
-    """Let the grid go on straight for a node past the view's reach, so that cells on its border are right inside.
+    """Extrapolate the grid linearly by one node past the view's reach, so that border cells interpolate correctly.
 
     Args:
         grid: Codes. [SIZE, SIZE, SIZE, 3]
-        solved: Whether they are displayed as wanted. [SIZE ** 3]
+        solved: True for nodes within the view's reach. [SIZE ** 3]
         top: Largest code.
 
     Returns:
@@ -258,7 +258,7 @@ def _continue(grid: np.ndarray, solved: np.ndarray, top: float) -> np.ndarray:
 
 
 def _interpolate(grid: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Trilinear values of a grid at places in nodes. [N, 3]"""
+    """Trilinear interpolation of a grid at positions in nodes. [N, 3]"""
     size = grid.shape[0]
     low = np.minimum(places.astype(np.intp), size - 2)
     part = places - low
@@ -273,7 +273,7 @@ def _interpolate(grid: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def _error(forward: Forward, made: Inverse) -> float:
-    """How far off colours come out that the view displays of a scene without negative light, of 255 steps."""
+    """95th percentile of the round-trip error of displayable colours of non-negative light, in steps of 1/255."""
     random = np.random.default_rng(0)
     light = 2.0 ** random.uniform(-6, 2, (4000, 1)) * 2.0 ** random.uniform(-0.7, 0.7, (4000, 3))
     wanted = np.asarray(forward(made.scale * light), np.float64)
