@@ -1,4 +1,4 @@
-"""Cameras as the files that radiance-field tools read: `transforms.json` of NeRF and D-NeRF, COLMAP's text model."""
+"""Writers of camera files for radiance-field tools: `transforms.json` of NeRF and D-NeRF, COLMAP's text model."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ..scene.cameras import Camera
 
 @dataclass(frozen=True)
 class View:
-    """One image that a camera takes.
+    """One image and its camera.
 
     Attributes:
-        file_path: Path of the image relative to the camera file, "/" between folders, with suffix.
-        camera: The camera; its name is that of the camera and not of the image.
-        t: Scene time, or None where there is none.
+        file_path: Path of the image relative to the camera file, with "/" between folders and a suffix.
+        camera: The camera; its name is that of the camera, not of the image.
+        t: Scene time, or None if there is none.
     """
 
     file_path: str
@@ -31,13 +31,13 @@ class View:
 
 
 def write_transforms(path: str | Path, views: Sequence[View]) -> Path:
-    """Write NeRF's camera file, atomically: camera to world with OpenGL axes, in the cameras' world.
+    """Write NeRF's camera file atomically: camera to world with OpenGL axes, in the cameras' world.
 
-    ``camera_angle_x w h fl_x fl_y cx cy`` stand at the top where they hold for all views, else with each view; ``time``
-    with the views that have one.
+    ``camera_angle_x w h fl_x fl_y cx cy`` are at the top level if all views share them, else in each view. ``time`` is
+    in the views that have one.
 
     Args:
-        path: Where to.
+        path: Target file.
         views: At least one.
 
     Returns:
@@ -58,10 +58,10 @@ def write_transforms(path: str | Path, views: Sequence[View]) -> Path:
 
 
 def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
-    """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically; the points are none.
+    """Write COLMAP's text model into ``sparse/0`` of a folder, each file atomically, without points.
 
-    Images are named by their paths without the leading folder ``images``, as COLMAP has it. Where views have times,
-    ``times.json`` beside ``sparse`` says them (docs/reference/dataset.md), which COLMAP does not know.
+    Images are named by their paths without the leading folder ``images``, as in COLMAP. If views have times, they are
+    stored in ``times.json`` beside ``sparse`` (docs/dataset.md), an extension that COLMAP ignores.
 
     Args:
         folder: An existing folder.
@@ -85,7 +85,7 @@ def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:
             camera_lines.append(f"{lenses[lens]} PINHOLE " + " ".join(repr(value) for value in lens))
         quat = rotations.rotmats_to_quats(camera.T_cam_world[:3, :3])
         center = cameras.cam_world_to_opengl(camera.T_cam_world)[:3, 3]
-        shift = -rotations.quats_to_rotmats(quat) @ center  # by the rotation that is read again, as `center` may be far
+        shift = -rotations.quats_to_rotmats(quat) @ center  # rotation as read back; `center` may be far
         pose = " ".join(repr(float(value)) for value in (*quat, *shift))
         image_lines.append(f"{number} {pose} {lenses[lens]} {_image_name(view)}\n")
     _write_lines(folder / "cameras.txt", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[] (fx fy cx cy)", camera_lines)

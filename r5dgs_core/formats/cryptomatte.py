@@ -1,7 +1,7 @@
-"""Names as numbers the way Cryptomatte 1.2 writes them into images: hashes, channel values, manifests.
+"""Cryptomatte 1.2 encoding of names: hashes, channel values, manifests.
 
-A name is its 32-bit MurmurHash3, stored in a float32 channel with these very bits; a hash whose exponent would make it
-infinite, not a number or denormal gets another exponent.
+A name is represented by its 32-bit MurmurHash3, whose bits are stored in a float32 channel. The exponent of a hash that
+would be infinite, NaN or denormal is changed.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ CONVERSION = "uint32_to_float32"
 
 
 def hash_of(name: str) -> int:
-    """MurmurHash3_x86_32 of a name in UTF-8, seed 0, with an exponent that a float32 keeps. In [0, 2^32)."""
+    """MurmurHash3_x86_32 of a name in UTF-8, seed 0, with an exponent valid in float32. In [0, 2^32)."""
     value = _murmur3(name.encode())
     exponent = value >> 23 & 255
     return value ^ (1 << 23) if exponent in (0, 255) else value
 
 
 def value_of(name: str) -> np.float32:
-    """What a channel of identities holds for a name."""
+    """Channel value that represents a name."""
     return np.uint32(hash_of(name)).view(np.float32)
 
 
 def manifest(names: Iterable[str]) -> str:
-    """The names of an image, as JSON in UTF-8: name to hash in eight hexadecimal digits."""
+    """Manifest of an image: JSON from names to hashes in eight hexadecimal digits."""
     found = {name: f"{hash_of(name):08x}" for name in names}
     return json.dumps(found, separators=(",", ":"), ensure_ascii=False)
 
 
 def metadata(layer: str, names: Iterable[str]) -> dict[str, str]:
-    """The entries that an image's header needs to be read.
+    """Header entries of an image with Cryptomatte channels.
 
     Args:
-        layer: Name of the Cryptomatte layer: that of its passes without their number.
-        names: Names that may be in the image.
+        layer: Name of the Cryptomatte layer, i.e. of its passes without their number.
+        names: Names that may occur in the image.
 
     Returns:
         Text by key.

@@ -1,7 +1,7 @@
-"""Masks and passes as files, written with the standard library: PNG of grey integers, OpenEXR of float channels.
+"""Writers of masks and render passes with the standard library: greyscale PNG and float OpenEXR.
 
-Both are read by Blender, OpenImageIO and every compositor. EXR channels that are named LAYER.PASS.CHANNEL, such as
-``ViewLayer.Depth.Z``, are what Blender's own multilayer files have.
+Blender, OpenImageIO and compositors read both. EXR channels named LAYER.PASS.CHANNEL, such as ``ViewLayer.Depth.Z``,
+match Blender's own multilayer files.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 
 from .. import atomic_files
 
-_ROWS_PER_BLOCK = 16  # of an EXR with ZIP compression
+_ROWS_PER_BLOCK = 16  # rows per block of an EXR with ZIP compression
 _ZIP, _FLOAT = 3, 2
 _LONG_NAMES = 1 << 10
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> Path:
-    """Write integers as a grey PNG, atomically.
+    """Write integers as a greyscale PNG, atomically.
 
     Args:
-        path: Where to.
+        path: Target file.
         pixels: Top row first. [H, W] uint8 or uint16
 
     Returns:
@@ -47,13 +47,13 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> Path:
     """Write channels as one OpenEXR image of 32-bit floats, losslessly compressed, atomically.
 
     Args:
-        path: Where to.
+        path: Target file.
         channels: Values by name, top row first, all of one size. [H, W] each
 
     Returns:
         The path.
     """
-    names = sorted(channels)  # the format asks for this order
+    names = sorted(channels)  # order required by the format
     planes = [np.ascontiguousarray(channels[name], "<f4") for name in names]
     if not planes or any(plane.ndim != 2 or plane.size == 0 or plane.shape != planes[0].shape for plane in planes):
         raise ValueError(f"channels: expected [H, W] each, got {[plane.shape for plane in planes]}")
@@ -67,7 +67,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> Path:
     header += _attribute("pixelAspectRatio", "float", struct.pack("<f", 1.0))
     header += _attribute("screenWindowCenter", "v2f", struct.pack("<2f", 0.0, 0.0))
     header += _attribute("screenWindowWidth", "float", struct.pack("<f", 1.0)) + b"\0"
-    lines = np.stack(planes, axis=1).reshape(height, -1).view(np.uint8)  # line by line, channel after channel
+    lines = np.stack(planes, axis=1).reshape(height, -1).view(np.uint8)  # by row, then by channel
     blocks = []
     for top in range(0, height, _ROWS_PER_BLOCK):
         packed = _pack(lines[top : top + _ROWS_PER_BLOCK].reshape(-1))
@@ -79,17 +79,17 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> Path:
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
-    """A PNG chunk: length, kind, data, checksum."""
+    """PNG chunk: length, kind, data, checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 def _attribute(name: str, kind: str, value: bytes) -> bytes:
-    """An entry of an EXR header."""
+    """EXR header attribute."""
     return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
 
 
 def _pack(data: np.ndarray) -> bytes:
-    """A block as EXR's ZIP has it: bytes of even and of odd place apart, differences, deflate; plain if no smaller."""
+    """Compress a block with EXR's ZIP: even and odd bytes apart, differences, deflate; stored if not smaller."""
     apart = np.concatenate([data[::2], data[1::2]])
     packed = zlib.compress(np.concatenate([apart[:1], np.diff(apart) + np.uint8(128)]).tobytes(), 4)
     return packed if len(packed) < data.size else data.tobytes()

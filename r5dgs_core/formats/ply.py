@@ -1,8 +1,8 @@
 """Gaussians in the PLY files of 3D Gaussian Splatting and Gaussian Grouping.
 
-Columns are looked up by name, because tools order them differently: x y z, f_dc_0..2, f_rest_* (all red, then green,
-then blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (wxyz, normalised here), obj_dc_0..15 (identity
-encoding) and obj_id. Other columns and elements are passed over.
+Columns are read by name, because tools order them differently: x y z, f_dc_0..2, f_rest_* (all red, then green, then
+blue), opacity (logit), scale_0..2 (natural logarithm), rot_0..3 (wxyz, normalised here), obj_dc_0..15 (identity
+encoding) and obj_id. Other columns and elements are skipped.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _HEADER_LIMIT = 1 << 16
-_LONGEST_NUMBER = 400  # characters with the blank behind it
-_MOST_DIGITS = 18  # of a count
+_LONGEST_NUMBER = 400  # characters, including the separator
+_MOST_DIGITS = 18  # digits of a row count
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Splats:
         means: Centres, in the file's world. [N, 3] float32
         quats: Unit wxyz. [N, 4] float32
         log_scales: Natural logarithm of the standard deviations. [N, 3] float32
-        opacity_logits: Before the sigmoid. [N] float32
+        opacity_logits: Opacities before the sigmoid. [N] float32
         sh: Coefficients, 3DGS convention. [N, K, 3] float32
-        identities: Identity encodings or None. [N, 16] float32
-        object_ids: From obj_id, or None. [N] int32
+        identities: Identity encodings, or None. [N, 16] float32
+        object_ids: Values of obj_id, or None. [N] int32
     """
 
     means: np.ndarray
@@ -66,13 +66,13 @@ class Splats:
 
 
 def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.ndarray | None = None) -> Path:
-    """Write binary little endian, atomically.
+    """Write a binary little-endian PLY, atomically.
 
     Args:
         splats: The Gaussians.
-        path: Where to.
-        plain: Leave identities and ids out, for viewers that refuse columns they do not know.
-        origin: Point of the world that the centres are relative to, for a comment of the header; zero if None. [3]
+        path: Target file.
+        plain: Omit identities and ids, for viewers that reject unknown columns.
+        origin: Point of the world that the centres are relative to, stored in a header comment; zero if None. [3]
 
     Returns:
         The path written.
@@ -97,12 +97,12 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.n
 
 
 def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:
-    """Read a PLY of Gaussians; ascii and both byte orders. Raises `SceneFileError` naming what is missing.
+    """Read a PLY of Gaussians, ascii or binary of either byte order. Raises `SceneFileError` naming what is missing.
 
     Args:
         path: The file.
-        guard: Entered around each statement of the header, row of text and group of columns, for callers that want all
-            faults (`findings`). What it keeps an error of is `findings.UNREAD` in the result.
+        guard: Context manager entered around each header statement, text row and group of columns, for callers that
+            collect all faults (`findings`). Parts whose errors it keeps are `findings.UNREAD` in the result.
     """
     path = Path(path)
     try:
@@ -114,7 +114,7 @@ def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:
 
 
 def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
-    """Name, type and values in the order of 3DGS."""
+    """Names, types and values of the columns in 3DGS order."""
     zeros = np.zeros(len(splats.means), np.float32)
     columns = [(name, "<f4", splats.means[:, i]) for i, name in enumerate("xyz")]
     columns += [(name, "<f4", zeros) for name in ("nx", "ny", "nz")]
@@ -134,7 +134,7 @@ def _columns(splats: Splats, plain: bool) -> list[tuple[str, str, np.ndarray]]:
 def _read_header(
     stream: BinaryIO, place: str, guard: findings.Guard
 ) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]]]:
-    """Format, and per element its name, count and properties (name, numpy type; "list" for lists)."""
+    """Format, and for each element its name, count and properties (name, numpy type; "list" for lists)."""
     if stream.readline(8).strip() != b"ply":
         raise errors.SceneFileError(f"{place}: expected a PLY file, found another kind (no 'ply' in the first line)")
     layout, elements = "", []
@@ -161,14 +161,14 @@ def _read_header(
             with guard():
                 raise fault
     if fault:
-        raise fault  # which was kept: without a statement, the places of the numbers are unknown
+        raise fault  # even if the guard kept it, because the column positions are now unknown
     if not layout:
         raise errors.SceneFileError(f"{place}: header: expected one of the formats {', '.join(_ORDERS)}, found none")
     return layout, elements
 
 
 def _read_vertices(stream: BinaryIO, place: str, guard: findings.Guard) -> np.ndarray:
-    """The vertex element as a structured array; without rows if the guard keeps an error of them."""
+    """Vertex element as a structured array, without rows if the guard keeps an error of them."""
     layout, elements = _read_header(stream, place, guard)
     for name, count, properties in elements:
         if any(kind == "list" for _, kind in properties):
@@ -188,9 +188,9 @@ def _read_rows(
     stream: BinaryIO, layout: str, count: int, dtype: np.dtype, place: str, guard: findings.Guard
 ) -> np.ndarray:
     columns = len(dtype.names or ())
-    least = 2 * columns - 1 if layout == "ascii" else dtype.itemsize  # bytes of a row
+    least = 2 * columns - 1 if layout == "ascii" else dtype.itemsize  # least bytes per row
     left = os.fstat(stream.fileno()).st_size - stream.tell()
-    if count and (not columns or count * least > left + 1):  # the last line may lack its end
+    if count and (not columns or count * least > left + 1):  # the last line may lack its newline
         raise errors.SceneFileError(
             f"{place}: expected {count} rows of at least {least} bytes, found {left} bytes; the file is truncated"
         )
@@ -233,7 +233,7 @@ def _to_splats(table: np.ndarray, place: str, guard: findings.Guard) -> Splats:
                 missing = ", ".join(column for column in columns if column not in names)
                 raise errors.SceneFileError(f"{place}: expected the columns of a Gaussian splat, not found: {missing}")
         with guard():
-            with np.errstate(over="ignore"):  # what is beyond single precision becomes infinite
+            with np.errstate(over="ignore"):  # values beyond float32 become infinite
                 values = np.stack([table[column].astype(np.float32) for column in there], axis=-1)
             if not np.isfinite(values).all():
                 row = int(np.flatnonzero(~np.isfinite(values).all(-1))[0])
@@ -274,7 +274,7 @@ def _to_splats(table: np.ndarray, place: str, guard: findings.Guard) -> Splats:
 
 
 def _whole(values: np.ndarray, place: str) -> np.ndarray:
-    """Ids as int32."""
+    """Convert ids to int32, with a range check."""
     least, most = np.iinfo(np.int32).min, np.iinfo(np.int32).max
     if values.size and not (values.min() >= least and values.max() <= most):
         raise errors.SceneFileError(f"{place}: expected whole numbers from {least} to {most}, found others")
