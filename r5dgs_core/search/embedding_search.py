@@ -1,11 +1,11 @@
-"""What stored embeddings say about words: which objects a phrase means, how surely, and that it means none.
+"""Match phrases to objects by stored embeddings, with calibrated scores.
 
-Notation: M objects, V views of an object at most, D numbers of an embedding, W words, C canonical phrases. An embedding
-e of an object answers a phrase q by its cosine e . q, and by the relevancy of LERF, the least over the canonical
-phrases c of exp(s e . q) / (exp(s e . q) + exp(s e . c)).
+Notation: M objects, at most V views of an object, D numbers of an embedding, W words, C canonical phrases. An object
+embedding e is compared with a phrase embedding q by the cosine e . q and by LERF's relevancy, the minimum over the
+canonical phrases c of exp(s e . q) / (exp(s e . q) + exp(s e . c)).
 
-What a cosine is worth differs from encoder to encoder and from object to object, so each embedding has a threshold of
-its own, calibrated where the table is made (`language.calibration`).
+The scale of cosines differs between encoders and objects, so each embedding has its own threshold, calibrated when the
+table is made (`language.calibration`).
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import numpy as np
 
 from ..scene.stored_embeddings import Meanings
 
-UNCALIBRATED = 0.25  # threshold of a file that says nothing about its encoder
+UNCALIBRATED = 0.25  # threshold for a file without encoder metadata
 PASS = 0.5  # score at the threshold
-_BEST = 0.95  # score far above the threshold: below a name's
-_SPREAD = 0.25  # of cosines, in a file that says nothing about its encoder
-_MOST_EXPONENT = 700.0  # whose exponential is a number
-_BESIDE = 0.4  # most of an object that fits far worse than another
+_BEST = 0.95  # score far above the threshold, below that of a name match
+_SPREAD = 0.25  # spread of cosines for a file without encoder metadata
+_MOST_EXPONENT = 700.0  # largest exponent with a finite exponential
+_BESIDE = 0.4  # largest score of an object far below the best match
 
 
 @dataclass(frozen=True)
 class Meant:
-    """How well one object fits a phrase.
+    """Match of one object with a phrase.
 
     Attributes:
-        object_id: Id in the table.
-        score: In [0, 0.95]; from `PASS` on it is a match.
-        cosine: Of the embedding that answers with that of the phrase.
-        relevancy: See the module, None where no canonical phrases are stored.
+        object_id: Id of the object.
+        score: In [0, 0.95]; a match from `PASS` on.
+        cosine: Cosine between the best embedding of the object and that of the phrase.
+        relevancy: See the module; None if no canonical phrases are stored.
     """
 
     object_id: int
@@ -43,12 +43,12 @@ class Meant:
 
 
 def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
-    """How well each object that has an embedding fits a phrase, the best first.
+    """Score each object that has an embedding against a phrase, best first.
 
-    An object whose cosine is more than the table's margin below the best one's is no match beside that one.
+    An object whose cosine is more than the table's margin below the best one does not match.
 
     Args:
-        meanings: What the scene stores.
+        meanings: Stored embeddings of the scene.
         query: Embedding of the phrase, unit. [D]
     """
     query, table = np.asarray(query, np.float64), meanings.table
@@ -60,12 +60,12 @@ def ask(meanings: Meanings, query: np.ndarray) -> list[Meant]:
 
 
 def relevancy(cosine: float, canonical: np.ndarray, scale: float) -> float:
-    """LERF's, of a cosine with a phrase beside those with the canonical ones. canonical: [C]"""
+    """LERF relevancy from the cosines of an object with a phrase and with the canonical phrases. canonical: [C]"""
     return float(1.0 / (1.0 + np.exp(min(-scale * (cosine - float(np.max(canonical))), _MOST_EXPONENT))))
 
 
 def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
-    """The best that an object's embeddings say, None where it has none. query: float64"""
+    """Best match among an object's embeddings, or None if it has none. query: float64"""
     rows, thresholds = _rows(meanings, row)
     if not len(rows):
         return None
@@ -80,13 +80,13 @@ def _answer(meanings: Meanings, row: int, query: np.ndarray) -> Meant | None:
 
 
 def _score(above: float, spread: float) -> float:
-    """Of a cosine that lies so far above the threshold: 0 far below it, `PASS` at it, `_BEST` far above."""
+    """Score of a cosine relative to the threshold: 0 far below it, `PASS` at it, `_BEST` far above."""
     share = math.exp(-min(abs(above) / max(spread, 1e-9), _MOST_EXPONENT))
     return PASS + (_BEST - PASS) * (1 - share) if above >= 0 else PASS * share
 
 
 def _rows(meanings: Meanings, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """The embeddings that answer for an object and their thresholds; none where it has none. [R, D], [R]"""
+    """Embeddings to compare for an object and their thresholds; empty if it has none. [R, D], [R]"""
     table, views = meanings.table, meanings.view_embeddings
     if table is None:
         own = np.asarray(meanings.embeddings[row], np.float64)[None]

@@ -1,4 +1,4 @@
-"""English words of names and prompts: one spelling for a noun and its plural, and the phrases of a list of things."""
+"""English text processing for names and prompts: plural normalisation and splitting into phrases."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 import unicodedata
 
 _FILLER = frozenset(("a", "an", "the", "this", "that", "these", "those", "of", "in", "on", "at", "my", "all", "any"))
-# Said before what is counted, they are no part of its name; "mug two" keeps its number.
+# Counts before a noun are not part of its name; "mug two" keeps its number.
 _COUNTS = frozenset(("both", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "some", "few"))
-# Plurals that no ending tells, and words that only look like one.
+# Irregular plurals, and singulars that look like plurals.
 _PLURALS = {
     **{"men": "man", "women": "woman", "children": "child", "people": "person", "lives": "life"},
     **{"feet": "foot", "teeth": "tooth", "geese": "goose", "mice": "mouse", "quizzes": "quiz"},
@@ -23,16 +23,16 @@ _SPLIT = re.compile(r"\s*(?:,|;|\+|&|/|\band\b|\bor\b|\bplus\b)\s*", re.IGNORECA
 
 
 def words_of(text: str) -> list[str]:
-    """Words in lower case without accents, as `singular` spells them; digits are words."""
+    """Words in lower case without accents, normalised by `singular`; numbers are words."""
     plain = "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
     return [singular(word) for word in re.findall(r"[^\W_]+", plain.casefold())]
 
 
 def singular(word: str) -> str:
-    """One spelling for an English noun and its plural: the singular, but for endings that a plural does not tell.
+    """Normalise an English noun so that singular and plural are spelled alike.
 
-    "cookies" and "berries" end alike, as "caches" and "torches" and "fuses" and "buses" do; so "cookie", "cache" and
-    "fuse" are spelled "cooky", "cach" and "fus".
+    The result is the singular, except for ambiguous plural endings: "cookies" and "berries" end alike, as do "caches"
+    and "torches", "fuses" and "buses"; so "cookie", "cache" and "fuse" become "cooky", "cach" and "fus".
     """
     if word in _PLURALS:
         return _PLURALS[word]
@@ -49,7 +49,7 @@ def singular(word: str) -> str:
 
 
 def phrases(text: str) -> list[tuple[str, list[str]]]:
-    """Each thing that a text lists: as it was said, and its words without fillers and counts."""
+    """Phrases listed in a text: each as written, and its words without fillers and counts."""
     result = []
     for part in _SPLIT.split(" ".join(text.split())):  # the search below is quadratic in runs of spaces
         words = words_of(part)

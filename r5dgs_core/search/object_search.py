@@ -1,9 +1,9 @@
-"""Find objects by words, without any network: names and aliases first, then what stored embeddings say.
+"""Find objects by words, without any network: by names and aliases first, then by stored embeddings.
 
-A query is cut into wishes at "and", "," and the like, unless it is a name with such a word; each wish is compared with
-every name and alias of the table. "Everything", "not" and their like are understood by `prompts`.
-Words match whole, in the plural, as the beginning or a part of a longer name, or with a small typo. A name that says a
-wish whole settles it; other wishes are asked of the embeddings, too (`embedding_search`), where their words have one.
+A query is split into phrases at "and", "," and the like, unless it is a name that contains such a word. Each phrase is
+compared with every name and alias. `prompts` handles "everything", "not" and the like. Words match as a whole, in the
+plural, as the beginning or a part of a longer name, or with a small typo. If no name matches a phrase completely, it is
+also compared with the stored embeddings (`embedding_search`), if an embedding of the phrase is available.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from . import embedding_search as stored
 from . import english, prompts
 
 THRESHOLD = stored.PASS
-EVERYTHING = "all"  # begins the reason of a match that no word of its own found
-Embed = Callable[[str], np.ndarray | None]  # embedding of a phrase, unit [D]; None where it cannot be had
-_SETTLED = 0.9  # of a name that says the wish whole
+EVERYTHING = "all"  # prefix of the reason of a match by "everything"
+Embed = Callable[[str], np.ndarray | None]  # returns the unit embedding of a phrase [D], or None if unavailable
+_SETTLED = 0.9  # least score of a complete match by name
 _TYPO_RATIO = 0.75
-_LETTERS_PER_SLIP = 3  # of the shorter word: so many letters excuse one that is wrong in what someone may have meant
+_LETTERS_PER_SLIP = 3  # letters of the shorter word per allowed typo in suggestions
 _MOST_SLIPS = 3
-_HEAD_WEIGHT = 0.65  # of the last word, which says what the thing is: "coffee mug" is a mug
+_HEAD_WEIGHT = 0.65  # weight of the last word, the head noun: "coffee mug" is a mug
 
 
 @dataclass(frozen=True)
 class Match:
-    """One object that a query found.
+    """One object that matches a query.
 
     Attributes:
-        object_id: Id in the table.
+        object_id: Id of the object.
         score: In (0, 1], 1 for its exact name.
-        why: In words, such as "name 'mug'" or "alias 'cup', spelled 'cupp'".
-        cosine: Of the embeddings, None for a match by name.
-        relevancy: See `embedding_search`, None for a match by name and where the file has no canonical phrases.
+        why: Reason for display, such as "name 'mug'" or "alias 'cup', near 'cupp'".
+        cosine: Cosine of the embeddings, None for a match by name.
+        relevancy: See `embedding_search`; None for a match by name or without canonical phrases.
     """
 
     object_id: int
@@ -52,7 +52,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Label:
-    """What an object answers to. `search_labels` needs no more, so it works without the scene file."""
+    """Names of an object. Sufficient for `search_labels`, so search works without the scene file."""
 
     object_id: int
     name: str
@@ -60,24 +60,24 @@ class Label:
 
 
 def labels_of(scene: Scene) -> list[Label]:
-    """What the objects of a scene answer to, the background among them."""
+    """Labels of a scene's objects, including the background."""
     return [Label(item.id, item.name, item.aliases) for item in scene.objects if item.id >= 0]
 
 
 def search(scene: Scene, text: str, threshold: float = THRESHOLD, embed: Embed | None = None) -> list[Match]:
-    """Objects that a text names or means, best first.
+    """Find the objects that a text names or describes, best first.
 
     Args:
-        scene: The scene; its stored embeddings are used for words that its vocabulary holds.
+        scene: The scene; its stored embeddings are used for words in its vocabulary.
         text: One or several names: "red mug", "mugs and lemon".
-        threshold: Least score that counts as a match.
-        embed: Gives the embedding of other words, by the encoder that made the scene's.
+        threshold: Least score of a match.
+        embed: Returns the embedding of other words, from the encoder of the scene's embeddings.
 
     Returns:
         Matches with score >= threshold, ranked by score, then by id; empty if nothing matches.
 
     Raises:
-        ConfigError: Something is to be left out that nothing matches.
+        ConfigError: Nothing matches a phrase that is to be left out.
     """
     labels, meanings = labels_of(scene), Meanings.of(scene)
     check_exclusions(labels, text, not_excluded(labels, text, threshold, meanings, embed))
@@ -91,9 +91,9 @@ def search_labels(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[Match]:
-    """As `search`, on names and aliases, and on stored embeddings if they are given.
+    """Same as `search`, on names and aliases, and on stored embeddings if given.
 
-    What cannot be left out, as nothing matches it, is ignored here: the caller asks `not_excluded`.
+    Excluded phrases without a match are ignored here; the caller checks `not_excluded`.
     """
     asked, best = _asked(labels, text), {}
     if asked.everything:
@@ -114,7 +114,7 @@ def unanswered(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
-    """Phrases of a text that are wanted and that nothing matches; arguments as of `search_labels`."""
+    """Phrases to find that nothing matches; arguments as for `search_labels`."""
     wanted = _asked(labels, text).wanted
     return [said for said, wish in wanted if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
 
@@ -126,21 +126,21 @@ def not_excluded(
     meanings: Meanings | None = None,
     embed: Embed | None = None,
 ) -> list[str]:
-    """Phrases that a text leaves out and that nothing matches; arguments as of `search_labels`."""
+    """Phrases to leave out that nothing matches; arguments as for `search_labels`."""
     excluded = _asked(labels, text).excluded
     return [said for said, wish in excluded if not _matches(labels, [(said, wish)], threshold, meanings, embed)]
 
 
 def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str]) -> None:
-    """Refuse a text that leaves out what is not there: that would select what the user did not mean.
+    """Reject a text with excluded phrases that match nothing, because it would select unintended objects.
 
     Args:
         labels: Labels of the objects.
         text: The text.
-        missing: Its phrases of `not_excluded`.
+        missing: Result of `not_excluded` for the text.
 
     Raises:
-        ConfigError: There are such phrases.
+        ConfigError: ``missing`` is not empty.
     """
     if missing:
         raise errors.ConfigError(
@@ -149,13 +149,13 @@ def check_exclusions(labels: Sequence[Label], text: str, missing: Sequence[str])
 
 
 def is_nothing(labels: Sequence[Label], text: str) -> bool:
-    """True for a text that asks for no object at all, such as "none" and "not everything"."""
+    """True if a text selects no object at all, such as "none" and "not everything"."""
     asked = _asked(labels, text)
     return bool(english.words_of(text)) and not asked.wanted and not asked.everything
 
 
 def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> list[str]:
-    """Phrases of a text that no name settles and that no stored word has an embedding for: an encoder has to say."""
+    """Phrases that need an encoder: no name matches them completely and no stored word has an embedding for them."""
     asked = _asked(labels, text)
     return [
         said
@@ -166,16 +166,15 @@ def unknown(labels: Sequence[Label], text: str, meanings: Meanings | None) -> li
 
 
 def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
-    """Names and aliases that someone may have meant who typed a text that nothing matches.
+    """Names and aliases that are similar to a text without matches.
 
     Args:
         labels: Labels of the objects.
-        text: What was typed.
-        count: Most suggestions.
+        text: Text as typed.
+        count: Largest number of suggestions.
 
     Returns:
-        The closest word of each object that is near, the best first; a word is near that a few slips of the keyboard
-        make of what was typed.
+        The most similar name or alias of each object within a few typos of the text, best first.
     """
     ranked = []
     for label in labels:
@@ -186,7 +185,7 @@ def suggest(labels: Sequence[Label], text: str, count: int = 3) -> list[str]:
 
 
 def explain_nothing(labels: Sequence[Label], text: str) -> str:
-    """A sentence for the user when nothing matched: what is close, else the names that there are."""
+    """Message for a text without matches: similar names, else the existing names."""
     said = f"nothing matches {text.strip()!r}"
     meant = suggest(labels, text)
     if meant:
@@ -195,18 +194,18 @@ def explain_nothing(labels: Sequence[Label], text: str) -> str:
 
 
 def wishes(text: str) -> list[list[str]]:
-    """Words of each thing that a text asks for, normalised, fillers left out."""
+    """Normalised words of each phrase of a text, without fillers."""
     return [words for _, words in english.phrases(text)]
 
 
 def vocabulary_row(vocabulary: Sequence[str], wish: Sequence[str]) -> int | None:
-    """Row of the first word of a vocabulary that says a wish, None for none."""
+    """Row of the first vocabulary entry that equals a phrase, or None."""
     return _vocabulary_rows(tuple(vocabulary)).get(tuple(wish))
 
 
 @functools.lru_cache(maxsize=8)
 def _vocabulary_rows(vocabulary: tuple[str, ...]) -> dict[tuple[str, ...], int]:
-    """Row of each word that is one wish, by its normalised words."""
+    """Row of each vocabulary entry that is a single phrase, by its normalised words."""
     rows: dict[tuple[str, ...], int] = {}
     for row, word in enumerate(vocabulary):
         said = wishes(word)
@@ -226,7 +225,7 @@ def _matches(
     meanings: Meanings | None,
     embed: Embed | None,
 ) -> list[Match]:
-    """Everything that fits one of some phrases well enough."""
+    """Matches of any of the phrases with a score of at least ``threshold``."""
     found = [match for said, wish in phrases for match in _fulfil(labels, said, wish, meanings, embed)]
     return [match for match in found if match.score >= threshold]
 
@@ -234,7 +233,7 @@ def _matches(
 def _fulfil(
     labels: Sequence[Label], said: str, wish: list[str], meanings: Meanings | None, embed: Embed | None
 ) -> list[Match]:
-    """Everything that fits one wish at all."""
+    """All matches of one phrase, regardless of score."""
     named = _named(labels, wish)
     if meanings is None or any(match.score >= _SETTLED for match in named):
         return named
@@ -244,7 +243,7 @@ def _fulfil(
         return named
     known = {label.object_id: label for label in labels}
     meant = [one for one in stored.ask(meanings, query) if one.object_id in known and one.object_id >= 0]
-    if row is not None:  # a word of its own is neither a typo nor the beginning of another: "car" is no "cart"
+    if row is not None:  # a known word is neither a typo nor a prefix of another: "car" is not "cart"
         fitting = {one.object_id for one in meant if one.score >= stored.PASS}
         named = [m for m in named if m.object_id in fitting or _ends_with(known[m.object_id], wish[-1])]
     word = said if row is None else meanings.vocabulary[row]
@@ -262,7 +261,7 @@ def _named(labels: Sequence[Label], wish: list[str]) -> list[Match]:
 
 
 def _ends_with(label: Label, word: str) -> bool:
-    """Whether a word is the end of one of a name: a chessboard is a board."""
+    """Return True if a word of a name ends with ``word``: a chessboard is a board."""
     return any(present.endswith(word) for name in (label.name, *label.aliases) for present in english.words_of(name))
 
 
@@ -270,9 +269,9 @@ def _ranked(matches: Iterable[Match]) -> list[Match]:
     return sorted(matches, key=lambda match: (-round(match.score, 6), match.object_id))
 
 
-@functools.lru_cache(maxsize=1 << 14)  # what is unknown, what is found and what is void ask for the same
+@functools.lru_cache(maxsize=1 << 14)  # several public functions repeat the same comparisons
 def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
-    """Best of the object's name and aliases for one wish; an alias counts a little less than a name."""
+    """Best match among the object's name and aliases for one phrase; aliases have slightly less weight."""
     best: Match | None = None
     for kind, text, weight in (("name", label.name, 1.0), *(("alias", alias, 0.97) for alias in label.aliases)):
         words = english.words_of(text)
@@ -283,7 +282,7 @@ def _match(label: Label, wish: tuple[str, ...]) -> Match | None:
         said = [max(*row, _similarity(word, whole)) for word, row in zip(wish, table, strict=True)]
         covered = said[0] if len(said) == 1 else _HEAD_WEIGHT * said[-1] + (1 - _HEAD_WEIGHT) * _mean(said[:-1])
         named = _mean([max(column) for column in zip(*table, strict=True)])
-        # Words of the name that were not said cost little; words that the name does not have cost much.
+        # Unmatched words of the name cost little; unmatched words of the phrase cost much.
         score = weight * covered * (0.85 + 0.15 * named)
         if score > 0 and (best is None or score > best.score):
             spelled = "" if max(said) == 1 else f", near {' '.join(wish)!r}"
@@ -296,9 +295,9 @@ def _mean(values: list[float]) -> float:
 
 
 def _similarity(word: str, present: str) -> float:
-    """Of a word asked for to a word of a name: 1 for equal ones, 0.6 to 0.95 for a part or a typo, else 0.
+    """Similarity of a query word to a word of a name: 1 if equal, 0.6 to 0.95 for a part or a typo, else 0.
 
-    A part of the name's word counts ("glob" of "globe"), a word with the name's inside does not ("cupboard" is no cup).
+    Parts of the name's word match ("glob" of "globe"); words that contain the name's do not ("cupboard" is not a cup).
     """
     if word == present:
         return 1.0
@@ -307,16 +306,16 @@ def _similarity(word: str, present: str) -> float:
     if len(word) >= 3 and word in present:
         return 0.6 + 0.2 * len(word) / len(present)
     shorter, longer = sorted((len(word), len(present)))
-    if shorter < 4 or 2 * shorter < _TYPO_RATIO * (shorter + longer):  # the ratio below cannot be larger than that
+    if shorter < 4 or 2 * shorter < _TYPO_RATIO * (shorter + longer):  # upper bound of the ratio below
         return 0.0
     ratio = difflib.SequenceMatcher(None, word, present, autojunk=False).ratio()
     if sorted(word) == sorted(present):
-        ratio = max(ratio, 0.85)  # letters exchanged
+        ratio = max(ratio, 0.85)  # transposed letters
     return 0.9 * ratio if ratio >= _TYPO_RATIO else 0.0
 
 
 def _closeness(text: str, name: str) -> float:
-    """How near two texts are, in [0, 1]: the best of their words, or all of them run together; 0 where none is."""
+    """Similarity of two texts in [0, 1]: maximum over pairs of words and over all words joined."""
     asked = [word for wish in wishes(text) for word in wish]
     present = english.words_of(name)
     if not asked or not present:
@@ -326,7 +325,7 @@ def _closeness(text: str, name: str) -> float:
 
 
 def _nearness(word: str, other: str) -> float:
-    """1 for equal words, less for each slip that makes one of the other; 0 for more slips than their length excuses."""
+    """Similarity of two words: 1 if equal, less for each typo, 0 for more typos than their length allows."""
     shorter, longer = sorted((len(word), len(other)))
     excused = min(shorter // _LETTERS_PER_SLIP, _MOST_SLIPS)
     if longer - shorter > excused:
@@ -336,15 +335,15 @@ def _nearness(word: str, other: str) -> float:
 
 
 def edit_distance(word: str, other: str, most: int) -> int:
-    """Least number of slips between two words: letters that are too many, missing, wrong, or two that are exchanged.
+    """Damerau-Levenshtein distance: inserted, missing or wrong letters, or two transposed ones.
 
     Args:
         word: One word.
         other: The other word.
-        most: Limit of the slips that are counted; the work grows with this times the length of the words.
+        most: Upper limit; the cost grows with this times the length of the words.
 
     Returns:
-        The number, or ``most + 1`` if it is larger.
+        The distance, or ``most + 1`` if it is larger.
     """
     rows: list[dict[int, int]] = [{}, {j: j for j in range(min(len(other), most) + 1)}]
     for i, letter in enumerate(word, 1):

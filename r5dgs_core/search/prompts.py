@@ -1,4 +1,4 @@
-"""The logic of a prompt: everything, nothing, and what is left out ("everything but the ball", "not the vase")."""
+"""Parse prompts with "everything", "nothing" and exclusions ("everything but the ball", "not the vase")."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from .. import errors
 from . import english
 
-MOST_LETTERS = 1000  # of a prompt: the work for one grows with its length and with the number of names
-Phrase = tuple[str, list[str]]  # as it was said, and its words (`english.phrases`)
+MOST_LETTERS = 1000  # per prompt, to bound the cost, which grows with its length and the number of names
+Phrase = tuple[str, list[str]]  # as written, and its words (`english.phrases`)
 
 _THINGS = r"(?:\s+(?:of\s+)?(?:the|these|those|them|it|my))?(?:\s+(?:objects?|things?|items?))?"
 _ALL = rf"(?:the\s+)?(?:everything|anything|all|every|each|any){_THINGS}"
 _NONE = rf"(?:nothing|none{_THINGS}|no\s+(?:objects?|things?))"
 _EVERYTHING = re.compile(_ALL, re.IGNORECASE)
 _NOTHING = re.compile(_NONE, re.IGNORECASE)
-# Words that leave out wherever they stand.
+# Words that exclude anywhere in a prompt.
 _EXCEPT = re.compile(
     r"(?:\b(?:but|and)\s+|[,;]\s*)?\bnot\b|\bexcept(?:ing)?\b(?:\s+for\b)?|\bexcluding\b|\bother\s+than\b|\bapart\s+from\b",
     re.IGNORECASE,
 )
-# Words that do so only at the beginning, or after "everything": a "mug without a handle" is a mug.
+# Words that exclude only at the beginning or after "everything": a "mug without a handle" is a mug.
 _BUT = re.compile(
     rf"\s*(?:{_ALL}|{_NONE})?\s*(?P<but>\b(?:but|without|minus|besides)\b)|\s*(?:all|every|any)\b.*?(?P<late>\bbut\b)",
     re.IGNORECASE | re.DOTALL,
@@ -31,12 +31,12 @@ _BUT = re.compile(
 
 @dataclass(frozen=True)
 class Prompt:
-    """A prompt in its parts.
+    """A parsed prompt.
 
     Attributes:
-        wanted: Phrases of the objects to find, beside ``everything``.
+        wanted: Phrases of the objects to find, in addition to ``everything``.
         excluded: Phrases of the objects to leave out.
-        everything: True if the prompt means all objects.
+        everything: True if the prompt selects all objects.
     """
 
     wanted: tuple[Phrase, ...] = ()
@@ -45,14 +45,14 @@ class Prompt:
 
 
 def parse(text: str, names: Iterable[str] = ()) -> Prompt:
-    """Take a prompt apart.
+    """Parse a prompt.
 
     Args:
         text: The prompt.
-        names: Names of objects; a prompt that is one as it stands asks for that alone, even for "Not" or "all".
+        names: Names of objects; a prompt that equals one selects only that, even "Not" or "all".
 
     Raises:
-        ConfigError: Nothing follows the word that leaves out, or the prompt is longer than `MOST_LETTERS`.
+        ConfigError: Nothing follows an excluding word, or the prompt is longer than `MOST_LETTERS`.
     """
     if len(text) > MOST_LETTERS:
         raise errors.ConfigError(
@@ -77,7 +77,7 @@ def parse(text: str, names: Iterable[str] = ()) -> Prompt:
 
 
 def _list(text: str, names: set[str]) -> Prompt:
-    """A text without words that leave out: phrases, some of which may be names, "everything" or "nothing"."""
+    """Parse a text without excluding words: phrases, some of which may be names, "everything" or "nothing"."""
     words = english.words_of(text)
     if words and _spelled(text) in names:
         return Prompt(wanted=((text.strip(), words),))
@@ -92,7 +92,7 @@ def _list(text: str, names: set[str]) -> Prompt:
 
 
 def _first(text: str) -> tuple[int, int] | None:
-    """Return start and end of the first word that leaves objects out; None if there is none."""
+    """Start and end of the first excluding word, or None."""
     always, but = _EXCEPT.search(text), _BUT.match(text)
     spans = [always.span()] if always is not None else []
     spans += [but.span("but" if but["but"] else "late")] if but is not None else []
