@@ -1,4 +1,4 @@
-"""The user's actions in Blender, one per file; each module lists its classes in ``CLASSES``."""
+"""Operators of the extension, one user action per file. Each module lists its classes in ``CLASSES``."""
 
 import bpy
 
@@ -92,7 +92,7 @@ MENUS = ((bpy.types.TOPBAR_MT_file_import, _menu_import), (bpy.types.TOPBAR_MT_f
 
 
 def register():
-    """Register every class, and the entries of File > Import and File > Export."""
+    """Register all classes, and the entries of File > Import and File > Export."""
     for module in MODULES:
         for cls in module.CLASSES:
             bpy.utils.register_class(cls)
@@ -101,7 +101,7 @@ def register():
 
 
 def unregister():
-    """Undo `register` in reverse order; what still runs is stopped first."""
+    """Stop running operators, and undo `register` in reverse order."""
     stepwise_operator.stop_all(bpy.context)
     for menu, draw in MENUS:
         menu.remove(draw)

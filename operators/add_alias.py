@@ -1,4 +1,4 @@
-"""Add Alias: another word that finds the active object."""
+"""Add Alias operator: another word that finds the active object."""
 
 import bpy
 from bpy.props import StringProperty
@@ -13,7 +13,7 @@ class R5DGS_OT_add_alias(polls.OfObject, bpy.types.Operator):
     bl_label = "Add Alias"
     bl_options = {"REGISTER", "UNDO"}
 
-    word: StringProperty(name="Word", description="The other word, such as 'cup'", options={"SKIP_SAVE"})
+    word: StringProperty(name="Word", description="Word that finds the object, such as 'cup'", options={"SKIP_SAVE"})
 
     def invoke(self, context, event):
         return context.window_manager.invoke_props_dialog(self)
@@ -32,7 +32,7 @@ class R5DGS_OT_add_alias(polls.OfObject, bpy.types.Operator):
             self.report({"WARNING"}, "Type a word first")
             return {"CANCELLED"}
         if word in [alias.name for alias in entry.aliases]:
-            self.report({"INFO"}, f"'{word}' finds {object_names.names(found[0])[found[1]]} already")
+            self.report({"INFO"}, f"'{word}' already finds {object_names.names(found[0])[found[1]]}")
             return {"CANCELLED"}
         entry.aliases.add().name = word
         return {"FINISHED"}

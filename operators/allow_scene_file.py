@@ -1,4 +1,4 @@
-"""Allow: let the file be read that a .blend names, though it lies elsewhere."""
+"""Allow operator: trust the scene file that a .blend names outside its folder."""
 
 import bpy
 from bpy.props import BoolProperty
@@ -10,7 +10,7 @@ from ..r5dgs_addon.ui import status_bar
 
 
 class R5DGS_OT_allow_scene_file(polls.NeedsScene, bpy.types.Operator):
-    """Let the scene file be read that this .blend names, though it lies neither beside nor below the .blend"""
+    """Allow the .blend to read its scene file, which is outside the folder of the .blend"""
 
     bl_idname = "r5dgs.allow_scene_file"
     bl_label = "Allow"

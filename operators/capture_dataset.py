@@ -1,4 +1,4 @@
-"""Render the scene into a training data set: images, exact masks, cameras, times and poses."""
+"""Capture operator: render the scene as a training data set with images, exact masks, cameras, times and poses."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ def _items(identifiers, descriptions):
 
 
 class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
-    """Render this scene from many cameras into a data set that R5DGS trains on"""
+    """Render this scene from many cameras into a data set for training R5DGS"""
 
     bl_idname = "r5dgs.capture_dataset"
     bl_label = "Capture R5DGS Data Set"
@@ -39,12 +39,25 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
     device: EnumProperty(name="Device", items=[("CPU", "CPU", ""), ("GPU", "GPU", "As set in the preferences")])
     frame_start: IntProperty(name="First Frame", description="Frame of t = 0; the scene's if not set")
     frame_end: IntProperty(name="Last Frame", description="Frame of t = 1; the scene's if not set")
-    frame_step: IntProperty(name="Frame Step", description="Captured frames are this far apart", default=1, min=1)
+    frame_step: IntProperty(
+        name="Frame Step", description="Number of frames from one captured frame to the next", default=1, min=1
+    )
     t_max: FloatProperty(name="t_max", description="Last observed time", default=0.75, min=0.0, max=1.0)
-    val_every: IntProperty(name="Val Every", description="Every n-th observed time", default=4, min=1)
-    val_between: BoolProperty(name="Val Between", description="Also half-way between observed times", default=True)
-    test_every: IntProperty(name="Test Every", description="Every n-th later time", default=1, min=1)
-    test_views: IntProperty(name="Test Views", description="Observed views in test, beside novel", default=4, min=0)
+    val_every: IntProperty(
+        name="Val Every",
+        description="Interval of the observed times that are rendered from novel views",
+        default=4,
+        min=1,
+    )
+    val_between: BoolProperty(
+        name="Val Between", description="Render novel views half-way between observed times, too", default=True
+    )
+    test_every: IntProperty(
+        name="Test Every", description="Interval of the later times that are rendered", default=1, min=1
+    )
+    test_views: IntProperty(
+        name="Test Views", description="Observed views in test, in addition to novel ones", default=4, min=0
+    )
     observed: StringProperty(
         name="Observed", description="Names of observed cameras (patterns) or their collection; empty for all"
     )
@@ -56,7 +69,7 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
         items=_items(
             cameras.RIGS,
             (
-                "An arc about the scene camera where the scene has fewer than three cameras",
+                "An arc around the scene camera if the scene has fewer than three cameras",
                 "Only the scene's cameras",
                 "Cameras on an arc",
                 "Cameras on a ring",
@@ -66,36 +79,38 @@ class R5DGS_OT_capture_dataset(stepwise_operator.Running, bpy.types.Operator):
     )
     rig_observed: IntProperty(name="Rig Observed", description="Generated observed cameras", default=10, min=0)
     rig_novel: IntProperty(name="Rig Novel", description="Generated novel cameras", default=2, min=0)
-    rig_target: StringProperty(name="Rig Target", description="Object to look at; empty for the middle of all objects")
-    rig_radius: FloatProperty(name="Rig Radius", description="Distance from the target; 0 sees all objects", min=0.0)
+    rig_target: StringProperty(name="Rig Target", description="Object to look at; empty for the center of all objects")
+    rig_radius: FloatProperty(
+        name="Rig Radius", description="Distance from the target; 0 to fit all objects into view", min=0.0
+    )
     rig_elevation_deg: FloatProperty(name="Rig Elevation", description="Degrees above the target", default=30.0)
     rig_elevation_spread_deg: FloatProperty(
-        name="Rig Elevation Spread", description="Degrees between neighbours", default=0.0
+        name="Rig Elevation Spread", description="Difference in elevation between neighbors in degrees", default=0.0
     )
     rig_azimuth_deg: FloatProperty(
         name="Rig Azimuth", description="Middle of the arc, degrees counter-clockwise from +X", default=-90.0
     )
     rig_arc_deg: FloatProperty(name="Rig Arc", description="Length of the arc in degrees", default=120.0)
     rig_fov_deg: FloatProperty(
-        name="Rig Field of View", description="Horizontal, degrees", default=45.0, min=1.0, max=170.0
+        name="Rig Field of View", description="Horizontal field of view in degrees", default=45.0, min=1.0, max=170.0
     )
     objects: EnumProperty(
         name="Objects",
         items=_items(
             captured_objects.CHOICES,
             (
-                "By pass index where any is set, else what is animated, else what is selected",
-                "Everything with a pass index above 0",
-                "What is in a collection; its child collections are an object each",
-                "What is selected",
-                "What moves or deforms in the frame range",
+                "By pass index if any is set, otherwise animated objects, otherwise selected ones",
+                "Objects with a pass index above 0",
+                "Objects in a collection; each child collection is one object",
+                "Selected objects",
+                "Objects that move or deform in the frame range",
             ),
         ),
     )
     object_collection: StringProperty(name="Object Collection", description="Collection that holds the objects")
 
     def settings(self) -> CaptureSettings:
-        """The properties as settings; a frame range that was not set is the scene's."""
+        """Return the properties as settings; an unset frame range is that of the scene."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(CaptureSettings)}
         values["directory"] = self.target_folder()
         for name in ("frame_start", "frame_end"):

@@ -1,4 +1,4 @@
-"""Test Worker: start the worker's Python, and report its versions, device and speed."""
+"""Test Worker operator: start the worker and report its versions, device and speed."""
 
 import time
 
@@ -13,8 +13,7 @@ KEY = "check"
 
 
 class R5DGS_OT_check_worker(worker_operator.Waiting, bpy.types.Operator):
-    """Start the worker anew, with the Python chosen in the preferences or found, and say its versions, device and \
-speed (the first time it compiles, 10 s)"""
+    """Restart the worker and report its versions, device and speed; the first test compiles the rasterizer (10 s)"""
 
     bl_idname = "r5dgs.check_worker"
     bl_label = "Test Worker"

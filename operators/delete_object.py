@@ -1,4 +1,4 @@
-"""Delete Object: an object of the scene with everything that belongs to it."""
+"""Delete Object operator: delete objects of a scene with everything that belongs to them."""
 
 import bpy
 from bpy.props import BoolProperty
@@ -8,7 +8,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_delete_object(bpy.types.Operator):
-    """Delete the selected objects: anchors, points, keys and collections that are empty then"""
+    """Delete the selected objects with their anchors, points, keys and emptied collections"""
 
     bl_idname = "r5dgs.delete_object"
     bl_label = "Delete Object"

@@ -1,4 +1,4 @@
-"""Duplicate Object: a copy that moves the same way, as an object of its own."""
+"""Duplicate With Motion operator: independent copies of objects that move the same way."""
 
 import bpy
 from bpy.props import BoolProperty, FloatVectorProperty
@@ -16,7 +16,7 @@ class R5DGS_OT_duplicate_object(bpy.types.Operator):
 
     offset: FloatVectorProperty(
         name="Offset",
-        description="How far the copies stand off, along the scene's axes; unless set, beside the originals",
+        description="Offset of the copies in the scene's axes; if not set, they are placed next to the originals",
         subtype="TRANSLATION",
         unit="LENGTH",
         options={"SKIP_SAVE"},

@@ -1,4 +1,4 @@
-"""Exact Mode: play what bends while observed."""
+"""Exact Mode operator: play the residual motion of single Gaussians."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -9,20 +9,20 @@ from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
 ACTIONS = (
-    ("TOGGLE", "Toggle", "On where it is off, and off where it is on"),
-    ("ON", "On", "Play what bends"),
-    ("OFF", "Off", "Move objects as wholes"),
+    ("TOGGLE", "Toggle", "Toggle Exact Mode"),
+    ("ON", "On", "Play the residual motion of single Gaussians"),
+    ("OFF", "Off", "Move objects rigidly"),
 )
 
 
 class R5DGS_OT_exact_mode(polls.NeedsScene, bpy.types.Operator):
-    """Play points that bend before the last observed time, read from the scene file on every frame change"""
+    """Play the residual motion of single Gaussians, read from the scene file at each frame change"""
 
     bl_idname = "r5dgs.exact_mode"
     bl_label = "Exact Mode"
     bl_options = {"REGISTER", "UNDO"}
 
-    action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
+    action: EnumProperty(name="Action", description="Change of the mode", items=ACTIONS)
 
     @classmethod
     def poll(cls, context):

@@ -1,4 +1,4 @@
-"""Export Cameras: Blender's cameras as transforms.json or COLMAP text."""
+"""Export Cameras operator: Blender's cameras as transforms.json or COLMAP text model."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
@@ -8,21 +8,21 @@ from ..r5dgs_addon.ui import stepwise_operator
 
 
 class R5DGS_OT_export_cameras(stepwise_operator.Running, bpy.types.Operator):
-    """Write cameras with lens, pose and time for radiance-field tools"""
+    """Export cameras with lens, pose and time for radiance field tools"""
 
     bl_idname = "r5dgs.export_cameras"
     bl_label = "Export Cameras"
     bl_options = {"REGISTER", "PRESET"}
 
-    directory: StringProperty(
-        name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
+    directory: StringProperty(name="Folder", description="Output folder", subtype="DIR_PATH", options={"SKIP_SAVE"})
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    which: EnumProperty(name="Cameras", description="What is exported", items=cameras.WHICH)
-    format: EnumProperty(name="Format", description="What is written", items=cameras.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES, default="RANGE")
-    frame_step: IntProperty(name="Frame Step", description="Frames from one view to the next", default=1, min=1)
-    axes: EnumProperty(name="Axes", description="World that the cameras are in", items=gaussians.AXES)
+    which: EnumProperty(name="Cameras", description="Cameras to export", items=cameras.WHICH)
+    format: EnumProperty(name="Format", description="Output format", items=cameras.FORMATS)
+    frames: EnumProperty(name="Frames", description="Frames to export", items=frame_range.FRAMES, default="RANGE")
+    frame_step: IntProperty(
+        name="Frame Step", description="Number of frames from one view to the next", default=1, min=1
+    )
+    axes: EnumProperty(name="Axes", description="Coordinate system of the cameras", items=gaussians.AXES)
 
     @classmethod
     def poll(cls, context):

@@ -1,4 +1,4 @@
-"""Export Masks: which object each pixel shows, as PNG masks and index EXR."""
+"""Export Object Masks operator: object of each pixel as PNG masks and index EXR."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
@@ -9,19 +9,19 @@ from ..r5dgs_addon.ui import stepwise_operator
 
 
 class R5DGS_OT_export_masks(stepwise_operator.Running, polls.NeedsCamera, bpy.types.Operator):
-    """Render which object each pixel of the active camera shows, in the worker, and write it to files"""
+    """Render the object of each pixel of the active camera in the worker and save it to files"""
 
     bl_idname = "r5dgs.export_masks"
     bl_label = "Export Object Masks"
     bl_options = {"REGISTER", "PRESET"}
 
-    directory: StringProperty(
-        name="Folder", description="Folder that the files go into", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
+    directory: StringProperty(name="Folder", description="Output folder", subtype="DIR_PATH", options={"SKIP_SAVE"})
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    format: EnumProperty(name="Format", description="What is written", items=masks.FORMATS)
-    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES, default="RANGE")
-    frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
+    format: EnumProperty(name="Format", description="Output format", items=masks.FORMATS)
+    frames: EnumProperty(name="Frames", description="Frames to export", items=frame_range.FRAMES, default="RANGE")
+    frame_step: IntProperty(
+        name="Frame Step", description="Number of frames from one file to the next", default=1, min=1
+    )
 
     def steps(self, context):
         return masks.steps(

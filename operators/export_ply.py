@@ -1,4 +1,4 @@
-"""Export PLY: what Blender shows of loaded scenes as 3D Gaussian Splatting files."""
+"""Export Gaussians operator: visible Gaussians as 3D Gaussian Splatting files."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from ..r5dgs_addon.ui import stepwise_operator
 
 
 class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
-    """Write Gaussians where they are now, edits included, as PLY files that other splat tools read"""
+    """Export Gaussians with all edits at their current place as PLY files for other splat tools"""
 
     bl_idname = "r5dgs.export_ply"
     bl_label = "Export Gaussians"
@@ -20,19 +20,21 @@ class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
     filepath: StringProperty(name="File", description="The .ply file", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
-    which: EnumProperty(name="Objects", description="What is exported", items=gaussians.WHICH, default="VISIBLE")
-    frames: EnumProperty(name="Frames", description="When it is exported", items=frame_range.FRAMES)
-    frame_step: IntProperty(name="Frame Step", description="Frames from one file to the next", default=1, min=1)
-    axes: EnumProperty(name="Axes", description="World that the positions are in", items=gaussians.AXES)
+    which: EnumProperty(name="Objects", description="Objects to export", items=gaussians.WHICH, default="VISIBLE")
+    frames: EnumProperty(name="Frames", description="Frames to export", items=frame_range.FRAMES)
+    frame_step: IntProperty(
+        name="Frame Step", description="Number of frames from one file to the next", default=1, min=1
+    )
+    axes: EnumProperty(name="Axes", description="Coordinate system of the positions", items=gaussians.AXES)
     plain: BoolProperty(
         name="Plain",
-        description="Leave out object ids and identity encodings, for tools that refuse columns they do not know",
+        description="Omit object ids and identity encodings, for tools that reject unknown columns",
         default=False,
     )
 
     @classmethod
     def poll(cls, context):
-        if not loaded_scenes.scene_collections():  # one that is only instanced is exported, too
+        if not loaded_scenes.scene_collections():  # scenes that are only instanced are exported, too
             cls.poll_message_set(selection.NO_SCENE)
             return False
         return True

@@ -1,4 +1,4 @@
-"""Save Edited Scene: a loaded scene with its edits as a new .r5dgs file."""
+"""Save Edited Scene operator: a loaded scene with its edits as a new .r5dgs file."""
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
@@ -11,18 +11,18 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_export_scene(polls.NeedsScene, stepwise_operator.Running, bpy.types.Operator):
-    """Write the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
+    """Save the active scene with its edits as a .r5dgs file: names, colors, deleted and moved objects, motion"""
 
     bl_idname = "r5dgs.export_scene"
     bl_label = "Save Edited Scene"
     bl_options = {"REGISTER", "PRESET"}
 
-    filepath: StringProperty(name="File", description="The new .r5dgs file", subtype="FILE_PATH", options={"SKIP_SAVE"})
+    filepath: StringProperty(name="File", description="New .r5dgs file", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default="*.r5dgs", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     exact: BoolProperty(
         name="Full Precision",
-        description="Store all numbers as they are, in a file about twice as large",
+        description="Store all numbers in full precision; the file is about twice as large",
         default=False,
     )
 

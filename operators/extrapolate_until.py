@@ -1,4 +1,4 @@
-"""Extrapolate Until: extend or shorten the future of a loaded scene."""
+"""Extrapolate Until operator: extend or shorten the extrapolation of a loaded scene."""
 
 import bpy
 from bpy.props import BoolProperty, FloatProperty
@@ -10,7 +10,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_extrapolate_until(polls.NeedsScene, bpy.types.Operator):
-    """Extend or shorten the future of the whole scene; edited physics are obeyed, keys edited by hand stay"""
+    """Extend or shorten the extrapolation of the whole scene, using edited physics and keeping keys edited by hand"""
 
     bl_idname = "r5dgs.extrapolate_until"
     bl_label = "Extrapolate Until"
@@ -18,7 +18,7 @@ class R5DGS_OT_extrapolate_until(polls.NeedsScene, bpy.types.Operator):
 
     t_end: FloatProperty(name="Scene Time", description="Scene time of the last keys", precision=3, step=10)
     fit_timeline: BoolProperty(
-        name="Fit Timeline", description="Set the last frame of the timeline to the last keys", default=True
+        name="Fit Timeline", description="Set the end of the frame range to the last keys", default=True
     )
 
     def invoke(self, context, event):

@@ -1,4 +1,4 @@
-"""Fit Timeline: the frame range and the marker of a scene that was appended or linked."""
+"""Fit Timeline operator: set frame range and marker for a scene that was appended or linked."""
 
 import bpy
 
@@ -6,7 +6,7 @@ from ..r5dgs_addon.scene import loaded_scenes, polls, timeline
 
 
 class R5DGS_OT_fit_timeline(polls.NeedsScene, bpy.types.Operator):
-    """Set the frame range to that of the loaded scene, and mark its last observed time"""
+    """Set the frame range to that of the loaded scene and mark its last observed time"""
 
     bl_idname = "r5dgs.fit_timeline"
     bl_label = "Fit Timeline"

@@ -1,4 +1,4 @@
-"""Isolate: hide all objects of the loaded scenes but some."""
+"""Isolate operator: hide all objects of the loaded scenes except some."""
 
 import bpy
 from bpy.props import IntProperty, StringProperty
@@ -9,7 +9,7 @@ from ..r5dgs_addon.ui import plural
 
 
 class R5DGS_OT_isolate(polls.Selects, bpy.types.Operator):
-    """Hide the other objects of all loaded scenes, in viewports and renders"""
+    """Hide the other objects of all loaded scenes in viewports and renders"""
 
     bl_idname = "r5dgs.isolate"
     bl_label = "Isolate"

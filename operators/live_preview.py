@@ -1,4 +1,4 @@
-"""Live Preview: let the preview image follow what Blender shows, or stop that."""
+"""Live Preview operator: start or stop the live preview."""
 
 import bpy
 

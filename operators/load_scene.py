@@ -1,4 +1,4 @@
-"""Load R5DGS Scene: sidebar, File > Import, drag and drop, ``bpy.ops.r5dgs.load_scene(filepath=...)``."""
+"""Load Scene operator: sidebar, File > Import, drag and drop, or ``bpy.ops.r5dgs.load_scene(filepath=...)``."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ from ..r5dgs_core import errors
 from ..r5dgs_core.scene import scene_file
 
 CONVENTIONS = (
-    ("FILE", "From the File", "The convention that the file records"),
+    ("FILE", "From the File", "Convention stored in the file"),
     ("blender", "Blender (Z up)", "Data sets made in Blender, such as those of D-NeRF and NVFi"),
     ("colmap", "COLMAP (Y down)", "Structure from motion: x right, y down, z forward"),
     ("opengl", "OpenGL (Y up)", "x right, y up, z backward"),
 )
 SH_DEGREES = (
-    ("ALL", "As Trained", "All harmonics of the file"),
-    ("0", "None", "One color from all sides; the smallest .blend files"),
-    ("1", "Degree 1", "3 harmonics beside the color"),
-    ("2", "Degree 2", "8 harmonics beside the color"),
-    ("3", "Degree 3", "15 harmonics beside the color"),
+    ("ALL", "As Trained", "All spherical harmonics of the file"),
+    ("0", "None", "The same color from all directions; smallest .blend files"),
+    ("1", "Degree 1", "3 harmonics in addition to the color"),
+    ("2", "Degree 2", "8 harmonics in addition to the color"),
+    ("3", "Degree 3", "15 harmonics in addition to the color"),
 )
 OPTIONS = ("world_convention", "frame_zero", "t_end", "key_tolerance", "fit_timeline", "sh_degree", "display")
 
@@ -40,16 +40,16 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     world_convention: EnumProperty(
         name="World Axes", description="Axes of the scene's world", items=CONVENTIONS, default="FILE"
     )
-    frame_zero: FloatProperty(name="Frame of Time 0", description="Frame at which the scene time is 0", default=1.0)
+    frame_zero: FloatProperty(name="Frame of Time 0", description="Frame of scene time 0", default=1.0)
     t_end: FloatProperty(
         name="Extrapolate Until",
-        description="Scene time up to which motion is extrapolated; 0 for a third of the observed span, at least to 1",
+        description="Scene time up to which motion is extrapolated; 0 for a third of the observed span, at least 1",
         default=0.0,
         min=0.0,
     )
     key_tolerance: FloatProperty(
         name="Key Tolerance",
-        description="Largest error of the keys, as a fraction of the scene's size; larger gives fewer keys to edit",
+        description="Maximum error of the keys as a fraction of the scene's size; larger values give fewer keys",
         default=keyframes.TOLERANCE,
         min=1e-7,
         max=0.1,
@@ -60,13 +60,13 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
     )
     sh_degree: EnumProperty(
         name="View Dependence",
-        description="How finely the points store how colors change with the viewing direction",
+        description="Degree of the stored dependence of colors on the viewing direction",
         items=SH_DEGREES,
         default="ALL",
     )
     display: EnumProperty(
         name="Display",
-        description="What stands for Gaussians where the viewport draws no splats",
+        description="Representation of Gaussians in viewports that draw no splats",
         items=viewport_display.ITEMS,
         default=viewport_display.POINTS,
     )
@@ -117,7 +117,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
-        if scene.residual_rows is not None:  # one matrix for each group is all that anchors can say
+        if scene.residual_rows is not None:  # anchors only hold one transform per group
             count = len(scene.residual_rows)
             self.report(
                 {"WARNING"}, f"{plural.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
@@ -133,7 +133,7 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
 
 
 class R5DGS_FH_scene(bpy.types.FileHandler):
-    """Drag and drop of .r5dgs files."""
+    """File handler for drag and drop of .r5dgs files."""
 
     bl_idname = "R5DGS_FH_scene"
     bl_label = "R5DGS Scene"

@@ -1,4 +1,4 @@
-"""Pivot to 3D Cursor: let the active object turn or swing about where the 3D cursor is."""
+"""Pivot to 3D Cursor operator: set the pivot of the active object's motion to the 3D cursor."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_pivot_to_cursor(bpy.types.Operator):
-    """Let the active object turn or swing about the 3D cursor after the last observed time, from Re-Extrapolate on"""
+    """Make the active object turn or swing about the 3D cursor past the last observed time"""
 
     bl_idname = "r5dgs.pivot_to_cursor"
     bl_label = "Pivot to 3D Cursor"

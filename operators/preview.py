@@ -1,4 +1,4 @@
-"""Preview: rasterize what Blender shows into the image `R5DGS Preview`."""
+"""Preview operator: render the scene in the worker into the image `R5DGS Preview`."""
 
 import bpy
 
@@ -8,7 +8,7 @@ from ..r5dgs_addon.worker import worker_operator
 
 
 class R5DGS_OT_preview(worker_operator.Waiting, polls.NeedsCamera, bpy.types.Operator):
-    """Render the loaded scenes as the active camera sees them, in the worker, into the image 'R5DGS Preview'"""
+    """Render the loaded scenes through the active camera into the image 'R5DGS Preview'"""
 
     bl_idname = "r5dgs.preview"
     bl_label = "Preview"

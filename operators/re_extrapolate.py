@@ -1,4 +1,4 @@
-"""Re-Extrapolate: write the keys after the last observed time anew, from the physics of the selected objects."""
+"""Re-Extrapolate operator: rewrite the keys past the last observed time from the objects' physics."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_re_extrapolate(bpy.types.Operator):
-    """Write the keys after the last observed time anew from the physics of the selected objects; earlier keys stay"""
+    """Rewrite the keys past the last observed time from the physics of the selected objects; earlier keys are kept"""
 
     bl_idname = "r5dgs.re_extrapolate"
     bl_label = "Re-Extrapolate"

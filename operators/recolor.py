@@ -1,4 +1,4 @@
-"""Recolor: tint the selected objects of loaded scenes; white takes the tint back."""
+"""Recolor operator: tint the selected objects of loaded scenes; white removes the tint."""
 
 import bpy
 from bpy.props import FloatVectorProperty
@@ -7,7 +7,7 @@ from ..r5dgs_addon.scene import object_names, object_tint, selection
 
 
 def tint(operator: bpy.types.Operator, context: bpy.types.Context, factors) -> set[str]:
-    """Tint the selected objects, and say which are not ours to tint. Returns what operators return."""
+    """Tint the selected objects and report linked ones, which cannot change. Returns the operator's result."""
     wanted = [cloud for item in selection.selected(context) for cloud in object_names.clouds(*item)]
     linked = object_tint.recolor(wanted, factors)
     if linked:
@@ -16,7 +16,7 @@ def tint(operator: bpy.types.Operator, context: bpy.types.Context, factors) -> s
 
 
 class R5DGS_OT_recolor(bpy.types.Operator):
-    """Multiply the colors of the selected objects; previews, renders and exports obey it"""
+    """Multiply the colors of the selected objects in the viewport, previews, renders and exports"""
 
     bl_idname = "r5dgs.recolor"
     bl_label = "Recolor"
@@ -24,7 +24,7 @@ class R5DGS_OT_recolor(bpy.types.Operator):
 
     tint: FloatVectorProperty(
         name="Tint",
-        description="Color that the Gaussians are multiplied with; white leaves them as captured",
+        description="Color that multiplies the Gaussians; white keeps the captured colors",
         subtype="COLOR_GAMMA",
         size=3,
         default=object_tint.NONE,

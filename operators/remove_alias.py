@@ -1,4 +1,4 @@
-"""Remove Alias: a word that shall not find the active object any more."""
+"""Remove Alias operator: remove a word that finds an object."""
 
 import bpy
 from bpy.props import StringProperty
@@ -13,7 +13,7 @@ class R5DGS_OT_remove_alias(polls.OfObject, bpy.types.Operator):
     bl_label = "Remove Alias"
     bl_options = {"REGISTER", "UNDO"}
 
-    word: StringProperty(name="Word", description="The word", options={"SKIP_SAVE"})
+    word: StringProperty(name="Word", description="Word to remove", options={"SKIP_SAVE"})
 
     def execute(self, context):
         found = self.found(context)

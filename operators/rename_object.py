@@ -1,4 +1,4 @@
-"""Rename Object: in the table, and its collection, anchor and clouds with it."""
+"""Rename Object operator: rename an object in the table, with its collection, anchor and point clouds."""
 
 import bpy
 from bpy.props import StringProperty
@@ -8,13 +8,13 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_rename_object(polls.OfObject, bpy.types.Operator):
-    """Rename the active object of a loaded scene: its collection, anchor and clouds, and what finds it"""
+    """Rename the active object of a loaded scene with its collection, anchor and point clouds"""
 
     bl_idname = "r5dgs.rename_object"
     bl_label = "Rename Object"
     bl_options = {"REGISTER", "UNDO"}
 
-    new_name: StringProperty(name="Name", description="The new name", options={"SKIP_SAVE"})
+    new_name: StringProperty(name="Name", description="New name of the object", options={"SKIP_SAVE"})
 
     def invoke(self, context, event):
         found = self.found(context)

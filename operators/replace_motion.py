@@ -1,4 +1,4 @@
-"""Replace Motion: the selected objects move as the active one does."""
+"""Copy Motion From Active operator: selected objects take over the motion of the active one."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -7,26 +7,26 @@ from ..r5dgs_addon.motion import duplicate_delete, extrapolate, replace
 from ..r5dgs_core import errors
 
 STAYS = (
-    ("LAST", "Last Observed Time", "They stay where they are at the last observed time"),
-    ("FIRST", "First Observed Time", "They stay where they are at the first observed time"),
-    ("CURRENT", "Current Frame", "They stay where they are at the current frame"),
+    ("LAST", "Last Observed Time", "Keep the pose at the last observed time"),
+    ("FIRST", "First Observed Time", "Keep the pose at the first observed time"),
+    ("CURRENT", "Current Frame", "Keep the pose at the current frame"),
 )
 
 
 class R5DGS_OT_replace_motion(bpy.types.Operator):
-    """Let the selected objects move as the active one does, each from its own place and about its own pivot"""
+    """Copy the motion of the active object to the selected ones, each from its own place and about its own pivot"""
 
     bl_idname = "r5dgs.replace_motion"
     bl_label = "Copy Motion From Active"
     bl_options = {"REGISTER", "UNDO"}
 
-    stays: EnumProperty(name="In Place At", description="When the objects are where they were", items=STAYS)
+    stays: EnumProperty(name="In Place At", description="Time at which the objects keep their pose", items=STAYS)
 
     @classmethod
     def poll(cls, context):
         source = duplicate_delete.active_anchor(context)
         if source is None or not [anchor for anchor in duplicate_delete.chosen(context) if anchor != source]:
-            cls.poll_message_set("Select the objects that shall move, and last the one that they shall move like")
+            cls.poll_message_set("Select the objects to change, then the object whose motion they copy")
             return False
         return True
 

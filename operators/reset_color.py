@@ -1,4 +1,4 @@
-"""Reset Color: the selected objects of loaded scenes look as captured again."""
+"""Reset Color operator: remove the tint of the selected objects."""
 
 import bpy
 
@@ -7,7 +7,7 @@ from . import recolor
 
 
 class R5DGS_OT_reset_color(bpy.types.Operator):
-    """Take the tint off the selected objects"""
+    """Remove the tint of the selected objects"""
 
     bl_idname = "r5dgs.reset_color"
     bl_label = "Reset Color"
@@ -18,7 +18,7 @@ class R5DGS_OT_reset_color(bpy.types.Operator):
         if not any(
             object_tint.is_tinted(cloud) for item in selection.selected(context) for cloud in object_names.clouds(*item)
         ):
-            cls.poll_message_set("Select an object that is tinted first")
+            cls.poll_message_set("Select a tinted object first")
             return False
         return True
 

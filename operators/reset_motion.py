@@ -1,4 +1,4 @@
-"""Reset to Learned: bring the motion of the selected objects back to what the scene file says."""
+"""Reset to Learned operator: restore the motion of the scene file."""
 
 import bpy
 from bpy.props import BoolProperty
@@ -9,7 +9,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_reset_motion(bpy.types.Operator):
-    """Bring the physics of the selected objects, and the keys after the last observed time, back to the learned ones"""
+    """Reset the physics of the selected objects and the keys past the last observed time to the learned motion"""
 
     bl_idname = "r5dgs.reset_motion"
     bl_label = "Reset to Learned"
@@ -17,7 +17,7 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
 
     observed: BoolProperty(
         name="Observed Keys Too",
-        description="Read the keys up to the last observed time from the scene file again, in place of yours",
+        description="Replace the keys up to the last observed time by those of the scene file, too",
         default=False,
     )
 
@@ -28,7 +28,7 @@ class R5DGS_OT_reset_motion(bpy.types.Operator):
     def execute(self, context):
         anchors = duplicate_delete.chosen(context)
         try:
-            if self.observed:  # all of it is there and can be written before any of it is
+            if self.observed:  # read and check everything before writing
                 extrapolate.check(anchors, curves=False)
                 members = duplicate_delete.by_scene(anchors)
                 sources = [

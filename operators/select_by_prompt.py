@@ -1,4 +1,4 @@
-"""Select by Prompt: words to objects, by names, aliases and the meanings that the scene file stores."""
+"""Select by Prompt operator: find objects by names, aliases and stored embeddings, and select them."""
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
@@ -9,22 +9,22 @@ from ..r5dgs_addon.scene import polls, selection
 MODES = (
     ("SET", "Set", "Select these objects only", "SELECT_SET", 0),
     ("ADD", "Add", "Add these objects to the selection", "SELECT_EXTEND", 1),
-    ("SUBTRACT", "Subtract", "Take these objects out of the selection", "SELECT_SUBTRACT", 2),
+    ("SUBTRACT", "Subtract", "Remove these objects from the selection", "SELECT_SUBTRACT", 2),
 )
 
 
 class R5DGS_OT_select_by_prompt(polls.Selects, bpy.types.Operator):
-    """Select the objects that these words name"""
+    """Select the objects that match these words"""
 
     bl_idname = "r5dgs.select_by_prompt"
     bl_label = "Select by Prompt"
     bl_options = {"REGISTER", "UNDO"}
 
     text: StringProperty(name="Prompt", description="Words for the objects, such as 'red mug'", options={"SKIP_SAVE"})
-    mode: EnumProperty(name="Mode", description="What to do with the selection", items=MODES, default="SET")
+    mode: EnumProperty(name="Mode", description="Change of the selection", items=MODES, default="SET")
     threshold: FloatProperty(
         name="Threshold",
-        description="Least score of a match; the sidebar's where it is not given",
+        description="Minimum score of a match; the sidebar's if not given",
         min=0.0,
         max=1.0,
         subtype="FACTOR",
@@ -37,7 +37,7 @@ class R5DGS_OT_select_by_prompt(polls.Selects, bpy.types.Operator):
         if not text:
             self.report({"WARNING"}, "Type the name of an object first")
             return {"CANCELLED"}
-        self.text = text  # for the redo panel, as the threshold below
+        self.text = text  # for the redo panel, like the threshold below
         if self.properties.is_property_set("threshold"):
             settings.threshold = self.threshold
         else:

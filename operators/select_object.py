@@ -1,4 +1,4 @@
-"""Select Object: one object of a loaded scene, by its id; what a click on a match does."""
+"""Select Object operator: select an object of a loaded scene by its id, used for matches in the sidebar."""
 
 import bpy
 from bpy.props import EnumProperty, IntProperty, StringProperty
@@ -8,14 +8,14 @@ from . import select_by_prompt
 
 
 class R5DGS_OT_select_object(polls.Selects, bpy.types.Operator):
-    """Select this object; Shift adds it, Ctrl takes it out"""
+    """Select this object; Shift adds it, Ctrl removes it"""
 
     bl_idname = "r5dgs.select_object"
     bl_label = "Select Object"
     bl_options = {"REGISTER", "UNDO"}
 
     scene: StringProperty(
-        name="Scene", description="Collection of its scene; empty for the active one", options={"SKIP_SAVE"}
+        name="Scene", description="Collection of the object's scene; empty for the active one", options={"SKIP_SAVE"}
     )
     object_id: IntProperty(
         name="Object Id",
@@ -24,7 +24,7 @@ class R5DGS_OT_select_object(polls.Selects, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
     mode: EnumProperty(
-        name="Mode", description="What to do with the selection", items=select_by_prompt.MODES, options={"SKIP_SAVE"}
+        name="Mode", description="Change of the selection", items=select_by_prompt.MODES, options={"SKIP_SAVE"}
     )
 
     def invoke(self, context, event):

@@ -1,4 +1,4 @@
-"""Set Display: points or ellipsoids for the Gaussians of a loaded scene."""
+"""Set Display operator: show the Gaussians of a loaded scene as points or ellipsoids."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -7,13 +7,13 @@ from ..r5dgs_addon.scene import loaded_scenes, polls, viewport_display
 
 
 class R5DGS_OT_set_display(polls.NeedsScene, bpy.types.Operator):
-    """Choose what stands for the Gaussians of this scene where the viewport draws no splats"""
+    """Choose how viewports that draw no splats represent the Gaussians of this scene"""
 
     bl_idname = "r5dgs.set_display"
     bl_label = "Set Display"
     bl_options = {"REGISTER", "UNDO"}
 
-    display: EnumProperty(name="Display", description="What stands for a Gaussian", items=viewport_display.ITEMS)
+    display: EnumProperty(name="Display", description="Representation of Gaussians", items=viewport_display.ITEMS)
 
     @classmethod
     def poll(cls, context):

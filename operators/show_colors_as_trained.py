@@ -1,4 +1,4 @@
-"""Show Colors as Trained: colour management that gives the colours back as trained, whatever the engine is."""
+"""Show Colors as Trained operator: colour management that reproduces trained colours with any render engine."""
 
 import bpy
 

@@ -1,4 +1,4 @@
-"""Show Confidence: how sure the extrapolated paths are, as tubes in the viewport."""
+"""Show Confidence operator: show the uncertainty of extrapolated paths as tubes."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -9,20 +9,20 @@ from ..r5dgs_addon.ui import plural
 from ..r5dgs_core import errors
 
 ACTIONS = (
-    ("TOGGLE", "Toggle", "Remove the tubes where there are some, else make them"),
-    ("SHOW", "Show", "Make or renew the tubes"),
+    ("TOGGLE", "Toggle", "Remove existing tubes, otherwise create them"),
+    ("SHOW", "Show", "Create or update the tubes"),
     ("HIDE", "Hide", "Remove the tubes"),
 )
 
 
 class R5DGS_OT_show_confidence(polls.NeedsScene, bpy.types.Operator):
-    """Show the paths of the selected objects, or of all, as tubes as thick as one standard deviation"""
+    """Show the extrapolated paths of the selected objects, or of all, as tubes of one standard deviation"""
 
     bl_idname = "r5dgs.show_confidence"
     bl_label = "Show Confidence"
     bl_options = {"REGISTER", "UNDO"}
 
-    action: EnumProperty(name="Action", description="What to do", items=ACTIONS)
+    action: EnumProperty(name="Action", description="Change of the tubes", items=ACTIONS)
 
     def execute(self, context):
         collection = loaded_scenes.active_collection(context)
@@ -33,14 +33,14 @@ class R5DGS_OT_show_confidence(polls.NeedsScene, bpy.types.Operator):
             count = sum(confidence_tubes.hide(anchor) for anchor in shown)
             self.report({"INFO"}, f"Removed {plural.of(count, 'tube')}")
             return {"FINISHED"}
-        # Shadows go where their casters go: a tube of their own is shown to who asks for it.
+        # Shadows follow their casters, so they get a tube only if selected.
         leaders = [a for a in everyone if physics.has_motion(a) and a.r5dgs_motion.leader is None]
         anchors = selected or leaders
         try:
             found = [(anchor, extrapolate.times_of(anchor)) for anchor in anchors]
             for anchor, times in found:
                 if confidence_tubes.moves(anchor, times):
-                    confidence_tubes.path(anchor, times)  # what is refused is refused before there is any tube
+                    confidence_tubes.path(anchor, times)  # raises before any tube is created
             tubes = [confidence_tubes.show(anchor, times) for anchor, times in found]
         except errors.R5dgsError as error:
             self.report({"ERROR"}, str(error))

@@ -1,4 +1,4 @@
-"""Simplify Keys: few keys to edit by hand, within a stated distance of the motion."""
+"""Simplify Keys operator: reduce keys within a tolerance, for manual editing."""
 
 import bpy
 from bpy.props import FloatProperty
@@ -9,7 +9,7 @@ from ..r5dgs_core import errors
 
 
 class R5DGS_OT_simplify_keys(bpy.types.Operator):
-    """Leave the selected objects as few keys as keep their motion, so that they can be edited by hand"""
+    """Reduce the keys of the selected objects within a tolerance of their motion, for editing by hand"""
 
     bl_idname = "r5dgs.simplify_keys"
     bl_label = "Simplify Keys"
@@ -17,7 +17,7 @@ class R5DGS_OT_simplify_keys(bpy.types.Operator):
 
     tolerance: FloatProperty(
         name="Tolerance",
-        description="Largest distance of any point from its place before, as a share of the object's size",
+        description="Maximum displacement of any point as a fraction of the object's size",
         default=1e-3,
         min=1e-6,
         max=0.5,

@@ -1,4 +1,4 @@
-"""Un-Isolate: show objects of the loaded scenes as they were before *Isolate*."""
+"""Un-Isolate operator: restore the visibility before *Isolate*."""
 
 import bpy
 
@@ -6,7 +6,7 @@ from ..r5dgs_addon.scene import isolation
 
 
 class R5DGS_OT_unisolate(bpy.types.Operator):
-    """Show the other objects again; what was hidden before stays hidden"""
+    """Show the other objects again, except those hidden before"""
 
     bl_idname = "r5dgs.unisolate"
     bl_label = "Un-Isolate"

@@ -1,4 +1,4 @@
-"""Use R5DGS Engine: choose the render engine, and report how exactly the scene's view shows the colours as trained."""
+"""Use R5DGS Engine operator: choose the render engine, and report the colour loss under the view transform."""
 
 import bpy
 
@@ -9,7 +9,7 @@ REMEDY = "'Show Colors as Trained' in the render properties sets Standard, which
 
 
 class R5DGS_OT_use_engine(bpy.types.Operator):
-    """Render with the engine R5DGS. The view transform stays: the engine inverts it for Gaussians"""
+    """Render with the R5DGS engine, which inverts the current view transform for Gaussians"""
 
     bl_idname = "r5dgs.use_engine"
     bl_label = "Use R5DGS Engine"

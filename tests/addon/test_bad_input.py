@@ -158,8 +158,8 @@ WITHOUT_A_SCENE = {
         "delete_object", "duplicate_object", "pivot_to_cursor", "re_extrapolate", "reset_motion", "simplify_keys",
     ),
     "Select an object of a loaded scene first": ("recolor",),
-    "Select an object that is tinted first": ("reset_color",),
-    "Select the objects that shall move": ("replace_motion",),
+    "Select a tinted object first": ("reset_color",),
+    "Select the objects to change": ("replace_motion",),
     "Nothing is isolated": ("unisolate",),
     "Live preview needs a window": ("live_preview",),
 }  # fmt: skip
