@@ -1,1 +1,1 @@
-"""Measure a scene against its data set: metrics, tables, legend and contact sheet."""
+"""Evaluation of a scene against its data set: metrics, tables, legend and contact sheet."""

@@ -1,4 +1,4 @@
-"""A picture that shows a scene beside its data set: ground truth, ours, difference and identity map at four times."""
+"""Contact sheet of a scene: ground truth, rendering, difference and identity map at four times."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ BACKGROUND_COLOR, UNKNOWN_COLOR = (0.16, 0.16, 0.18), (1.0, 0.0, 1.0)
 
 
 def choose_views(dataset: datasets.Dataset) -> tuple[datasets.View, ...]:
-    """Pick four views by increasing time, two observed and two past t_max, from one camera where there is one.
+    """Pick four views by increasing time, two observed and two past t_max, from one camera if possible.
 
-    Held-out views come first: val (train where there is none) for the observed times, test for the later ones. Where a
-    split is missing the other fills its place.
+    Held-out views come first: val (train if empty) for observed times, test for later ones. If a split has too few
+    views, the other one fills its columns.
     """
     early, late = dataset.val or dataset.train, dataset.test
     by_camera: dict[str, tuple[list[datasets.View], list[datasets.View]]] = {}
@@ -54,15 +54,15 @@ def write(
     background: np.ndarray | None = None,
     backend: str = "auto",
 ) -> Path:
-    """Render views of a data set and write the sheet.
+    """Render views of a data set and write the contact sheet.
 
     Args:
         scene: The scene.
         dataset: The data set.
         path: PNG file to write.
-        views: Its columns, `choose_views` where None.
-        mode: Way to move past t_max.
-        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        views: Columns of the sheet; `choose_views` if None.
+        mode: Playback mode past t_max.
+        background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
 
     Returns:
@@ -84,14 +84,14 @@ def draw(
     truths: Sequence[np.ndarray],
     masks: Sequence[np.ndarray | None],
 ) -> np.ndarray:
-    """Draw the sheet: one column per view, rows ground truth, ours, difference, identity map.
+    """Draw the sheet: one column per view; rows are ground truth, rendering, difference and identity map.
 
     Args:
-        scene: The scene, for names, colours and t_max.
+        scene: The scene, for names, colors and t_max.
         views: The columns, at least one.
-        renderings: What the scene shows in them.
+        renderings: Rendering of the scene for each view.
         truths: True images. [H, W, 3] each
-        masks: True object ids, whose outlines are drawn, or None. [H, W] each
+        masks: True object ids, drawn as outlines, or None. [H, W] each
 
     Returns:
         The picture. [h, w, 3] uint8
@@ -148,14 +148,14 @@ def draw(
 
 
 def color_ids(scene: Scene, ids: np.ndarray) -> np.ndarray:
-    """Paint an id map in the objects' colours; background dark gray, ids without object magenta.
+    """Color an id map with the objects' colors; background is dark gray, ids without object magenta.
 
     Args:
         scene: The scene.
         ids: Object ids. [H, W]
 
     Returns:
-        Colours, sRGB. [H, W, 3] float32
+        Colors, sRGB. [H, W, 3] float32
     """
     picture = np.full((*ids.shape, 3), UNKNOWN_COLOR, np.float32)
     picture[ids == 0] = BACKGROUND_COLOR
@@ -166,7 +166,7 @@ def color_ids(scene: Scene, ids: np.ndarray) -> np.ndarray:
 
 
 def _spread(views: Sequence[datasets.View], count: int) -> list[datasets.View]:
-    """``count`` views spread over the times of ``views``, the last among them, the first where count > 1."""
+    """Return ``count`` views spread over the times of ``views``, including the last, and the first if count > 1."""
     ordered = sorted(views, key=lambda view: view.t)
     if count <= 0:
         return []

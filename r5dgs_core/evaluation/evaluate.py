@@ -1,7 +1,7 @@
-"""A baked scene against the images, masks and true poses of its data set.
+"""Evaluation of a baked scene against the images, masks and true poses of its data set.
 
-The result has one fixed shape (docs/reference/evaluation.md), so that it can be compared across versions. Renderings
-are rounded to 8 bits before they are measured, as in image files.
+The result has a fixed form (docs/results/evaluation.md) that is comparable across versions. Renderings are rounded to 8
+bits before they are measured, as in an image file.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _SAME_TIME = 1e-9  # scene time
 
 @dataclass(frozen=True)
 class Rendering:
-    """One picture of a scene.
+    """Rendered picture of a scene.
 
     Attributes:
         color: Display-referred sRGB, rounded to 8 bits. [H, W, 3] float32
         ids: Object of each pixel, 0 = background. [H, W] int32
-        ms_motion: Time that the motion took, milliseconds.
-        ms_raster: Time that the rendering took, milliseconds.
+        ms_motion: Time to move the Gaussians, milliseconds.
+        ms_raster: Time to rasterize them, milliseconds.
     """
 
     color: np.ndarray
@@ -77,16 +77,16 @@ def evaluate(
     Args:
         scene: The scene.
         dataset: The data set.
-        modes: Ways to move past t_max, of `scene_player.modes`.
+        modes: Playback modes past t_max, from `scene_player.modes`.
         splits: Splits to measure.
-        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
-        train: What the training took: "seconds", "iterations", "gaussians".
-        progress: Called with images measured and their number.
+        train: Cost of training: "seconds", "iterations", "gaussians".
+        progress: Called with the number of measured images and the total.
 
     Returns:
-        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types; what could
-        not be computed is None.
+        ``{"scene", "splits": {split: {mode: METRICS}}, "objects": [...], "train": {...}}`` in JSON types. Values that
+        cannot be computed are None.
     """
     background = truth_background(scene) if background is None else background
     total = sum(len(dataset.views(split)) for split in splits) * len(modes)
@@ -129,23 +129,23 @@ def measure(
     backend: str = "auto",
     measured: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
-    """Measure pictures of a scene that is moved in any way.
+    """Measure pictures of a scene whose Gaussians are moved by a function.
 
     Args:
         scene: The scene.
         views: Cameras, times and true images.
-        move: The scene's Gaussians at a time.
-        background: Colour behind transparent pixels of the true images, sRGB, `truth_background` where None. [3]
+        move: Returns the scene's Gaussians at a time.
+        background: Color behind transparent pixels of the true images, sRGB; `truth_background` if None. [3]
         backend: Rasterizer.
         measured: Called after each image.
 
     Returns:
-        METRICS; what could not be computed is None.
+        METRICS; values that cannot be computed are None.
     """
     background = truth_background(scene) if background is None else background
     tally = _Tally([item.id for item in scene.objects if item.id > 0])
     for view in (views[0], views[-1]) if views else ():
-        draw(scene, view.camera, view.t, move, backend=backend)  # compiles, fills what is kept; not timed
+        draw(scene, view.camera, view.t, move, backend=backend)  # compiles kernels and fills caches before timing
     for view in views:
         rendering = draw(scene, view.camera, view.t, move, backend=backend)
         later = is_later(scene, view.t)
@@ -159,7 +159,7 @@ def write(evaluation: dict[str, Any], path: Path) -> Path:
     """Write an evaluation as JSON; returns ``path``.
 
     Raises:
-        ConfigError: It cannot be written there.
+        ConfigError: The file cannot be written.
     """
     try:
         atomic_files.write(path, json.dumps(evaluation, indent=2).encode())
@@ -169,16 +169,16 @@ def write(evaluation: dict[str, Any], path: Path) -> Path:
 
 
 def render(scene: Scene, camera: Camera, t: float, mode: str = "rigid", *, backend: str = "auto") -> Rendering:
-    """Render colour and object ids of a scene at a time; see `draw`."""
+    """Render color and object ids of a scene at a time; see `draw`."""
     return draw(scene, camera, t, functools.partial(scene_player.frame, scene, mode=mode), backend=backend)
 
 
 def draw(
     scene: Scene, camera: Camera, t: float, move: Callable[[float], scene_player.Frame], *, backend: str = "auto"
 ) -> Rendering:
-    """Render colour and object ids of a scene moved in any way, with the milliseconds that it took.
+    """Render color and object ids of a scene moved by a function, and measure the time in milliseconds.
 
-    The id of a pixel is the classifier's answer to the blended identities where the scene has both, else the object
+    The id of a pixel is the classifier's prediction for the blended identities if the scene has both, else the object
     with the largest weight in the pixel.
     """
     start = time.perf_counter()
@@ -199,17 +199,16 @@ def draw(
 
 
 def truth_background(scene: Scene) -> np.ndarray:
-    """Colour that a scene was trained to show where its images are transparent: black if its configuration says so,
-    else white. [3] float32"""
+    """Return the color that training put behind transparent pixels: black if configured, else white. [3] float32"""
     train = scene.provenance.get("config", {}).get("train", {})
     return np.zeros(3, np.float32) if train.get("background") == "black" else np.ones(3, np.float32)
 
 
 def classify(scene: Scene, features: np.ndarray) -> np.ndarray:
-    """Object of each pixel from its blended identity encoding: argmax of the scene's classifier.
+    """Return the object of each pixel from its blended identity encoding: argmax of the scene's classifier.
 
     Args:
-        scene: The scene, with classifier.
+        scene: A scene with a classifier.
         features: Blended identities, no background term. [H, W, 16]
 
     Returns:
@@ -227,20 +226,20 @@ def classify(scene: Scene, features: np.ndarray) -> np.ndarray:
 
 
 def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> list[dict[str, Any]]:
-    """Error of each object's predicted pose at the last time of the ground truth.
+    """Return the error of each object's predicted pose at the last time of the ground truth.
 
-    The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times
-    at which the object was seen decide (`ground_truth_poses.bodies`).
+    The object frames in the scene and in the ground truth differ by a constant rigid offset, which is estimated from
+    the observed times at which the object was seen (`ground_truth_poses.bodies`).
 
     Returns:
-        Per object ``id name position_error rotation_error_deg``: world units and degrees, None where the object has no
+        Per object ``id name position_error rotation_error_deg``, in world units and degrees; None if the object has no
         true pose or no motion group. Without ground truth, one row per object of the scene.
     """
     named = {item.id: item.name for item in scene.objects if item.id > 0}
     known: tuple[ground_truth_poses.Body, ...] = ()
     if ground_truth is not None:
         known = ground_truth_poses.bodies(scene, ground_truth)
-        if not scene.provenance.get("discovered"):  # else the ids of the truth mean nothing here
+        if not scene.provenance.get("discovered"):  # ids of discovered objects do not correspond to the true ids
             named = dict(zip(ground_truth.object_ids, ground_truth.names, strict=True)) | named
     rows: dict[int, dict[str, Any]] = {
         key: {"id": key, "name": name, "position_error": None, "rotation_error_deg": None}
@@ -255,12 +254,12 @@ def object_errors(scene: Scene, ground_truth: datasets.GroundTruth | None) -> li
 
 
 def is_later(scene: Scene, t: float) -> bool:
-    """Whether a time is past the scene's t_max: what it shows is extrapolated."""
+    """Return True if a time is past the scene's t_max, so that the scene extrapolates."""
     return t > scene.t_max + _SAME_TIME
 
 
 class _Tally:
-    """Collects the errors of a split's images and averages them."""
+    """Accumulator of the errors of a split's images."""
 
     def __init__(self, ids: list[int]) -> None:
         self.values: dict[str, list[float]] = {name: [] for name in METRICS}
@@ -299,6 +298,6 @@ class _Tally:
 
 
 def _mean(values: Sequence[float]) -> float | None:
-    """Mean of the values that are numbers; None where there are none."""
+    """Mean of the values that are not NaN; None if there are none."""
     kept = [value for value in values if not math.isnan(value)]
     return float(np.mean(kept)) if kept else None

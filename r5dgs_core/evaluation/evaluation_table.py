@@ -1,4 +1,4 @@
-"""An evaluation, and what a scene needs, as tables for the terminal."""
+"""Terminal tables of an evaluation and of a scene's needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.table import Table
 
 from . import miou
 
-# What the tables show: key in METRICS, what the user reads, its short form in rows of modes ("": left out), format.
+# Rows of the tables: key in METRICS, label, column name in tables of several modes ("" = omitted), number format.
 _SHOWN = (
     ("psnr", "PSNR, mean over images (dB)", "PSNR", "{:.2f}"),
     ("psnr_pooled", "PSNR of the pooled error (dB)", "", "{:.2f}"),
@@ -32,13 +32,13 @@ ABSENT = "not computed"
 
 
 def make(evaluation: dict[str, Any]) -> Table | Group:
-    """Lay out an evaluation (`evaluate.evaluate`): images above, pose errors of the objects below.
+    """Lay out an evaluation (`evaluate.evaluate`): image metrics above, pose errors of the objects below.
 
     Args:
         evaluation: The evaluation, as in ``evaluation.json``.
 
     Returns:
-        The table, to print with rich; with several modes, one whose rows they are, and the poses below.
+        A rich table. With several modes, a table with one row per mode, followed by the pose errors.
     """
     columns = [(split, mode, values) for split, modes in evaluation["splits"].items() for mode, values in modes.items()]
     if len({mode for _, mode, _ in columns}) > 1:
@@ -69,7 +69,7 @@ def make(evaluation: dict[str, Any]) -> Table | Group:
 
 
 def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[str, Any]]]) -> Table:
-    """A row for each split and mode; what was computed for none of them is left out."""
+    """Return a table with one row per split and mode; columns without any value are omitted."""
     table = Table(title=_title(evaluation), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.caption, table.caption_justify = f"motion and raster: ms per frame. {_caption(rows)}", "left"
     shown = [
@@ -91,7 +91,7 @@ def _of_modes(evaluation: dict[str, Any], rows: Sequence[tuple[str, str, dict[st
 
 
 def _caption(columns: Sequence[tuple[str, str, dict[str, Any]]]) -> str:
-    """Which images each split has, and what mIoU is where there is one."""
+    """Return the number of images per split and, if computed, the definition of mIoU."""
     counts = {split: (metrics["images"], metrics.get("images_later")) for split, _, metrics in columns}
     parts = []
     for split, (images, later) in counts.items():
@@ -107,7 +107,7 @@ def _caption(columns: Sequence[tuple[str, str, dict[str, Any]]]) -> str:
 def _overlaps(
     evaluation: dict[str, Any], columns: Sequence[tuple[str, str, dict[str, Any]]]
 ) -> list[tuple[str, list[str]]]:
-    """Rows of the objects' IoU, below a heading; none without masks."""
+    """Return a heading and the rows of the objects' IoU; an empty list without masks."""
     named = {str(row["id"]): row["name"] for row in evaluation["objects"]}
     found = [metrics.get("iou_objects") or {} for _, _, metrics in columns]
     ids = sorted({key for values in found for key in values}, key=int)
@@ -126,12 +126,12 @@ def _overlaps(
 
 
 def _called(name: str, object_id: int | str) -> str:
-    """Name and id of an object; brackets in a name are no markup."""
+    """Return name and id of an object, with markup brackets in the name escaped."""
     return f"{escape(name)} ({object_id})"
 
 
 def _poses(evaluation: dict[str, Any]) -> list[Table]:
-    """Pose errors of the objects, which are those of mode "rigid" whatever else was played; none without true poses."""
+    """Return the table of pose errors, always for mode "rigid"; an empty list without true poses."""
     rows = [row for row in evaluation["objects"] if row["position_error"] is not None]
     if not rows:
         return []
@@ -145,18 +145,18 @@ def _poses(evaluation: dict[str, Any]) -> list[Table]:
 
 
 def needs(rows: Sequence[dict[str, Any]]) -> Table:
-    """The needs table of a scene: of the whole, then object by object.
+    """Return the table of a scene's needs, for the whole scene and then per object.
 
     Args:
         rows: ``Scene.needs``.
 
     Returns:
-        The table, to print with rich.
+        A rich table.
     """
-    table = Table(title="what the scene needs", title_justify="left")
+    table = Table(title="needs of the scene", title_justify="left")
     for name, side in (("", "left"), ("need", "left"), ("value", "right"), ("threshold", "right"), ("", "left")):
         table.add_column(name, justify=side)  # type: ignore[arg-type]
-    table.add_column("what the value is", overflow="fold")
+    table.add_column("meaning of the value", overflow="fold")
     owner = None
     for row in rows:
         if row.get("object") != owner:

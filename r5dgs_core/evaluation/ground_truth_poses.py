@@ -1,7 +1,7 @@
-"""True poses of a data set in a scene's terms: where each motion group should be, and how far off it is.
+"""True poses of a data set in the frame of a scene: true motion of each motion group, and its error.
 
-The object's frame in the scene and in the ground truth differ by a constant rigid offset, which the observed times at
-which the object was seen decide (`metrics.true_motion`). Notation: T times of the ground truth.
+The object frames in the scene and in the ground truth differ by a constant rigid offset, which is estimated from the
+observed times at which the object was seen (`metrics.true_motion`). Notation: T times of the ground truth.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..playback import scene_player
 from ..scene.scene import MotionGroup, Scene
 from . import metrics
 
-TURNS_DEG = 5.0
+TURNS_DEG = 5.0  # median rotation error up to which rotation counts as observed
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Body:
     """A motion group and its true motion.
 
     Attributes:
-        object_id: Its object.
-        name: Of the object, as the ground truth has it.
-        group: The motion group; one of role "pinned" for an object at rest, about the object's own centre.
+        object_id: Id of the object.
+        name: Name of the object in the ground truth.
+        group: The motion group; for an object at rest, one of role "pinned" about the object's own center.
         size: Diameter of the object, world units.
-        times: Of the ground truth. [T]
+        times: Times of the ground truth. [T]
         motion: True map from the bind state to the world. [T, 4, 4]
-        path: Where the group's pivot truly is if the body's own origin tells: right where `motion` is not, as how the
-            scene's body lies in the true one is not known. [T, 3]
-        turn_error_deg: How far the scene's rotations are from the true ones at the observed times, median, degrees. A
-            body that looks the same from all sides may be turned as it likes.
+        path: True position of the group's pivot, derived from the path of the true body's origin alone. Unlike
+            `motion`, it does not depend on the rotation offset between both object frames. [T, 3]
+        turn_error_deg: Median angle between the scene's and the true rotations at the observed times, degrees. It may
+            be large for a body that looks the same from all sides.
     """
 
     object_id: int
@@ -50,20 +50,20 @@ class Body:
 
     @property
     def turn_seen(self) -> bool:
-        """Whether the images told how it turns: the scene's rotations are within `TURNS_DEG` of the true ones."""
+        """True if the images determine the rotation: the scene's rotations are within `TURNS_DEG` of the true ones."""
         return self.turn_error_deg <= TURNS_DEG
 
 
 def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> tuple[Body, ...]:
-    """The motion groups of a scene whose true motion is known.
+    """Return the motion groups of a scene whose true motion is known.
 
     Args:
         scene: The scene.
-        ground_truth: True poses. Where the scene found its objects by itself, places decide which is which.
-        every: All bodies of an object, not only the one that carries most of its Gaussians.
+        ground_truth: True poses. For a scene with discovered objects, positions decide which object is which.
+        every: Return all bodies of an object instead of only the one with most of its Gaussians.
 
     Returns:
-        In the order of the ground truth; none where no time of it was observed.
+        Bodies in the order of the ground truth; empty if no time of the ground truth was observed.
     """
     times = ground_truth.times
     observed = (times <= scene.t_max + 1e-9) & (times >= scene.track_times[0] - 1e-9)
@@ -90,13 +90,13 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
 
 
 def motion(scene: Scene, groups: Sequence[MotionGroup], times: np.ndarray) -> np.ndarray:
-    """How a scene moves groups: maps from the bind state to the world. G groups, [T] -> [G, T, 4, 4]"""
+    """Return the motion of groups as maps from the bind state to the world. G groups, [T] -> [G, T, 4, 4]"""
     poses = [scene_player.group_poses(scene, float(t)) for t in times]
     return np.stack([np.stack([matrix(group.pivot, q[group.id], d[group.id]) for q, d in poses]) for group in groups])
 
 
 def matrix(pivot: np.ndarray, quat: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Map from the bind state to the world: x -> p + R (x - p) + d. [4, 4]"""
+    """Return the map from the bind state to the world: x -> p + R (x - p) + d. [4, 4]"""
     result = np.eye(4)
     result[:3, :3] = rotations.quats_to_rotmats(quat)
     pivot = np.asarray(pivot, np.float64)
@@ -105,17 +105,18 @@ def matrix(pivot: np.ndarray, quat: np.ndarray, displacement: np.ndarray) -> np.
 
 
 def pose(pivot: np.ndarray, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of `matrix`: unit wxyz [..., 4] and displacement of the pivot [..., 3] of maps [..., 4, 4]."""
+    """Invert `matrix`: return unit wxyz [..., 4] and displacement of the pivot [..., 3] of maps [..., 4, 4]."""
     pivot = np.asarray(pivot, np.float64)
     turned = np.einsum("...ij,j->...i", motion[..., :3, :3], pivot)
     return rotations.rotmats_to_quats(motion[..., :3, :3]), turned + motion[..., :3, 3] - pivot
 
 
 def _renumbered(scene: Scene, ground_truth: GroundTruth) -> GroundTruth:
-    """The ground truth of those objects that a scene found by itself, with the ids that they have there.
+    """Return the ground truth of the objects that a scene discovered, renumbered to the scene's ids.
 
-    Nobody named what was found, so places decide: at the time of the truth that is nearest to the bind state each
-    object is the one that is nearest to it, no further off than the radius of that group.
+    Discovered objects have no names, so positions decide: at the true time nearest to the bind state, objects and
+        groups
+    are assigned one to one with minimal total distance. Pairs further apart than the radius of the group are dropped.
     """
     bodies = [group for group in scene.groups if group.role == "body" and group.object_id > 0]
     at = int(np.argmin(np.abs(ground_truth.times - scene.t_max)))
@@ -133,7 +134,7 @@ def _renumbered(scene: Scene, ground_truth: GroundTruth) -> GroundTruth:
 
 
 def _body(scene: Scene, object_id: int) -> MotionGroup | None:
-    """The motion group that carries most of an object's Gaussians; shadows do not count."""
+    """Return the motion group with most of an object's Gaussians, without shadows; None if it has no Gaussians."""
     candidates = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
     if not candidates:  # an object at rest may be a member of the pinned group
         pinned = scene.groups[0] if scene.groups else None
@@ -147,7 +148,7 @@ def _body(scene: Scene, object_id: int) -> MotionGroup | None:
 
 
 def _size(scene: Scene, group: MotionGroup) -> float:
-    """Twice the radius of a group; that of an object at rest holds nine of ten of its Gaussians."""
+    """Return twice the radius of a group; for an object at rest, the radius that holds 90 % of its Gaussians."""
     if group.role == "body":
         return 2 * group.model.radius
     distances = np.linalg.norm(scene.means[scene.object_ids == group.object_id] - group.pivot, axis=-1)

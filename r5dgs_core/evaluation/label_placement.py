@@ -1,15 +1,15 @@
-"""Names beside the points of a plot, so that no two of them overlap and none hides a point.
+"""Placement of labels beside the points of a plot, without overlaps and without hiding a point.
 
-Everything is in pixels; a box is (left, bottom, right, top).
+All lengths are in pixels; a box is (left, bottom, right, top).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-RADII = (7.0, 13.0, 20.0, 30.0, 42.0, 56.0, 72.0, 90.0, 112.0, 138.0, 170.0)
-ANGLES = np.radians([0, 180, 30, 330, 150, 210, 60, 300, 120, 240, 90, 270])
-MARGIN = 1.5
+RADII = (7.0, 13.0, 20.0, 30.0, 42.0, 56.0, 72.0, 90.0, 112.0, 138.0, 170.0)  # tried distances, pixels
+ANGLES = np.radians([0, 180, 30, 330, 150, 210, 60, 300, 120, 240, 90, 270])  # tried directions, radians
+MARGIN = 1.5  # least distance between boxes, pixels
 
 
 def place(
@@ -18,16 +18,16 @@ def place(
     frame: np.ndarray,  # [4]
     obstacles: np.ndarray,  # [B, 4]
 ) -> list[np.ndarray | None]:
-    """Boxes for labels, the first ones first.
+    """Place labels in order of priority.
 
     Args:
-        points: What each label names. [L, 2]
+        points: Point that each label names. [L, 2]
         sizes: Width and height of each label. [L, 2]
-        frame: Box that no label may leave. [4]
-        obstacles: Boxes that no label may touch, such as the markers of the points. [B, 4]
+        frame: Box that labels must not leave. [4]
+        obstacles: Boxes that labels must not touch, such as the markers of the points. [B, 4]
 
     Returns:
-        The box of each label, as near to its point as those before it leave room, or None where nothing is free. [4]
+        Box of each label [4], as near to its point as the earlier labels allow; None if no free place was found.
     """
     taken = np.asarray(obstacles, np.float64).reshape(-1, 4)
     found: list[np.ndarray | None] = []
@@ -40,7 +40,7 @@ def place(
 
 
 def overlaps(box: np.ndarray, others: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Which boxes [B, 4] a box [4] comes nearer to than a margin. [B] bool"""
+    """Mask of the boxes [B, 4] that are closer to a box [4] than a margin. [B] bool"""
     apart = (
         (others[:, 0] >= box[2] + margin)
         | (others[:, 2] <= box[0] - margin)
@@ -54,7 +54,7 @@ def _candidates(point: np.ndarray, size: np.ndarray):
     for radius in RADII:
         for angle in ANGLES:
             direction = np.array([np.cos(angle), np.sin(angle)])
-            # The side of the box that faces the point lies at the radius.
+            # The side of the box that faces the point is at distance ``radius``.
             center = point + radius * direction + 0.5 * size * np.where(np.abs(direction) > 0.3, np.sign(direction), 0)
             yield np.concatenate([center - 0.5 * size, center + 0.5 * size])
 

@@ -1,7 +1,6 @@
-"""A picture that says which id is what: the scene with its objects outlined, tinted and named.
+"""Legend of a scene: a picture with its objects outlined, tinted and named.
 
-Pixels are counted from the upper left corner, but for the boxes of `label_placement`, which are counted from the lower
-left.
+Pixels are counted from the upper left corner, except in boxes for `label_placement`, which use the lower left corner.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from ..render import viewpoints
 from ..scene.scene import Scene, SceneObject
 from . import evaluate, label_placement
 
-LONGEST = 1024  # least number of pixels along the longer side: names can be read whatever the size of the images
-TINT = 0.3  # share of its colour that an object takes
-ROOM = 0.9  # share of a name that its object has to lie under, for the name to stand on it
-BEHIND = 0.6  # of its brightness is left to the background
-LEAST_LETTERS = 10.0  # height of letters, pixels
+LONGEST = 1024  # minimum pixels along the longer side, so that names are legible for images of any size
+TINT = 0.3  # share of an object's color mixed into its pixels
+ROOM = 0.9  # share of a name's box that its object must cover for the name to be written on it
+BEHIND = 0.6  # brightness factor of the background
+LEAST_LETTERS = 10.0  # minimum height of letters, pixels
 DPI = 100
 _DARK, _LIGHT, _FAINT = "#101014", "#ffffff", "#8c8c94"
 
@@ -45,8 +44,8 @@ def draw(
     Args:
         scene: The scene.
         standpoint: Camera and time.
-        mode: Way to move past t_max.
-        longest: Pixels along the longer side; those of the camera, at least `LONGEST`, where None.
+        mode: Playback mode past t_max.
+        longest: Pixels along the longer side; those of the camera, but at least `LONGEST`, if None.
         backend: Rasterizer.
 
     Returns:
@@ -65,16 +64,16 @@ def annotate(scene: Scene, color: np.ndarray, ids: np.ndarray, title: str) -> np
     """Outline, tint and name the objects of a picture.
 
     Args:
-        scene: The scene, for names and colours.
+        scene: The scene, for names and colors.
         color: The picture, sRGB in [0, 1]. [H, W, 3]
         ids: Object of each pixel. [H, W]
-        title: What stands first in the strip.
+        title: First entry of the strip.
 
     Returns:
         The picture with the strip below. [h, W, 3] uint8
     """
     with warnings.catch_warnings():
-        # Letters that the font lacks become squares; the id beside them says enough.
+        # Letters missing from the font become squares; the id beside them still identifies the object.
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         return _annotate(scene, color, ids, title)
 
@@ -99,10 +98,10 @@ def _annotate(scene: Scene, color: np.ndarray, ids: np.ndarray, title: str) -> n
 
 
 def middle(mask: np.ndarray) -> tuple[float, float, float]:
-    """The point deepest inside the largest part of a mask that is not empty.
+    """Return the point deepest inside the largest part of a non-empty mask.
 
     Returns:
-        Column and row of its pixel's centre, and its distance from the edge in pixels.
+        Column and row of the pixel's center, and its distance from the edge in pixels.
     """
     parts, count = ndimage.label(mask)  # type: ignore[misc]
     if count > 1:
@@ -113,7 +112,7 @@ def middle(mask: np.ndarray) -> tuple[float, float, float]:
 
 
 def _painted(color: np.ndarray, ids: np.ndarray, listed: Sequence[SceneObject], line: int) -> np.ndarray:
-    """The picture with tints and outlines ``line`` pixels wide, in the objects' colours over a dark seam. [H, W, 3]"""
+    """Return the picture with tints, outlines ``line`` pixels wide, and a dark seam around them. [H, W, 3]"""
     picture = np.clip(color, 0, 1).astype(np.float32)
     known = np.isin(ids, [item.id for item in listed])
     picture[~known] *= BEHIND
@@ -136,7 +135,7 @@ def _halo(font_px: float) -> list[patheffects.AbstractPathEffect]:
 
 
 def _write(figure: Figure, x: float, y: float, text: str, font_px: float, color: str = _LIGHT):
-    """Text with its lower left corner at a pixel of the figure, light over a dark halo; $ has no meaning in it."""
+    """Draw light text with a dark halo, its lower left corner at a pixel of the figure, without math markup."""
     return figure.text(
         x, y, text, transform=IdentityTransform(), fontsize=font_px * 72 / DPI, color=color, va="bottom", ha="left",
         parse_math=False, path_effects=_halo(font_px),
@@ -144,15 +143,15 @@ def _write(figure: Figure, x: float, y: float, text: str, font_px: float, color:
 
 
 def _extent(figure: Figure, text: str, font_px: float) -> tuple[float, float]:
-    """Width, with some to spare, and height of a text in pixels."""
+    """Return width, with some margin, and height of a text in pixels."""
     drawn = _write(figure, 0, 0, text, font_px)
     box = drawn.get_window_extent(FigureCanvasAgg(figure).get_renderer())
     drawn.remove()
-    return 1.04 * box.width + 1, box.height  # letters with a halo are drawn as outlines, which run wider
+    return 1.04 * box.width + 1, box.height  # text with a halo is drawn as outlines, which are wider
 
 
 def _name(figure: Figure, ids: np.ndarray, listed: Sequence[SceneObject], bottom: int, font_px: float) -> None:
-    """Write names on the objects, or beside small ones: whole where there is room, else the id alone, else none."""
+    """Write names on the objects, or beside small ones; shortened to the id, or omitted, if there is no room."""
     height, width = ids.shape
     found = [(int((ids == item.id).sum()), item) for item in listed]
     found = sorted((pair for pair in found if pair[0]), key=lambda pair: -pair[0])
@@ -172,7 +171,7 @@ def _name(figure: Figure, ids: np.ndarray, listed: Sequence[SceneObject], bottom
         if under.size and (under == item.id).sum() >= ROOM * (high - low) * (right - left):
             boxes[k] = box
     on = np.array([box is not None for box in boxes])
-    # A name beside an object hides none of them where there is room for that, else it leaves their middles free.
+    # A label beside an object covers no object if there is room for that; otherwise it only avoids their middles.
     middles = np.concatenate([points - 0.7 * depths[:, None], points + 0.7 * depths[:, None]], axis=1)
     everything = _cells(np.isin(ids, [item.id for _, item in found]), bottom, font_px)
     for k in np.flatnonzero(~on):
@@ -192,7 +191,7 @@ def _name(figure: Figure, ids: np.ndarray, listed: Sequence[SceneObject], bottom
 
 
 def _cells(mask: np.ndarray, bottom: int, font_px: float) -> np.ndarray:
-    """Boxes that cover a mask: squares of half a letter's height that hold a part of it. [B, 4]"""
+    """Return boxes that cover a mask: the non-empty squares of a grid of half a letter's height. [B, 4]"""
     side = max(round(0.5 * font_px), 1)
     height, width = mask.shape
     padded = np.pad(mask, ((0, -height % side), (0, -width % side)))
@@ -204,14 +203,14 @@ def _cells(mask: np.ndarray, bottom: int, font_px: float) -> np.ndarray:
 def _beside(
     point: np.ndarray, size: np.ndarray, frame: np.ndarray, taken: np.ndarray, font_px: float
 ) -> np.ndarray | None:
-    """The box of one name near its point, whatever the scale of the picture; None where nothing is free. [4]"""
-    unit = font_px / 17  # the distances of `label_placement` are made for letters of that size
+    """Return the box of one name near its point, scaled with the letters; None if no place is free. [4]"""
+    unit = font_px / 17  # `label_placement` uses distances for letters 17 pixels high
     (box,) = label_placement.place(point[None] / unit, size[None] / unit, frame / unit, taken / unit)
     return None if box is None else box * unit
 
 
 def _lead(figure: Figure, point: np.ndarray, end: np.ndarray, item: SceneObject, font_px: float) -> None:
-    """A line from an object's middle, with a dot, to its name."""
+    """Draw a line from an object's middle, marked with a dot, to its name."""
     pixels, thin = np.stack([point, end]), 0.12 * font_px * 72 / DPI
     dark = [patheffects.withStroke(linewidth=3 * thin, foreground=_DARK)]
     for ends, marker in ((pixels, ""), (pixels[:1], "o")):
@@ -230,7 +229,7 @@ def _lead(figure: Figure, point: np.ndarray, end: np.ndarray, item: SceneObject,
 
 
 class _Strip:
-    """The list of all objects below the picture: a square of the colour, id and name; faint where it is not seen."""
+    """List of all objects below the picture: color square, id and name; faint if the object is not seen."""
 
     def __init__(self, listed: Sequence[SceneObject], seen: set[int], title: str, width: int, font_px: float):
         self._font, self._row = font_px, round(1.7 * font_px)

@@ -1,4 +1,4 @@
-"""Errors of images, id maps and poses, each as the paper or the field defines it.
+"""Error metrics of images, id maps and poses, as defined by the paper or the field.
 
 Images are float in [0, 1], display-referred sRGB, [H, W, 3]. Id maps are integers, 0 = background, [H, W].
 """
@@ -11,21 +11,21 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize
 
-MSE_FLOOR = 1e-10  # equal images score 100 dB, so that means stay finite
+MSE_FLOOR = 1e-10  # limits PSNR to 100 dB, so that means stay finite for equal images
 SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
 def mse(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Mean squared error over pixels and channels.
+    """Return the mean squared error over pixels and channels.
 
     Args:
-        image: Rendered. [H, W, 3]
+        image: Rendered image. [H, W, 3]
         truth: Ground truth. [H, W, 3]
-        where: Pixels that count, all where None. [H, W] bool
+        where: Mask of the pixels to count; all if None. [H, W] bool
 
     Returns:
-        The mean; NaN where no pixel counts.
+        The mean; NaN if the mask is empty.
     """
     _check_pair(image, truth)
     squared = (image.astype(np.float64) - truth.astype(np.float64)) ** 2
@@ -35,18 +35,18 @@ def mse(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -
 
 
 def psnr_of_mse(value: float) -> float:
-    """Peak signal-to-noise ratio of a mean squared error in dB, at most 100."""
+    """Return the peak signal-to-noise ratio of a mean squared error, dB, at most 100."""
     return -10.0 * math.log10(max(value, MSE_FLOOR))
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float:
-    """PSNR of one image in dB, over the pixels ``where`` holds; at most 100; NaN where no pixel counts."""
+    """Return the PSNR of an image over the pixels in ``where``, dB, at most 100; NaN if the mask is empty."""
     value = mse(image, truth, where)
     return math.nan if math.isnan(value) else psnr_of_mse(value)
 
 
 def psnr_pooled(errors: Sequence[float]) -> float:
-    """PSNR of the mean of the images' squared errors: at most the mean of their PSNR. NaN without images.
+    """Return the PSNR of the mean squared error over all images, which is at most their mean PSNR; NaN without images.
 
     Source: FreeGave's ``MAEPSNR``, -10 log10(mean(10^(-PSNR / 10))).
     """
@@ -54,18 +54,18 @@ def psnr_pooled(errors: Sequence[float]) -> float:
 
 
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
-    """Structural similarity as 3D Gaussian Splatting computes it: the mean of `ssim_map`, 1 for equal images."""
+    """Return the structural similarity as in 3D Gaussian Splatting: the mean of `ssim_map`, 1 for equal images."""
     return float(ssim_map(image, truth).mean())
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Structural similarity of the windows around each pixel.
+    """Return the structural similarity of the windows around each pixel.
 
     Window 11 x 11, Gaussian of sigma 1.5, zero padding, constants 0.01 and 0.03. Packages that pad by reflection or
-    leave the border out give other means (differences up to 0.007).
+    crop the border give other means (differences up to 0.007).
 
     Args:
-        image: Rendered. [H, W, 3]
+        image: Rendered image. [H, W, 3]
         truth: Ground truth. [H, W, 3]
 
     Returns:
@@ -83,7 +83,7 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> float | None:
-    """Mean FLIP error of display-referred images; None where `flip-evaluator` (extra ``metrics``) is not installed."""
+    """Return the mean FLIP error of display-referred images; None without `flip-evaluator` (extra ``metrics``)."""
     try:
         import flip_evaluator
     except ImportError:
@@ -102,8 +102,8 @@ def confusion(
     Args:
         predicted: Predicted ids. [H, W]
         truth: True ids. [H, W]
-        ids: The ids that are told apart; others, -1 among them, are counted in a last row and column. (M,)
-        where: Pixels that count, all where None. [H, W] bool
+        ids: Ids with a row and column of their own; all others, including -1, share the last row and column. (M,)
+        where: Mask of the pixels to count; all if None. [H, W] bool
 
     Returns:
         Pixels with true id ``ids[i]`` and predicted id ``ids[j]``. [M + 1, M + 1] int64
@@ -124,7 +124,7 @@ def confusion(
 
 
 def ious(counts: np.ndarray) -> np.ndarray:
-    """Intersection over union of every true id with every predicted one, 0 where both are absent. [M, M]
+    """Return the intersection over union of every true with every predicted id, 0 if both are absent. [M, M]
 
     Args:
         counts: `confusion`. [M + 1, M + 1]
@@ -135,7 +135,7 @@ def ious(counts: np.ndarray) -> np.ndarray:
 
 
 def iou_of_rest(counts: np.ndarray) -> float:
-    """IoU of the pixels of no id with those predicted as none, the background; NaN where neither has any.
+    """Return the IoU of the background, the pixels outside all ids; NaN if truth and prediction have none.
 
     Args:
         counts: `confusion`. [M + 1, M + 1]
@@ -146,31 +146,31 @@ def iou_of_rest(counts: np.ndarray) -> float:
 
 
 def present(counts: np.ndarray) -> np.ndarray:
-    """Which ids the truth shows. [M + 1, M + 1] -> [M] bool"""
+    """Mask of the ids that occur in the truth. [M + 1, M + 1] -> [M] bool"""
     return counts[:-1].sum(axis=1) > 0
 
 
 def miou(counts: np.ndarray) -> float:
-    """Mean over the ids present in the truth of their IoU with the same predicted id.
+    """Return the mean IoU of the ids present in the truth with the same predicted id.
 
     Args:
         counts: `confusion`, of one image or summed over many (pooled). [M + 1, M + 1]
 
     Returns:
-        The mean; NaN where the truth has none of the ids.
+        The mean; NaN if the truth has none of the ids.
     """
     shown = present(counts)
     return float(np.diag(ious(counts))[shown].mean()) if shown.any() else math.nan
 
 
 def matched(counts: np.ndarray) -> dict[int, int]:
-    """The one-to-one map from true to predicted ids with the largest sum of IoU (Hungarian method).
+    """Return the one-to-one map from true to predicted ids with the largest sum of IoU (Hungarian method).
 
     Args:
         counts: `confusion`. [M + 1, M + 1]
 
     Returns:
-        Column of each row that the truth shows; a row that overlaps with nothing left over has none.
+        Column of each row that is present in the truth; rows without overlap with a remaining column are missing.
     """
     shown = np.flatnonzero(present(counts))
     table = ious(counts)[shown]
@@ -179,7 +179,7 @@ def matched(counts: np.ndarray) -> dict[int, int]:
 
 
 def miou_matched(counts: np.ndarray) -> float:
-    """As `miou`, after the map `matched`."""
+    """Return the mean IoU as in `miou`, with predicted ids mapped by `matched`."""
     shown = present(counts)
     table = ious(counts)
     total = sum(float(table[i, j]) for i, j in matched(counts).items())
@@ -187,7 +187,7 @@ def miou_matched(counts: np.ndarray) -> float:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Rotation nearest to a matrix, or to the mean of rotations (chordal mean). [..., 3, 3]"""
+    """Return the rotation nearest to a matrix; for a mean of rotations, the chordal mean. [..., 3, 3]"""
     u, _, vt = np.linalg.svd(matrix)
     sign = np.ones((*matrix.shape[:-2], 3))
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
@@ -195,7 +195,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between rotations in degrees, accurate near 0 and 180. [..., 3, 3], [..., 3, 3] -> [...]"""
+    """Return the angle between rotations in degrees, accurate near 0 and 180. [..., 3, 3], [..., 3, 3] -> [...]"""
     between = np.swapaxes(a, -1, -2) @ b
     axis = np.stack(
         [
@@ -209,7 +209,7 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def rigid(matrices: np.ndarray) -> np.ndarray:
-    """Object-to-world matrices without their scale: rotation and translation. [..., 4, 4]"""
+    """Return object-to-world matrices without their scale. [..., 4, 4]"""
     out = np.array(matrices, np.float64)
     out[..., :3, :3] = nearest_rotation(out[..., :3, :3] / np.linalg.norm(out[..., :3, :3], axis=-2, keepdims=True))
     return out
@@ -218,16 +218,16 @@ def rigid(matrices: np.ndarray) -> np.ndarray:
 def aligned_pose_error(
     predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray
 ) -> tuple[float, float]:
-    """Error at the last time of a predicted motion against true poses given in another frame of the object.
+    """Return the error of a predicted motion at the last time, against true poses in another frame of the object.
 
     Args:
         predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
         truth: Object to world at the same times; scale is removed. [T, 4, 4]
-        observed: Times that the offset between the frames may use, at least one. [T] bool
-        center: Centre of the object in the bind state; its distance is measured. [3]
+        observed: Times from which the offset between both frames is estimated, at least one. [T] bool
+        center: Center of the object in the bind state; its distance is measured. [3]
 
     Returns:
-        Distance of the centres at the last time in world units, and angle between the rotations in degrees.
+        Distance of the centers at the last time in world units, and angle between the rotations in degrees.
     """
     motion = true_motion(predicted, truth, observed, center)
     distances, angles = pose_errors(predicted[-1:], motion[-1:], center)
@@ -235,16 +235,16 @@ def aligned_pose_error(
 
 
 def true_motion(predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """True motion of a bind state, from true poses given in another frame of the object.
+    """Return the true motion of a bind state, from true poses in another frame of the object.
 
     The constant rigid offset A between both frames is the mean of P(t)^-1 T(t) over the observed times (chordal mean of
-    the rotations), so that what differs later is error of the motion alone.
+    the rotations), so that later differences are errors of the motion alone.
 
     Args:
         predicted: Map from the bind state to the world at each time, rigid. [T, 4, 4]
         truth: Object to world at the same times; scale is removed. [T, 4, 4]
-        observed: Times that the offset may use, at least one. [T] bool
-        center: Centre of the object in the bind state. [3]
+        observed: Times from which the offset is estimated, at least one. [T] bool
+        center: Center of the object in the bind state. [3]
 
     Returns:
         Map from the bind state to the world at each time, T(t) A^-1. [T, 4, 4]
@@ -255,14 +255,14 @@ def true_motion(predicted: np.ndarray, truth: np.ndarray, observed: np.ndarray, 
     offsets = np.linalg.inv(predicted[observed]) @ poses[observed]
     align = np.eye(4)
     align[:3, :3] = nearest_rotation(offsets[:, :3, :3].mean(axis=0))
-    # The translation is averaged at the centre, not at the object's origin, which may lie far off.
+    # Average the translation at the center, because the object's origin may be far away.
     p_object = np.einsum("tij,tj->ti", np.linalg.inv(offsets), np.append(center, 1.0)[None].repeat(len(offsets), 0))
     align[:3, 3] = np.asarray(center) - align[:3, :3] @ p_object.mean(axis=0)[:3]
     return poses @ np.linalg.inv(align)
 
 
 def pose_errors(predicted: np.ndarray, motion: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of the centres in world units and angles in degrees between two motions. [T, 4, 4] -> [T], [T]"""
+    """Return center distances in world units and angles in degrees between two motions. [T, 4, 4] -> [T], [T]"""
     distances = np.linalg.norm(((predicted - motion) @ np.append(center, 1.0))[..., :3], axis=-1)
     return distances, rotation_angle_deg(predicted[..., :3, :3], motion[..., :3, :3])
 
@@ -273,7 +273,7 @@ def _check_pair(image: np.ndarray, truth: np.ndarray) -> None:
 
 
 def _blur(images: np.ndarray) -> np.ndarray:
-    """Gaussian window with zero padding, separable. [B, H, W, C]"""
+    """Convolve with a separable Gaussian window, with zero padding. [B, H, W, C]"""
     offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
     window = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
     window /= window.sum()

@@ -1,7 +1,7 @@
-"""How well the id maps of a split overlap with its true masks: mIoU, said in full.
+"""Mean intersection over union (mIoU) of a split's id maps with its true masks.
 
-Pixels of all images are counted in one table, so an object that fills more of the images counts by its pixels within
-its own IoU, and once in the mean. The background is measured apart, and pixels whose mask says nothing do not count.
+Pixels of all images are pooled: an object is weighted by its pixels within its own IoU, and counts once in the mean.
+The background is measured separately, and pixels with an unknown mask value are ignored.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from . import metrics
 
 KEYS = ("miou", "miou_matched", "iou_background", "iou_objects", "iou_objects_matched", "id_map")
 DEFINITION = (
-    "mIoU: mean over the objects in the true masks of intersection / union, pixels of all images of a split together; "
-    "matched ids: after the best one-to-one map of ids, one for the split (Hungarian); unknown pixels do not count"
+    "mIoU: mean over the objects in the true masks of intersection / union, pooled over all images of a split; "
+    "matched ids: after the best one-to-one map of ids, one per split (Hungarian method); unknown pixels are ignored"
 )
 
 
 def known(mask: np.ndarray) -> np.ndarray:
-    """Where a true mask says what is there. [H, W] -> [H, W] bool"""
+    """Mask of the pixels whose true id is known. [H, W] -> [H, W] bool"""
     return mask != masks.UNKNOWN
 
 
 def objects_of(mask: np.ndarray) -> np.ndarray:
-    """Where a true mask shows an object. [H, W] -> [H, W] bool"""
+    """Mask of the pixels that show an object. [H, W] -> [H, W] bool"""
     return (mask > 0) & known(mask)
 
 
 class Overlap:
-    """Counts pixels by true and by rendered id.
+    """Counter of pixels by true and rendered id.
 
     Args:
-        ids: Objects of the scene; those of true masks join when they are first seen.
+        ids: Object ids of the scene; further ids of true masks are added when they first occur.
     """
 
     def __init__(self, ids: Iterable[int]) -> None:
@@ -45,27 +45,27 @@ class Overlap:
         self.images = 0
 
     def add(self, rendered: np.ndarray, mask: np.ndarray) -> None:
-        """Count an image.
+        """Count the pixels of an image.
 
         Args:
             rendered: Rendered ids, 0 = background. [H, W]
-            mask: True ids; `masks.UNKNOWN` does not count. [H, W]
+            mask: True ids; pixels with `masks.UNKNOWN` are ignored. [H, W]
         """
         self.images += 1
         shown = np.unique(mask[objects_of(mask)])
         for object_id in sorted(set(shown.tolist()) - set(self.ids)):
-            # An object that the scene lacks counts as missed; so far it was in no truth and in no prediction.
+            # An object missing from the scene counts as missed; no earlier truth or prediction contains it.
             self.counts = np.insert(np.insert(self.counts, len(self.ids), 0, axis=0), len(self.ids), 0, axis=1)
             self.ids.append(object_id)
         self.counts += metrics.confusion(rendered, mask, self.ids, known(mask))
 
     def result(self) -> dict[str, Any]:
-        """What came of it, by `KEYS`, in JSON types.
+        """Return the result by `KEYS`, in JSON types.
 
         Returns:
             ``miou`` and ``miou_matched``; ``iou_background``; ``iou_objects`` and ``iou_objects_matched``, the IoU of
-            each object that the masks show, by its true id as a string; ``id_map``, the rendered id (None for none)
-            that the matched score takes for each. All None without an image, the scores without an object.
+            each object in the masks, by its true id as a string; ``id_map``, the rendered id that the matched score
+            uses for each (None if unmatched). All are None without images; the scores are None without objects.
         """
         if not self.images:
             return dict.fromkeys(KEYS)

@@ -1,4 +1,4 @@
-"""Which id is what: one row per object of a scene, with how well it is seen, how it moves and how sure its label is."""
+"""Table of a scene's objects: visibility, motion and confidence of the label of each."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from ..scene.scene import MotionGroup, Scene
 from . import evaluate, miou
 from .scene_summary import motion_of
 
-MOST_VIEWS = 24  # that pixels are counted in
+MOST_VIEWS = 24  # maximum number of views in which pixels are counted
 
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """One object.
+    """Row of the table.
 
     Attributes:
-        id: Object id; 0 is the background, -1 what is unassigned.
-        name: Its name.
+        id: Object id; 0 is the background, -1 unassigned Gaussians.
+        name: Name of the object.
         aliases: Other words for it.
-        caption: A sentence about it, or "".
-        gaussians: Its members.
-        pixels: Mean number of pixels that it has in the views.
-        views: Views that show it.
-        motion: How it moves, in words.
-        rigid_rms: Root mean square distance of its members from its rigid motion, as a share of its radius; None where
-            its members move rigidly by construction, so that there is nothing to measure.
-        confidence: Mean probability that the classifier gives its members' encodings for this object, weighted by their
-            opacities; None where the scene stores no encodings.
-        strays: Members that move with another object's group than their own.
-        iou: Overlap with the true masks of the views, same ids; None without masks that show it.
+        caption: Sentence that describes it, or "".
+        gaussians: Number of member Gaussians.
+        pixels: Mean number of pixels per view.
+        views: Number of views that show it.
+        motion: Motion in words.
+        rigid_rms: RMS distance of the members from their rigid motion, as a share of the radius; None if they move
+            rigidly by construction.
+        confidence: Mean probability of this object by the classifier over the members' encodings, weighted by opacity;
+            None if the scene stores no encodings.
+        strays: Number of members that move with the group of another object.
+        iou: IoU with the true masks of the views, same ids; None if no mask shows the object.
     """
 
     id: int
@@ -60,16 +60,16 @@ class ObjectRow:
 def measure(
     scene: Scene, views: Sequence[datasets.View | viewpoints.Standpoint], mode: str = "rigid", *, backend: str = "auto"
 ) -> list[ObjectRow]:
-    """Look at a scene from some views and describe its objects.
+    """Render a scene from some views and measure its objects.
 
     Args:
         scene: The scene.
-        views: Where from and when; those of a data set are compared with their masks.
-        mode: Way to move past t_max.
+        views: Cameras and times; views of a data set are compared with their masks.
+        mode: Playback mode past t_max.
         backend: Rasterizer.
 
     Returns:
-        A row per object of the scene's table.
+        One row per object of the scene's table.
     """
     player = scene_player.Player(scene, mode)
     tally = miou.Overlap([item.id for item in scene.objects if item.id > 0])
@@ -107,20 +107,20 @@ def measure(
 
 
 def own_views(scene: Scene) -> list[viewpoints.Standpoint]:
-    """Views of a scene's own cameras, each at another observed time; where it stores none, an overview at some."""
+    """Return views of the scene's own cameras at distinct observed times, or overviews if it stores no cameras."""
     first = float(scene.track_times[0])
     cameras = viewpoints.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
-    # Steps of the golden ratio: neither the order of the cameras nor that of the times shows in the pairs.
+    # Golden-ratio steps keep camera order and time order uncorrelated.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
     times = first + shares * (scene.t_max - first)
     return [viewpoints.Standpoint(camera, float(t)) for camera, t in zip(cameras, times, strict=True)]
 
 
 def confidences(scene: Scene) -> dict[int, float]:
-    """Mean probability that the classifier gives to the label of an object's members, weighted by their opacities.
+    """Return the classifier's mean probability of the members' own label, weighted by opacity.
 
     Returns:
-        By object id; empty where the scene stores no encodings or no classifier, without objects that have no members.
+        Probability by object id, for objects with members; empty if the scene stores no encodings or no classifier.
     """
     if scene.identities is None or scene.classifier_weight is None or scene.classifier_bias is None:
         return {}
@@ -138,24 +138,26 @@ def confidences(scene: Scene) -> dict[int, float]:
 
 
 def strays(scene: Scene) -> dict[int, int]:
-    """How many members of each object go with another one's group, or rest where theirs moves. A shadow is background
-    that follows its caster, and counts as resting."""
+    """Return the number of members of each object that move with another object's group, or rest although theirs moves.
+
+    A shadow is background that follows its caster, and counts as resting.
+    """
     bodies = {group.id: group.object_id for group in scene.groups if group.role == "body"}
     owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.motion_ids]
     labels = np.maximum(scene.object_ids, 0)
-    # What has no group of its own rests with the background, as it should.
+    # Objects without a group of their own rest with the background and are not strays.
     away = (owner != labels) & ((owner > 0) | np.isin(labels, list(bodies.values())))
     ids, counts = np.unique(scene.object_ids[away], return_counts=True)
     return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
 
 def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
-    """The rows as a table for the terminal.
+    """Return the rows as a terminal table.
 
     Args:
         scene: The scene.
-        rows: Of `measure`.
-        views: Number of views that were looked at.
+        rows: Rows of `measure`.
+        views: Number of views that were rendered.
     """
     title = escape(f"objects of {scene.name}")
     shown = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
@@ -170,21 +172,24 @@ def table(scene: Scene, rows: Sequence[ObjectRow], views: int) -> Table:
         cells += ["-" if row.rigid_rms is None else f"{100 * row.rigid_rms:.2g} %"] if measured else []
         cells += ["-" if row.confidence is None else f"{row.confidence:.3f}", str(row.strays)]
         cells += ["-" if row.iou is None else f"{row.iou:.3f}"] if compared else []
-        shown.add_row(*map(Text, cells))  # without markup: names may hold brackets
+        shown.add_row(*map(Text, cells))  # as plain text, because names may contain markup brackets
     shown.caption, shown.caption_justify = _caption(scene, rows, views), "left"
     return shown
 
 
 def to_json(scene: Scene, rows: Sequence[ObjectRow], views: int) -> dict[str, Any]:
-    """The same in JSON types: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
+    """Return the rows as JSON: ``{"scene", "views", "hygiene", "label_hygiene", "objects": [ObjectRow, ...]}``."""
     objects = [asdict(row) | {"aliases": list(row.aliases)} for row in rows]
     cleaned = {"hygiene": _recorded(scene, "regrouping"), "label_hygiene": _recorded(scene, "label_hygiene")}
     return {"scene": scene.name, "views": views, **cleaned, "objects": objects}
 
 
 def _recorded(scene: Scene, key: str) -> dict[str, Any] | None:
-    """Counts that training left in the scene: ``regrouping`` of motion labels (`train.observed_motion.Moves`) or
-    ``label_cleanup`` of the objects' (`train.identity.label_cleanup.Changes`); None where it did not run."""
+    """Return counts that training stored in the scene: ``regrouping`` of motion labels or ``label_hygiene`` of object
+    labels.
+
+    Returns None if that step did not run.
+    """
     found = scene.provenance.get(key)
     return dict(found) if isinstance(found, dict) else None
 
@@ -215,7 +220,7 @@ def _caption(scene: Scene, rows: Sequence[ObjectRow], views: int) -> str:
 
 
 def _residual(scene: Scene, groups: Sequence[MotionGroup]) -> float | None:
-    """Share of the radius, by members; None where none of the groups was found to move otherwise than rigidly."""
+    """Return the RMS share of the radius, weighted by members; None if all groups move rigidly."""
     if not any(group.rigid_max > 0 for group in groups):
         return None
     counts = np.array([max(int((scene.motion_ids == group.id).sum()), 1) for group in groups])

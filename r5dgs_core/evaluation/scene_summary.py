@@ -1,4 +1,4 @@
-"""Motion of objects in words, and the summary of a scene that ``r5dgs info`` and ``bake`` print."""
+"""Motion of objects in words, and the scene summary of ``r5dgs info`` and ``bake``."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .. import terminal
 from ..scene import quality
 from ..scene.scene import MotionGroup, Scene
 
-STILL = 0.05  # of its radius: less than this is no motion
-_KINDS = {  # as the sidebar in Blender calls them
+STILL = 0.05  # largest motion of a still object, as a share of its radius
+_KINDS = {  # names in Blender's sidebar
     "static": "rests",
     "translation": "slide",
     "ballistic_spin": "throw+spin",
@@ -23,7 +23,7 @@ _KINDS = {  # as the sidebar in Blender calls them
 
 
 def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
-    """Motion of an object past t_max in words, by its motion models; "pinned" if none of its groups can move."""
+    """Return the motion of an object past t_max in words, by its motion models; "pinned" if no group can move."""
     words = []
     for group in groups:
         if group.model.kind == "static" and _moved(scene, group) <= STILL * group.model.radius:
@@ -34,18 +34,18 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
 
 
 def _moved(scene: Scene, group: MotionGroup) -> float:
-    """Largest displacement of a member at the group's radius in the observed time, world units."""
+    """Return the largest displacement of a point at the group's radius in the observed time, world units."""
     poses = scene.track_poses[group.id]
     chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
     return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
 
 
 def summary(scene: Scene, path: Path | None = None) -> str:
-    """Return what a user wants to know of a scene: duration, frames, extent, moving objects and quality, in lines.
+    """Return the summary of a scene: duration, frames, extent, moving objects and quality, as lines.
 
     Args:
         scene: The scene.
-        path: Its file; an evaluation beside it gives the quality of the pictures.
+        path: File of the scene; an evaluation beside it provides the quality.
     """
     objects = [item for item in scene.objects if item.id > 0]
     first, fps = float(scene.track_times[0]), scene.frames_per_unit
@@ -66,7 +66,7 @@ def summary(scene: Scene, path: Path | None = None) -> str:
 
 
 def _loss_of_baking(scene: Scene) -> list[str]:
-    """PSNR of checkpoint and scene on the training views, in a line; none if the file has no such numbers."""
+    """Return a line with the PSNR of checkpoint and scene on the training views; empty if it was not stored."""
     found = scene.provenance.get("training_views")
     values = [found.get(name) for name in ("checkpoint_psnr", "baked_psnr")] if isinstance(found, dict) else [None]
     if not all(isinstance(value, int | float) for value in values):
@@ -75,7 +75,7 @@ def _loss_of_baking(scene: Scene) -> list[str]:
 
 
 def observed_motion(scene: Scene, object_id: int) -> str | None:
-    """Return how far an object moves and turns in the observed time, and its motion past t_max; None if it rests."""
+    """Return an object's largest displacement and turn in the observed time, and its later motion; None if it rests."""
     groups = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
     if not groups or motion_of(scene, groups) in ("still", "pinned"):
         return None

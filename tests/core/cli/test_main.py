@@ -119,7 +119,7 @@ def test_bake_prints_the_summary_and_the_needs_on_demand(made, tmp_path, capsys)
     for extra, shown in (([], False), (["--needs"], True)):
         assert main.main(["bake", str(made[0]), "--out", str(scene), "--progress", "none", *extra]) == 0
         text = capsys.readouterr().out
-        assert text.startswith(f"written: {scene}\nscene ") and ("what the scene needs" in text) == shown
+        assert text.startswith(f"written: {scene}\nscene ") and ("needs of the scene" in text) == shown
         assert re.search(r"^baking +checkpoint \d+\.\d\d dB, scene \d+\.\d\d dB on the training views$", text, re.M)
 
 
