@@ -1,1 +1,1 @@
-"""``r5dgs bench``: every variant trained on every scene, measured alike, and laid out in the paper's two tables."""
+"""``r5dgs bench``: train every variant on every scene, measure all alike, and write the paper's two tables."""

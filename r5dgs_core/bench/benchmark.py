@@ -1,4 +1,4 @@
-"""A benchmark from its plan to its tables; what is finished stays, what was interrupted goes on."""
+"""Run of a benchmark from its plan to its tables; finished cases are kept and interrupted ones are resumed."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ SPLITS = ("test", "val")
 
 
 def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto") -> dict[str, Any]:
-    """Train, bake and measure every case of a plan, and write what was found after each of them.
+    """Train, bake and measure every case of a plan, and write the results after each of them.
 
-    Writes into ``plan.out``: per case what `cases` says, and `RESULT_FILE`, `TABLES_FILE` and `PLOT_FILE`.
+    Writes the files of each case (`cases`), `RESULT_FILE`, `TABLES_FILE` and `PLOT_FILE` into ``plan.out``.
 
     Args:
-        plan: What to do.
+        plan: The plan.
         remeasure: Bake and measure finished runs again.
-        progress_kind: How progress is shown (`progress.make`).
+        progress_kind: Form of progress output (`progress.make`).
 
     Returns:
-        What is in `RESULT_FILE` (docs/user/bench.md).
+        The content of `RESULT_FILE` (docs/user/bench.md).
 
     Raises:
-        ConfigError, DatasetError, CheckpointError: As `cases.make`, before anything is trained.
-        TrainingError: Some cases failed; all others are done and written.
-        Interrupted: SIGINT or SIGTERM came; everything is kept that is needed to go on.
+        ConfigError, DatasetError, CheckpointError: Errors of `cases.make`, before training starts.
+        TrainingError: Some cases failed; all others are finished and written.
+        Interrupted: SIGINT or SIGTERM was received; the same command resumes the benchmark.
     """
     planned = cases.make(plan)
     records: list[dict[str, Any]] = []
@@ -58,7 +58,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
             progress({"event": "case", "text": f"{case.title} ({index + 1} of {len(planned)})"})
             try:
                 records += run_case(plan, case, remeasure, progress)
-            except Exception as error:  # whatever one case suffers from, the others are worth having
+            except Exception as error:  # a failed case must not stop the others
                 if not isinstance(error, R5dgsError):
                     log.exception("%s", case.title)
                 text = str(error) if isinstance(error, R5dgsError) else f"{type(error).__name__}: {error}"
@@ -79,7 +79,7 @@ def run_bench(plan: Plan, *, remeasure: bool = False, progress_kind: str = "auto
 
 
 def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> list[dict[str, Any]]:
-    """Train a case as far as it is not, measure it as far as it is not, and return its records, one per mode."""
+    """Train and measure a case as far as not done yet; returns its records, one per mode."""
     if not cases.is_finished(case):
         _train(plan, case, progress)
     record = cases.read_record(case)
@@ -98,12 +98,12 @@ def run_case(plan: Plan, case: Case, remeasure: bool, progress: Progress) -> lis
         "trained_on": measured.get("trained_on"),
         "train": cases.cost(record["sittings"]),
     }
-    shared["machine"] = None  # of what an earlier version measured, which did not note it
+    shared["machine"] = None  # for measurements of earlier versions, which did not record the machine
     return [{**shared, "mode": mode, **measured["modes"][mode]} for mode in plan.modes if mode in measured["modes"]]
 
 
 def _train(plan: Plan, case: Case, progress: Progress) -> None:
-    """Train a case in a process of its own, from its last checkpoint where there is one."""
+    """Train a case in a separate process, from its last checkpoint if it has one."""
     record = cases.read_record(case)
     arguments = ["train", str(case.root), "--out", str(case.run)]
     if (case.run / checkpoint.RUN_FILE).exists():
@@ -114,7 +114,7 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
         arguments += ["--config", str(plan.config_path)] if plan.config_path else []
         arguments += [text for override in case.overrides for text in ("--set", override)]
     before = record["sittings"]
-    # Should this process be killed, the record says that there was a sitting of which nothing is known.
+    # If this process is killed, the record holds a sitting of unknown cost.
     cases.write_record(case, {"sittings": [*before, {"status": None}]})
     log_path = case.beside(".log")
 
@@ -127,13 +127,13 @@ def _train(plan: Plan, case: Case, progress: Progress) -> None:
     except OSError as error:
         raise CheckpointError(f"{log_path}: training cannot be started or followed: {error}") from error
     if sitting.status == process.STOPPED:
-        raise KeyboardInterrupt  # someone stopped training from outside: that ends the benchmark, too
+        raise KeyboardInterrupt  # training was stopped from outside, which stops the benchmark too
     if sitting.status != 0:
         raise TrainingError(process.reason(sitting))
 
 
 def _stamp(case: Case) -> list[int]:
-    """What tells a checkpoint from another one."""
+    """Return size and modification time of the newest checkpoint, which identify it."""
     newest = checkpoint.newest_file(case.run)
     assert newest is not None  # the case is finished
     found = newest.stat()
@@ -143,7 +143,7 @@ def _stamp(case: Case) -> list[int]:
 def _measure(
     case: Case, measured: dict[str, Any], wanted: Sequence[str], lacking: Sequence[str], progress: Progress
 ) -> dict[str, Any]:
-    """Bake a run, write its scene, and measure it in the modes that are lacking and that it has."""
+    """Bake a run, write its scene, and measure the lacking modes that the scene supports."""
     progress({"event": "bake", "text": case.title})
     run = checkpoint.open_run(case.run)
     dataset = datasets.read(case.root)
@@ -181,7 +181,7 @@ def _measure(
 
 
 def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Write result, tables and plot of what is there so far; returns the result."""
+    """Write result, tables and plot of the cases finished so far; returns the result."""
     result = {
         "machine": machine(),
         "settings": {
@@ -200,15 +200,15 @@ def _write(plan: Plan, records: Sequence[dict[str, Any]], failures: Sequence[dic
 
 
 def _show(plan: Plan, result: dict[str, Any]) -> None:
-    """Print tables and places."""
+    """Print the tables and the paths of the files."""
 
     for sheet in tables.sheets(result):
         table, console = tables.to_rich(sheet), terminal.console()
         wide = console.measure(table, options=console.options.update(width=1000)).maximum
-        terminal.console(width=max(wide, console.width)).print(table)  # rather too long than cut short
+        terminal.console(width=max(wide, console.width)).print(table)  # too wide is better than truncated
     print(f"tables: {plan.out / TABLES_FILE}\nresult: {plan.out / RESULT_FILE}\nplot:   {plan.out / PLOT_FILE}")
 
 
 def machine() -> dict[str, Any]:
-    """What times are measured on in this process."""
+    """Describe the machine, threads and versions of this process."""
     return {**machines.describe(), "torch_threads": torch.get_num_threads(), "versions": machines.versions()}

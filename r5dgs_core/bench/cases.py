@@ -1,7 +1,7 @@
-"""What a benchmark consists of: cases, one training each, and what is kept of them on the disk.
+"""Cases of a benchmark, one training run each, and their files.
 
-A case of scene S, variant V and seed K has under the benchmark's folder: the run folder ``S/V_seedK``, and beside it
-``.r5dgs`` (the scene), ``.log`` (what training said on stderr) and ``.json`` (its record).
+A case of scene S, variant V and seed K has the run folder ``S/V_seedK`` in the benchmark's folder, and beside it the
+files ``.r5dgs`` (scene), ``.log`` (stderr of training) and ``.json`` (record).
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from ..playback import scene_player
 from ..train import checkpoint
 from . import variants as kinds
 
-# Looking at held-out views while training would be counted into its time. The user's settings win over these.
+# Evaluating held-out views during training would add to its time. The user's settings override these.
 QUIET = ("train.probe_every=0",)
-COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # of a sitting; seconds add up
+COSTS = ("cpu_seconds", "wall_seconds", "peak_mb", "peak_gpu_mb")  # per sitting; seconds are summed, peaks maximised
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the user asks for.
+    """Request of a benchmark.
 
     Attributes:
         scenes: Data sets.
         out: Folder of the benchmark.
-        variants: Of `variants.VARIANTS`.
-        seeds: Of training.
-        modes: Of `scene_player.every`; a scene is played in those that it has data for.
-        preset: Named settings of training.
-        config_path: TOML configuration, wins over the preset.
-        overrides: ``section.key=value``, win over both.
+        variants: Names from `variants.VARIANTS`.
+        seeds: Seeds of training.
+        modes: Playback modes from `scene_player.every`; modes without data in a scene are skipped.
+        preset: Named training settings.
+        config_path: TOML configuration; overrides the preset.
+        overrides: ``section.key=value``; override both.
     """
 
     scenes: tuple[Path, ...]
@@ -53,13 +53,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Case:
-    """One training and its measurement.
+    """One training run and its measurement.
 
     Attributes:
         scene: Name of the data set.
-        root: Its folder.
-        variant: Of `variants.VARIANTS`.
-        seed: Of training.
+        root: Folder of the data set.
+        variant: Name from `variants.VARIANTS`.
+        seed: Seed of training.
         run: Run folder.
         overrides: All ``section.key=value`` of its configuration.
     """
@@ -73,28 +73,28 @@ class Case:
 
     @property
     def title(self) -> str:
-        """The case in a few words."""
+        """Short description of the case."""
         return f"{self.scene}, {self.variant}, seed {self.seed}"
 
     @property
     def names(self) -> dict[str, Any]:
-        """What tells the case from the others, for its records."""
+        """Fields that identify the case in its records."""
         representation = kinds.VARIANTS[self.variant]["train.representation"]
         return {"scene": self.scene, "representation": representation, "variant": self.variant, "seed": self.seed}
 
     def beside(self, suffix: str) -> Path:
-        """A file beside the run folder, with its name."""
+        """Return the path of a file beside the run folder, with the folder's name and a suffix."""
         return self.run.with_name(self.run.name + suffix)
 
 
 def make(plan: Plan) -> list[Case]:
-    """The cases of a plan, by seed, scene and variant, so that a benchmark that is stopped holds whole tables early.
+    """Return the cases of a plan, ordered by seed, scene and variant, so that complete tables are available early.
 
-    Everything that can be known before hours of training is checked here.
+    All checks that are possible before hours of training are made here.
 
     Raises:
-        ConfigError: A variant, mode or setting is unknown, or a case was begun with other settings.
-        DatasetError: A data set cannot be read, or two have one name.
+        ConfigError: A variant, mode or setting is unknown, or a case was started with other settings.
+        DatasetError: A data set cannot be read, or two have the same name.
         CheckpointError: A run folder is damaged, or its run was trained on other data.
     """
     every_mode = scene_player.every()
@@ -129,7 +129,7 @@ def make(plan: Plan) -> list[Case]:
 
 
 def _check_settings(case: Case, wanted: configs.Config) -> None:
-    """Raise ConfigError where the case's run was begun with other settings; CheckpointError where it is damaged."""
+    """Raise ConfigError if the case's run was started with other settings; CheckpointError if it is damaged."""
     if not (case.run / checkpoint.RUN_FILE).exists():
         return
     found = checkpoint.open_run(case.run).config.to_dict()
@@ -137,15 +137,15 @@ def _check_settings(case: Case, wanted: configs.Config) -> None:
         for key, value in keys.items():
             if found[section][key] != value:
                 raise ConfigError(
-                    f"{case.run}: was begun with {section}.{key} = {found[section][key]}, not {value}; "
-                    "go on with the settings it was begun with, or choose another --out"
+                    f"{case.run}: was started with {section}.{key} = {found[section][key]}, expected {value}; "
+                    "use the settings it was started with, or choose another --out"
                 )
 
 
 def _check_data(case: Case, digest: str) -> None:
-    """Raise CheckpointError where the case was trained on other data than there is now."""
+    """Raise CheckpointError if the case was trained on other data than the current data set."""
     if checkpoint.newest_file(case.run) is None:
-        return  # nothing of other data is in it
+        return  # no checkpoint depends on the data yet
     if checkpoint.open_run(case.run).digest != digest:
         raise CheckpointError(
             f"{case.run}: was trained on other data than {case.root} now holds; restore the data, choose another "
@@ -154,12 +154,12 @@ def _check_data(case: Case, digest: str) -> None:
 
 
 def _texts(settings: dict[str, str]) -> tuple[str, ...]:
-    """Settings as ``--set`` takes them."""
+    """Return settings in the form of ``--set``."""
     return tuple(f"{key}={value}" for key, value in settings.items())
 
 
 def read_record(case: Case) -> dict[str, Any]:
-    """What is kept of a case: ``sittings`` of its training and, once it is measured, ``measured``.
+    """Return the record of a case: ``sittings`` of its training and, once measured, ``measured``.
 
     Raises:
         CheckpointError: The file is damaged.
@@ -177,26 +177,26 @@ def write_record(case: Case, record: dict[str, Any]) -> None:
     """Replace the record of a case.
 
     Raises:
-        CheckpointError: It cannot be written.
+        CheckpointError: The record cannot be written.
     """
     write(case.beside(".json"), json.dumps(record, indent=2))
 
 
 def write(path: Path, text: str) -> None:
-    """Replace a file of the benchmark; its folder is made.
+    """Replace a file of the benchmark; creates its folder.
 
     Raises:
-        CheckpointError: It cannot be written.
+        CheckpointError: The file cannot be written.
     """
     try:
         os.makedirs(path.parent, exist_ok=True)
         atomic_files.write(path, text.encode())
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written: {error}; make room and give the command again") from error
+        raise CheckpointError(f"{path}: cannot be written: {error}; free disk space and repeat the command") from error
 
 
 def is_finished(case: Case) -> bool:
-    """Whether the case's training has ended.
+    """Return True if the case's training has finished.
 
     Raises:
         CheckpointError: The checkpoint is damaged.
@@ -205,9 +205,10 @@ def is_finished(case: Case) -> bool:
 
 
 def cost(sittings: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """What training took in all sittings: ``cpu_seconds``, ``wall_seconds``, ``peak_mb`` and ``peak_gpu_mb``.
+    """Return the cost of training over all sittings: ``cpu_seconds``, ``wall_seconds``, ``peak_mb``, ``peak_gpu_mb``.
 
-    A sum is None where a sitting is not known (the benchmark itself was killed), a peak where no sitting knows it.
+    A sum is None if the cost of a sitting is unknown (the benchmark was killed); a peak is None if it is unknown for
+    all sittings.
     """
     result: dict[str, float | None] = {}
     for key in COSTS[:2]:

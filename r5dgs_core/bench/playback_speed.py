@@ -1,4 +1,4 @@
-"""How fast a scene plays: whole frames along its test views, one after the other, as a player would draw them."""
+"""Playback speed of a scene: complete frames along its test views, in sequence, as in a player."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
 
-LEAST_FRAMES = 60
-PATIENCE_S = 20.0  # per mode, after which what was measured is enough
+LEAST_FRAMES = 60  # per mode, unless time runs out
+PATIENCE_S = 20.0  # time limit per mode, seconds
 
 
 def measure(
     scene: Scene, views: Sequence[View], modes: Sequence[str], *, backend: str = "auto"
 ) -> dict[str, dict[str, Any]]:
-    """Time frames of a scene, from the time t to the picture on the host: colours alone, no identity encodings.
+    """Time frames of a scene, from scene time to the color image in host memory, without identity encodings.
 
-    The views are played camera by camera in the order of their times, again and again until there are enough frames.
-    The modes take turns, a round each, so that what else the machine does meets all of them alike. A first round of
-    each does not count: it loads kernels and fills what the mode computes once.
+    The views are played camera by camera in order of time, repeatedly until there are enough frames. The modes are
+    timed in interleaved rounds, so that background load affects all of them equally. The first round of each is not
+    counted, because it loads kernels and fills caches.
 
     Args:
         scene: The scene.
         views: Cameras and times.
-        modes: Of `scene_player.modes`.
+        modes: Playback modes from `scene_player.modes`.
         backend: Rasterizer.
 
     Returns:
         By mode ``fps`` (frames per second by the median), medians ``ms_frame``, ``ms_motion`` and ``ms_raster``,
-        ``ms_cpu`` (processor time of a frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
-        percentile), ``frames``; all but the last None without views.
+        ``ms_cpu`` (processor time per frame, over all threads), ``ms_frame_low`` and ``ms_frame_high`` (10th and 90th
+        percentile), and ``frames``. All but the last are None without views.
     """
     ordered = sorted(views, key=lambda view: (view.camera.name, view.t))
     times: dict[str, list[tuple[float, float, float]]] = {mode: [] for mode in modes}
@@ -57,7 +57,7 @@ def measure(
 
 
 def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
-    """What `measure` says of a mode, from the motion, rasterization and processor time of its frames."""
+    """Return the values of `measure` for one mode, from motion, rasterization and processor times of its frames."""
     names = ("fps", "ms_frame", "ms_motion", "ms_raster", "ms_cpu", "ms_frame_low", "ms_frame_high")
     if not times:
         return {**dict.fromkeys(names), "frames": 0}
@@ -69,10 +69,10 @@ def _summary(times: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
 
 
 def _draw(player: scene_player.Player, view: View, backend: str) -> tuple[float, float, float]:
-    """Milliseconds of motion, of rasterization, and of processor time of one frame."""
+    """Return the time of motion and of rasterization, and the processor time, of one frame in milliseconds."""
     cpu, start = time.process_time(), time.perf_counter()
     frame = player.frame(view.t, view.camera.center)
     moved = time.perf_counter()
     output = scene_renderer.render_frame(player.scene, frame, view.camera, backend=backend)
-    scene_renderer.to_numpy(output.color, np.float32)  # waits for a GPU, too
+    scene_renderer.to_numpy(output.color, np.float32)  # also synchronises a GPU
     return 1e3 * (moved - start), 1e3 * (time.perf_counter() - moved), 1e3 * (time.process_time() - cpu)

@@ -1,4 +1,4 @@
-"""Error against run time of a benchmark, as a picture."""
+"""Plot of error against run time for a benchmark."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _MARKERS = "osD^vP*X"
 
 
 def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
-    """Plot PSNR against the seconds of training, in the observed time and past it, and against the time of a frame.
+    """Plot PSNR against training time, past t_max and in the observed time, and against the time of a frame.
 
     Args:
-        records: Cases in their modes, with figures (docs/user/bench.md); colour: method and mode, marker: scene.
+        records: Measured cases by mode (docs/user/bench.md). Colors show method and mode, markers show the scene.
         path: The PNG file.
 
     Returns:
         ``path``.
 
     Raises:
-        ConfigError: It cannot be written.
+        ConfigError: The file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -77,7 +77,7 @@ def write(records: Sequence[dict[str, Any]], path: Path) -> Path:
 
 
 def _color(index: int) -> tuple[float, float, float, float]:
-    """Twenty colours that can be told apart, the strong ones first."""
+    """Return one of twenty distinguishable colors, saturated ones first."""
     import matplotlib
 
     place = index % 20

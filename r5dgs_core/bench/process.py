@@ -1,4 +1,4 @@
-"""Training in a process of its own, so that its processor time and memory are its own, too."""
+"""Training in a separate process, so that its processor time and memory can be measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# The system's largest size of a process counts its parent's, too, which it was forked from; so it tells its own.
+# The system's peak size of a forked process includes its parent's, so the child reports its own.
 _CHILD = """
 import sys
 from r5dgs_core.cli import main as cli
@@ -29,15 +29,15 @@ STOPPED = 130
 
 @dataclass(frozen=True)
 class Sitting:
-    """One process that trained.
+    """One training process.
 
     Attributes:
-        status: Its exit status, negative for the signal that ended it.
-        complaint: The last line that it wrote on stderr, "" without one.
-        cpu_seconds: Processor time of all its threads, start and end of Python included; None where unknown.
-        wall_seconds: From start to end.
-        peak_mb: Its largest resident memory, 2^20 bytes; None where unknown.
-        peak_gpu_mb: The most that torch reserved on a GPU; None where it used none.
+        status: Exit status; negative for the signal that ended it.
+        complaint: Last line on stderr; "" without one.
+        cpu_seconds: Processor time of all threads, including start and end of Python; None if unknown.
+        wall_seconds: Wall time from start to end.
+        peak_mb: Peak resident memory, MiB; None if unknown.
+        peak_gpu_mb: Peak GPU memory reserved by torch, MiB; None if no GPU was used.
     """
 
     status: int
@@ -54,19 +54,19 @@ def train(
     progress: Callable[[dict[str, Any]], None],
     ended: Callable[[Sitting], None],
 ) -> Sitting:
-    """Run ``r5dgs ARGUMENTS --progress json`` in a process of its own and wait for it.
+    """Run ``r5dgs ARGUMENTS --progress json`` in a separate process and wait for it.
 
-    An exception on the way, such as KeyboardInterrupt, asks the process to keep its state and end, and goes on when it
-    has.
+    On an exception, such as KeyboardInterrupt, the process is asked to save its state and end; the exception is raised
+    again afterwards.
 
     Args:
-        arguments: Of the command line.
-        log_path: What the process writes on stderr is added to this file; its folder must exist.
-        progress: Called with each event that the process reports.
-        ended: Called when the process has ended, also where an exception goes on.
+        arguments: Arguments of the command line.
+        log_path: File to which stderr of the process is appended; its folder must exist.
+        progress: Called with each event of the process.
+        ended: Called when the process has ended, also after an exception.
 
     Returns:
-        What it took.
+        Status and cost of the process.
     """
     root = str(Path(__file__).resolve().parents[2])
     paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -76,7 +76,7 @@ def train(
     began = time.monotonic()
     with open(log_path, "ab") as log:
         start = log.tell()
-        # In a session of its own: Ctrl-C in the terminal reaches it through us, once.
+        # A separate session: Ctrl-C in the terminal reaches the process only once, through us.
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment, start_new_session=True
         )
@@ -88,7 +88,7 @@ def train(
             elif event:
                 progress(event)
     except BaseException:
-        os.kill(process.pid, signal.SIGTERM)  # Popen's own would wait for it, and its time would be lost
+        os.kill(process.pid, signal.SIGTERM)  # Popen.terminate() may reap the process and lose its resource usage
         peaks = next((event for event in map(_event, process.stdout) if event.get("event") == "peak"), peaks)
         raise
     finally:
@@ -99,7 +99,7 @@ def train(
 
 
 def tell_peak() -> None:
-    """Print the largest memory of this process so far as an event."""
+    """Print the peak memory of this process as an event."""
     event: dict[str, Any] = {"event": "peak", "peak_mb": _peak_mb(), "peak_gpu_mb": None}
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
@@ -108,7 +108,7 @@ def tell_peak() -> None:
 
 
 def _peak_mb() -> float | None:
-    """Largest resident memory of this process so far; None where the system does not tell."""
+    """Return the peak resident memory of this process, MiB; None if the system does not report it."""
     try:
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
@@ -119,7 +119,7 @@ def _peak_mb() -> float | None:
 
 
 def _event(line: str) -> dict[str, Any]:
-    """An event that the process reported; empty for any other line."""
+    """Parse an event of the process; returns an empty dict for any other line."""
     try:
         event = json.loads(line)
     except ValueError:
@@ -128,7 +128,7 @@ def _event(line: str) -> dict[str, Any]:
 
 
 def _end(process: subprocess.Popen[str], began: float, log_path: Path, start: int, peaks: dict[str, Any]) -> Sitting:
-    """Wait for the process and account for it."""
+    """Wait for the process and return its status and cost."""
     cpu = None
     if hasattr(os, "wait4"):
         _, status, usage = os.wait4(process.pid, 0)
@@ -151,9 +151,9 @@ def _end(process: subprocess.Popen[str], began: float, log_path: Path, start: in
 
 
 def reason(sitting: Sitting) -> str:
-    """Why a process that failed did, in one line."""
+    """Return the reason why a process failed, in one line."""
     if sitting.status < 0:
         name = signal.Signals(-sitting.status).name
-        hint = "; the system may lack memory, --set densify.max_gaussians=N bounds it" if name == "SIGKILL" else ""
+        hint = "; possibly out of memory, which --set densify.max_gaussians=N limits" if name == "SIGKILL" else ""
         return f"ended by {name}{hint}"
     return sitting.complaint or f"ended with status {sitting.status}"

@@ -1,7 +1,8 @@
-"""A benchmark as the paper's two tables: for the terminal, as Markdown, and as rows that other programs compare.
+"""Tables of a benchmark, as in the paper: for the terminal, as Markdown, and as rows for other programs.
 
-Notation: a record is one case in one mode (docs/user/bench.md); a table row summarises the seeds of one scene, variant
-and mode by their mean and, if there are several, half of their range behind a plus-minus sign.
+Notation: a record is one case in one mode (docs/user/bench.md). A table row summarises the seeds of one scene, variant
+    and
+mode by their mean and, if there are several, half of their range behind a plus-minus sign.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from rich.table import Table
 
 Record = dict[str, Any]
 ABSENT = "-"
-# What the paper calls a variant in a mode. 5DGS is trained as R5DGS is, so either checkpoint can stand for it.
+# The paper's name of a variant in a mode. 5DGS is trained like R5DGS, so either checkpoint can represent it.
 PAPER = {
     ("5dgs", "standard"): "5DGS",
     ("r5dgs", "standard"): "5DGS",
@@ -23,7 +24,7 @@ PAPER = {
 }
 OURS = "ours"
 UNKNOWN = "unknown"
-# What is said of the machine of a record.
+# Labels of the recorded properties of a machine.
 _MACHINE = {
     "processor": "processor",
     "cores": "usable cores",
@@ -46,12 +47,12 @@ _AGAINST = (*_AGAINST, ("CPU x", "ms_cpu", "{:.2f}"))
 
 @dataclass(frozen=True)
 class Column:
-    """A column of figures.
+    """Numeric column of a table.
 
     Attributes:
-        label: Its head.
-        value: The figure of a record, None where there is none.
-        form: How it is written.
+        label: Heading.
+        value: Returns the number of a record, or None.
+        form: Format string.
     """
 
     label: str
@@ -61,14 +62,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table before it is laid out.
+    """Content of a table, independent of its layout.
 
     Attributes:
-        title: What it shows.
-        head: Labels of its columns; the first ``words`` of them hold words, the others figures.
-        blocks: Lines of each scene, then those of the mean over scenes.
-        caption: What the reader has to know.
-        words: Number of columns of words.
+        title: Title.
+        head: Column headings; the first ``words`` columns hold text, the others numbers.
+        blocks: Rows of each scene, then rows of the mean over scenes.
+        caption: Explanation for the reader.
+        words: Number of text columns.
     """
 
     title: str
@@ -79,11 +80,11 @@ class Sheet:
 
 
 def sheets(result: dict[str, Any]) -> list[Sheet]:
-    """The tables of a benchmark: quality past t_max, quality in the observed time, speed and mIoU, and where a run was
-    played in mode "standard", what the others lose and gain against that.
+    """Return the tables of a benchmark: quality past t_max, quality in the observed time, speed and mIoU, and, for runs
+    played in mode "standard", the other modes relative to it.
 
     Args:
-        result: What `bench.benchmark.run_bench` writes.
+        result: Result of `bench.benchmark.run_bench`.
     """
     records, failures = result["results"], result["failures"]
     costs = [Column(label, _at("train", key), form) for label, key, form in _COST]
@@ -94,7 +95,7 @@ def sheets(result: dict[str, Any]) -> list[Sheet]:
     played = [Column(label, _at("playback", key), form) for label, key, form in _PLAYED]
     overlaps = [Column(f"mIoU {split}", _at("splits", split, "miou"), "{:.3f}") for split in ("test", "val")]
     count = Column("Gaussians", lambda record: record["gaussians"], "{:.0f}")
-    note = f"frames of the test views in sequence, medians, colours alone; {_where(records)}"
+    note = f"frames of the test views in sequence, medians, color only; {_where(records)}"
     tables.append(("Table 2: speed and identities", [*played, *overlaps, count, costs[0], costs[2]], note))
     data = [(records, failures)] * len(tables)
     if compared := against_standard(records):
@@ -111,7 +112,7 @@ def sheets(result: dict[str, Any]) -> list[Sheet]:
 
 
 def to_rich(sheet: Sheet) -> Table:
-    """A table for the terminal."""
+    """Convert a table for the terminal."""
     table = Table(title=sheet.title, title_justify="left", caption=sheet.caption, caption_justify="left")
     for index, label in enumerate(sheet.head):
         table.add_column(label, justify="left" if index < sheet.words else "right", no_wrap=True)
@@ -123,7 +124,7 @@ def to_rich(sheet: Sheet) -> Table:
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """All tables, what failed, and what the times were measured on."""
+    """Return all tables, failures, and the machine and settings, as Markdown."""
     records, parts = result["results"], []
     for sheet in sheets(result):
         rule = ["---"] * sheet.words + ["---:"] * (len(sheet.head) - sheet.words)
@@ -132,24 +133,24 @@ def markdown(result: dict[str, Any]) -> str:
         parts.append(f"## {sheet.title}\n\n{rows}\n\n{sheet.caption}\n")
     if result["failures"]:
         lines = [f"- {f['scene']}, {f['variant']}, seed {f['seed']}: {f['error']}" for f in result["failures"]]
-        parts.append("## What failed\n\n" + "\n".join(lines) + "\n")
+        parts.append("## Failed runs\n\n" + "\n".join(lines) + "\n")
     settings = result["settings"]
     given = [f"preset {settings['preset']}"] if settings["preset"] else []
     given += [f"configuration {settings['config']}"] if settings["config"] else []
     given += settings["set"]
     parts.append(
         "## How\n\n"
-        f"Settings: {', '.join(given) or 'defaults'}. CPU s, wall s and MB are of the process that trained, start and "
-        "labels included; FPS of the process that measured.\n\n" + "\n".join(_machines(records)) + "\n"
+        f"Settings: {', '.join(given) or 'defaults'}. CPU s, wall s and MB refer to the training process, including "
+        "start-up and labels; FPS refers to the measuring process.\n\n" + "\n".join(_machines(records)) + "\n"
     )
     return "\n".join(parts)
 
 
 def report_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Rows in the shape of ``r5dgs report``: PSNR against training time, and against the time of a frame.
+    """Return rows in the form of ``r5dgs report``: PSNR against training time, and against the time of a frame.
 
-    ``ms`` of a training is processor time, or wall time where that is unknown. ``pareto`` says that no faster row of
-    the same task is at least as good.
+    ``ms`` of training is processor time, or wall time if that is unknown. ``pareto`` is True if no faster row of the
+    same task is at least as good.
     """
     rows: list[dict[str, Any]] = []
     for split in ("test", "val"):
@@ -177,8 +178,11 @@ def report_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
 
 
 def against_standard(records: Sequence[Record]) -> list[Record]:
-    """Records of the other modes of runs that were played in mode "standard", with ``against``: differences of PSNR on
-    test, of all pixels and those of objects (dB), and ratios of frames per second and of processor time."""
+    """Return the records of runs that were played in mode "standard", in their other modes, with ``against``.
+
+    ``against`` holds differences of test PSNR over all pixels and over object pixels (dB), and ratios of frames per
+    second and of processor time.
+    """
     runs = {(r["scene"], r["variant"], r["seed"]): r for r in records if r["mode"] == "standard"}
     found = []
     for record in records:
@@ -197,24 +201,24 @@ def against_standard(records: Sequence[Record]) -> list[Record]:
 
 
 def method(record: Record) -> str:
-    """Representation and variant: "tracks", "field/r5dgs"."""
+    """Return representation and variant: "tracks", "field/r5dgs"."""
     representation, variant = record["representation"], record["variant"]
     return representation if variant == representation else f"{representation}/{variant}"
 
 
 def training_ms(record: Record) -> float | None:
-    """What training took, milliseconds: processor time, or wall time where that is unknown."""
+    """Return the training time in milliseconds: processor time, or wall time if that is unknown."""
     train = record["train"]
     seconds = train["cpu_seconds"] if train["cpu_seconds"] is not None else train["wall_seconds"]
     return None if seconds is None else 1e3 * seconds
 
 
 def paper_row(variant: str, mode: str, variants: Iterable[str]) -> str:
-    """Which row of the paper's tables a variant in a mode is; "ours" for what the paper has not, or "".
+    """Return the row of the paper's tables that a variant in a mode corresponds to; "ours" if it is new, or "".
 
     Args:
         variant: The variant.
-        mode: The mode that it is played in.
+        mode: Playback mode.
         variants: All variants of the benchmark.
     """
     if mode == "standard" and variant == "r5dgs" and "5dgs" in variants:
@@ -223,7 +227,7 @@ def paper_row(variant: str, mode: str, variants: Iterable[str]) -> str:
 
 
 def _where(records: Sequence[Record]) -> str:
-    """What the frames were timed on, or in what that differs from record to record."""
+    """Describe the machine of the timings, or the properties that differ between records."""
     found = {key: sorted({_said(record["machine"], key) for record in records}) for key in _MACHINE}
     differ = [f"{_MACHINE[key]} {' / '.join(said)}" for key, said in found.items() if len(said) > 1]
     if differ:
@@ -233,8 +237,10 @@ def _where(records: Sequence[Record]) -> str:
 
 
 def _machines(records: Sequence[Record]) -> list[str]:
-    """A line for each kind of machine, threads and versions that runs were trained or measured on; with what ran there
-    where there are several."""
+    """Return a line per machine, threads and versions on which runs were trained or measured.
+
+    If there are several, each line lists its runs.
+    """
     lines = []
     for task, where in (("trained", "trained_on"), ("measured", "machine")):
         ran: dict[str, dict[str, None]] = {}
@@ -252,7 +258,7 @@ def _machines(records: Sequence[Record]) -> list[str]:
 
 
 def _said(machine: dict[str, Any] | None, key: str) -> str:
-    """An entry of a machine in words."""
+    """Format a property of a machine."""
     value = (machine or {}).get(key, UNKNOWN)
     if isinstance(value, dict):
         return " ".join(f"{name} {version}" for name, version in value.items())
@@ -260,7 +266,7 @@ def _said(machine: dict[str, Any] | None, key: str) -> str:
 
 
 def _at(*path: str) -> Callable[[Record], float | None]:
-    """Look up a figure of a record by the keys that lead to it."""
+    """Return a function that looks up a value of a record by a path of keys."""
 
     def value(record: Record) -> float | None:
         found: Any = record
@@ -274,7 +280,7 @@ def _at(*path: str) -> Callable[[Record], float | None]:
 def _blocks(
     records: Sequence[Record], failures: Sequence[dict[str, Any]], columns: Sequence[Column]
 ) -> tuple[tuple[tuple[str, ...], ...], ...]:
-    """Lines of each scene, those of cases without any figures, and the mean over scenes where there are several."""
+    """Return the rows of each scene, of failed cases, and of the mean over scenes if there are several."""
     variants = {record["variant"] for record in records}
     scenes = list(dict.fromkeys(item["scene"] for item in (*records, *failures)))
     groups: dict[tuple[str, str], dict[str, list[Record]]] = {}
@@ -308,7 +314,7 @@ def _blocks(
 
 
 def _cell(records: Sequence[Record], column: Column) -> str:
-    """Mean over the seeds, and half their range where there are several; absent where one lacks the figure."""
+    """Format the mean over seeds, with half their range if there are several; absent if a seed lacks the value."""
     values = [column.value(record) for record in records]
     known = [value for value in values if value is not None]
     if len(known) < len(values):
@@ -319,7 +325,7 @@ def _cell(records: Sequence[Record], column: Column) -> str:
 
 
 def _mean_over_scenes(scenes: Sequence[Sequence[Record]], column: Column) -> str:
-    """Mean of the scenes' means; absent where a scene lacks the figure."""
+    """Format the mean of the scenes' means; absent if a scene lacks the value."""
     means = []
     for records in scenes:
         values = [column.value(record) for record in records]

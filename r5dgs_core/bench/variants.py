@@ -1,4 +1,4 @@
-"""What a benchmark trains: the settings of each variant, and what it leaves of a preset. Needs no torch."""
+"""Training settings of the benchmark's variants, and of the presets they are combined with. Does not import torch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from ..config import config as configs
 from ..config.presets import PRESETS
 
-# The method has its identities trained with the geometry (docs/user/field.md). All their losses at a twentieth: the
-# encodings, whose optimizer does not feel the scale, learn as at the paper's weights, and the geometry is not harmed.
+# The method trains identities jointly with the geometry (docs/results/field.md). Scaling all identity losses by 1/20
+# protects the geometry; the encodings learn at the same rate, because their optimizer is invariant to the scale.
 _IDENTITIES = {"identity.training": "joint", "identity.weight": "0.05", "identity.spatial": "0.1"}
 _FIELD = {"train.representation": "field", **_IDENTITIES}
-# Whoever starts from tracks needs objects in their places.
+# Training from tracks needs the objects placed in the scene.
 _PLACED = {"init.placement": "scene"}
-# What each variant sets; it wins over everything that the user gives.
+# Settings of each variant; they override everything that the user gives.
 VARIANTS: dict[str, dict[str, str]] = {
     "5dgs": {**_FIELD, "field.variant": "5dgs"},
     "r5dgs": {**_FIELD, "field.variant": "r5dgs"},
@@ -28,11 +28,11 @@ VARIANTS: dict[str, dict[str, str]] = {
     },
     "tracks": {"train.representation": "tracks", **_PLACED},
 }
-# `5dgs` is trained as `r5dgs` is and differs only in how it is played, so its row comes from the checkpoint of `r5dgs`.
+# `5dgs` is trained like `r5dgs` and differs only in playback, so its row comes from the checkpoint of `r5dgs`.
 DEFAULT_VARIANTS = ("r5dgs", "r5dgs_extra", "from_tracks", "tracks")
-# Preset `paper` has the paper's weights, which its variants keep.
+# Keys that variants leave to a preset: `paper` has the paper's weights.
 KEPT = {"paper": ("identity.weight", "identity.spatial", "identity.majority")}
-# What a preset for the field says of these (sections or keys) does not suit tracks; they keep their defaults.
+# Sections and keys of field presets that do not suit tracks, which keep their defaults.
 UNSUITED = {
     "from_tracks": ("init", "curriculum", "train.shading", "train.shadows"),
     "tracks": ("init", "curriculum", "train.shading", "train.shadows", "rates", "densify.strategy", "identity"),
@@ -40,12 +40,12 @@ UNSUITED = {
 
 
 def settings(variant: str, preset: str | None) -> dict[str, str]:
-    """What a variant sets, whatever the user gives, by ``section.key`` as for ``--set``."""
+    """Return the settings that a variant enforces, by ``section.key`` as for ``--set``."""
     return {key: value for key, value in VARIANTS[variant].items() if key not in KEPT.get(preset or "", ())}
 
 
 def suited(variant: str, preset: str | None) -> dict[str, str]:
-    """Defaults for what a preset sets for the field and a variant with tracks cannot use; the user's ``--set`` wins."""
+    """Return defaults for preset keys that suit the field but not a variant with tracks; ``--set`` overrides them."""
     given: dict[str, Any] = PRESETS.get(preset or "", {})
     if given.get("train.representation") != "field":
         return {}

@@ -1,1 +1,1 @@
-"""The report `r5dgs report`: error against run time of integrators, poses, images and rasterizer settings."""
+"""``r5dgs report``: error against run time of integrators, poses, images and rasterizer settings."""

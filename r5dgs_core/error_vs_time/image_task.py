@@ -1,4 +1,4 @@
-"""Pictures of a scene in each playback mode against true images, with true future poses as the oracle of motion."""
+"""Task "images": error and time of each playback mode against true images, with true future poses as the oracle."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from . import timing
 from .report_rows import Row
 
 KINDS = ("psnr", "psnr_objects", "ssim", "flip", "lpips", "miou")
-FRAMES = 6  # of the views that are timed
+FRAMES = 6  # timed views
 ORACLE = "true poses"
-_SAME = 1e-6
+_SAME = 1e-6  # tolerance for equal times
 Move = Callable[[float], scene_player.Frame]
 
 
@@ -32,19 +32,19 @@ def measure(
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[Row], list[str]]:
-    """Rows of the task "images".
+    """Return the rows of the task "images".
 
     Args:
         scene: The scene.
         dataset: Its data set.
-        splits: Splits to measure; kinds of error of all but the first one carry "@" and their name.
-        rounds: Rounds of timing.
-        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        splits: Splits to measure; error kinds of all but the first have "@" and the split's name appended.
+        rounds: Timing rounds.
+        clock: Clock of the rows' ``ms``, from `timing.CLOCKS`.
         backend: Rasterizer.
-        progress: Called with images measured and their number.
+        progress: Called with the number of measured images and the total.
 
     Returns:
-        The rows, and what is absent and why.
+        The rows, and the reasons for missing measurements.
     """
     rows, absent = [], []
     players = {mode: scene_player.Player(scene, mode) for mode in scene_player.modes(scene)}
@@ -82,7 +82,7 @@ def measure(
         for mode, move in plan.items():
             found = evaluate.measure(scene, views, move, backend=backend, measured=count)
             label: dict[str, Any] = {"mode": mode, "method": "playback"}
-            if mode == ORACLE:  # nothing that could be chosen, so it is not timed and on no front
+            if mode == ORACLE:  # not a selectable method, so neither timed nor on the Pareto front
                 label = {"mode": "rigid", "method": ORACLE, "note": "motion is given, not predicted"}
                 times: dict[str, Any] = {}
             else:
@@ -108,18 +108,18 @@ def measure(
 
 
 def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[Move | None, str]:
-    """Playback with every body in its true pose past t_max.
+    """Return a function that plays the scene with every body in its true pose past t_max.
 
-    A body whose rotation the images do not tell, as of a ball without texture, wears what it looks like in a rotation
-    of its own: it goes to its true place and turns as the scene has it.
+    A body whose rotation the images do not determine, such as a ball without texture, keeps the scene's rotation and
+    moves along its true path.
 
     Args:
         scene: The scene.
         dataset: Its data set.
-        times: Times that will be asked for.
+        times: Times at which frames will be requested.
 
     Returns:
-        What gives the frame at one of the times, or None and why there is no such thing.
+        A function from one of the times to the frame, or None and the reason.
     """
     if dataset.ground_truth is None:
         return None, "the data set has no true poses (ground_truth.json)"
@@ -154,7 +154,7 @@ def true_move(scene: Scene, dataset: Dataset, times: Sequence[float]) -> tuple[M
 def _times(
     scene: Scene, views: Sequence[View], moves: dict[str, Move], rounds: int, backend: str
 ) -> tuple[dict[str, timing.Times], dict[str, timing.Times]]:
-    """Time of a frame by mode: motion, and rasterization of colours alone."""
+    """Return motion time and color rasterization time per frame, by mode."""
     some = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).round().astype(int))]
     calls: dict[tuple[str, str], Callable[[], object]] = {}
     for mode, move in moves.items():

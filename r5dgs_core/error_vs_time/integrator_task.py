@@ -1,9 +1,9 @@
-"""Integrators against a fine reference: where a scene's groups are a while past t_max, and what that costs.
+"""Task "dynamics": error and time of integrators past t_max, against a fine reference.
 
-Notation: K moving groups, P Gaussians in them; tau the time past t_max. A group's state at t_max is a twist (w, v)
-about its pivot with rates (eps, a). The integrators follow that twist, which changes linearly with time; a fitted model
-in closed form is its own motion, so it is compared with a fine integration of its own rates. An error of position is
-the largest over the pivot and six points at the group's radius, as a share of its diameter.
+Notation: K moving groups, P Gaussians in them; tau the time past t_max. The state of a group at t_max is a twist (w, v)
+about its pivot with rates (eps, a). The integrators follow that twist, which changes linearly with time. A fitted model
+in closed form is compared with a fine integration of its own rates. The position error is the largest over the pivot
+and six points at the group's radius, as a share of its diameter.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from .report_rows import Row, spread
 
 STEPS = (1, 2, 4, 8, 16, 32, 64)
 FINE_STEPS = 4096
-POINT_STEPS = (1, 4, 15, 60)  # of single Gaussians, which are many
+POINT_STEPS = (1, 4, 15, 60)  # for single Gaussians; fewer settings, because Gaussians are many
 FINE_POINT_STEPS = 256
-POINTS_AT_ONCE = 512
-ROUNDING = 1e-15  # errors below are called that
+POINTS_AT_ONCE = 512  # Gaussians per batch of the reference
+ROUNDING = 1e-15  # errors below this are rounding errors
 TWIST = "world twist"
 _CORNERS = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 Poses = tuple[np.ndarray, np.ndarray]
@@ -39,11 +39,11 @@ class _State:
     """States of K groups at t_max about their pivots.
 
     Attributes:
-        v: [K, 3]
-        w: [K, 3]
-        a: [K, 3]
-        eps: [K, 3]
-        radii: [K]
+        v: Velocities of the pivots. [K, 3]
+        w: Angular velocities. [K, 3]
+        a: Accelerations. [K, 3]
+        eps: Angular accelerations. [K, 3]
+        radii: Radii of the groups. [K]
     """
 
     v: np.ndarray
@@ -54,16 +54,16 @@ class _State:
 
 
 def measure(scene: Scene, tau: float, rounds: int, clock: str = "wall") -> tuple[list[Row], list[str]]:
-    """Rows of the task "dynamics".
+    """Return the rows of the task "dynamics".
 
     Args:
         scene: The scene.
         tau: Time past t_max at which errors are measured.
-        rounds: Rounds of timing.
-        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        rounds: Timing rounds.
+        clock: Clock of the rows' ``ms``, from `timing.CLOCKS`.
 
     Returns:
-        The rows, and what is absent and why.
+        The rows, and the reasons for missing measurements.
     """
     groups = [g for g in scene.groups if g.role == "body" and g.follows is None and _moves(g)]
     absent = []
@@ -80,9 +80,9 @@ def measure(scene: Scene, tau: float, rounds: int, clock: str = "wall") -> tuple
 
 
 def state_of(model: models.MotionModel) -> np.ndarray:
-    """The twist of a model at t_max about its pivot, and its rates: v, w, a, eps. [4, 3]
+    """Return the twist of a model at t_max about its pivot, and its rates: v, w, a, eps. [4, 3]
 
-    Of the fitted curve, without the offset that is faded in.
+    Taken from the fitted curve, without the faded offset.
     """
     step = 1e-3 * model.fade_time
     _, _, spins, velocities = models.curve(model, np.array([-step, 0.0, step]))
@@ -95,7 +95,7 @@ def state_of(model: models.MotionModel) -> np.ndarray:
 
 @contextmanager
 def _unwarned() -> Iterator[None]:
-    """Steps that are too long are what is shown here."""
+    """Silence the warning about long steps, whose effect is measured here."""
     log = logging.getLogger(point_dynamics.__name__)
     before, log.disabled = log.disabled, True
     try:
@@ -163,7 +163,7 @@ def _of_groups(scene: Scene, groups: list[MotionGroup], tau: float, rounds: int,
 
 
 def _members(scene: Scene, groups: list[MotionGroup]) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the groups' Gaussians about their pivots [P, 3], and which of the groups each belongs to [P]."""
+    """Return positions of the groups' Gaussians relative to their pivots [P, 3], and the group index of each [P]."""
     rows = [np.flatnonzero(scene.motion_ids == group.id) for group in groups]
     pairs = zip(groups, rows, strict=True)
     arms = [scene.means[some].astype(np.float64) - group.pivot for group, some in pairs]
@@ -171,7 +171,7 @@ def _members(scene: Scene, groups: list[MotionGroup]) -> tuple[np.ndarray, np.nd
 
 
 def _fine(plain: list[models.MotionModel], tau: float) -> Poses:
-    """Poses of models by small Magnus-4 steps of their own rates, which nothing in closed form has part in.
+    """Integrate models by small Magnus-4 steps of their own rates, independently of any closed form.
 
     With the twists x1, x2 about the pivot at the Gauss nodes of a step h the exponent is
     h (x1 + x2)/2 - sqrt(3)/12 h^2 [x1, x2].
@@ -196,7 +196,7 @@ def _fine(plain: list[models.MotionModel], tau: float) -> Poses:
 
 
 def _pose_errors(radii: np.ndarray, poses: Poses, truth: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the diameter [K], and degrees [K]."""
+    """Return position errors as shares of the diameter [K], and rotation errors in degrees [K]."""
     points = radii[:, None, None] * _CORNERS  # [K, 7, 3]
     moved, expected = (rotations.rotate(q[:, None], points) + d[:, None] for q, d in (poses, truth))
     distances = np.linalg.norm(moved - expected, axis=-1).max(axis=-1)
@@ -204,7 +204,7 @@ def _pose_errors(radii: np.ndarray, poses: Poses, truth: Poses) -> tuple[np.ndar
 
 
 def _point_errors(state: _State, truth: Poses, tau: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """As `_pose_errors`, of points that are integrated one by one, so that their distances may change."""
+    """Return errors as in `_pose_errors`, for points that are integrated one by one and may drift apart."""
     points = state.radii[:, None, None] * _CORNERS
     v, w, a, eps = (x[:, None] + 0 * points for x in (state.v, state.w, state.a, state.eps))
     moved, quats = point_dynamics.rk2(points, v, w, a, eps, tau, abs(tau) / steps)
@@ -214,7 +214,7 @@ def _point_errors(state: _State, truth: Poses, tau: float, steps: int) -> tuple[
 
 
 def _of_points(scene: Scene, tau: float, rounds: int, clock: str) -> list[Row]:
-    """Single Gaussians by their own dynamics: TRACE's integrator and ours."""
+    """Return rows for single Gaussians with their own dynamics: TRACE's integrator and ours."""
     assert scene.dynamics is not None
     moving = scene.dynamics[(scene.dynamics != 0).any(-1)].astype(np.float64)
     v, w, a, eps = np.split(moving, 4, axis=-1)

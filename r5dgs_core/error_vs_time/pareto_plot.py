@@ -1,4 +1,4 @@
-"""The report "error against run time" as one picture: a panel per task, the front drawn, the points named."""
+"""Plot of error against run time: one panel per task, with the Pareto front and labelled points."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ..evaluation import label_placement
 from . import image_task, report_rows, tables
 from .report_rows import Row
 
-# A panel's kind of error, its label, and the factor on the numbers.
+# Per task: plotted kind of error, axis label, and factor on the values.
 _SHOWN = {
     "dynamics": ("position", "position error, % of the object's size", 100.0),
     "poses": ("position", "position error, % of the object's size", 100.0),
     "images": ("psnr", "error of pixels, 8-bit levels (rms)", 1.0),
     "raster": ("difference", "difference to the finest picture, 8-bit levels (rms)", 1.0),
 }
-_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "images": 1e-3, "raster": 1e-4}  # what is smaller is drawn there
-# Colours that people with any colour vision tell apart (Okabe and Ito 2008).
+_FLOOR = {"dynamics": 1e-13, "poses": 1e-4, "images": 1e-3, "raster": 1e-4}  # smaller errors are drawn at this value
+# Colors distinguishable with any color vision (Okabe and Ito 2008).
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F", "#000000")
 _FRONT = "#B00020"
 _DPI = 110
-LEAST_SPAN = 2.0  # of the times that an axis shows
+LEAST_SPAN = 2.0  # minimum ratio between the ends of a time axis
 
 
 @dataclass(frozen=True)
 class _Point:
-    """A row in a panel: place, name and colour, and whether it is on the front."""
+    """Point of a panel: position, row, label and color."""
 
     x: float
     y: float
@@ -41,10 +41,10 @@ class _Point:
 
 
 def png(report: dict[str, Any]) -> bytes:
-    """The picture as a PNG.
+    """Return the plot as a PNG.
 
     Args:
-        report: What `report.measure` gives; tasks without rows that have a time get no panel.
+        report: Result of `report.measure`; tasks without timed rows have no panel.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -63,7 +63,7 @@ def png(report: dict[str, Any]) -> bytes:
     figure.suptitle(
         f"{report['scene']}: error against run time. {report['gaussians']} Gaussians, {report['groups']} motion "
         f"groups, {report['machine']['raster_threads']} threads.\n"
-        "Down and left is better; red: the front, where nothing better is as fast."
+        "Down and left is better; red: the Pareto front, where no better method is as fast."
     )
     if not panels:
         figure.text(0.5, 0.5, "nothing could be timed", ha="center")
@@ -76,7 +76,7 @@ def png(report: dict[str, Any]) -> bytes:
         drawn.append((axes, task, points))
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    canvas.draw()  # lays the panels out, so that pixels are known
+    canvas.draw()  # computes the layout, so that pixel positions are known
     figure.set_layout_engine("none")
     for axes, task, points in drawn:
         _name(axes, canvas.get_renderer(), task, points, oracle.get(task))
@@ -98,12 +98,12 @@ def _points(task: str, rows: Sequence[Row]) -> list[_Point]:
 
 
 def _pixel_error(psnr: float) -> float:
-    """Root mean square in 8-bit levels."""
+    """Convert PSNR in dB to RMS error in 8-bit levels."""
     return 255 * 10 ** (-psnr / 20)
 
 
 def _series(row: Row) -> tuple[str, str]:
-    """What has one colour: in "dynamics" a method with its steps, else the base of the mode."""
+    """Return the key of rows with the same color: mode and method in "dynamics", else the base of the mode."""
     if row.task == "dynamics":
         return row.mode, row.method
     if row.task == "raster":
@@ -155,7 +155,7 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]
         axes.step([p.x for p in front], [p.y for p in front], where="post", color=_FRONT, linewidth=1.2, zorder=1)
     axes.margins(x=0.16, y=0.12)
     low, high = axes.get_xlim()
-    if high < LEAST_SPAN * low:  # else noise would look like a difference
+    if high < LEAST_SPAN * low:  # a narrow axis would make noise look like a difference
         middle = math.sqrt(low * high)
         axes.set_xlim(middle / math.sqrt(LEAST_SPAN), middle * math.sqrt(LEAST_SPAN))
     axes.grid(alpha=0.25, which="major")
@@ -177,7 +177,7 @@ def _draw(axes: Any, task: str, points: Sequence[_Point], report: dict[str, Any]
 
 
 def _ticks(axes: Any) -> None:
-    """Plain numbers where an axis spans little, so that it has some."""
+    """Use plain numbers on axes with a small range, so that they have tick labels."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
@@ -190,11 +190,11 @@ def _ticks(axes: Any) -> None:
 
 
 def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point], oracle: float | None) -> None:
-    """Write the names: those of lines first, then of points of the front, then of the others while there is room."""
+    """Label the lines first, then points on the front, then other points while there is room."""
     frame = axes.get_window_extent(renderer)
     places = axes.transData.transform([(p.x, p.y) for p in points])
     markers = np.concatenate([places - 4, places + 4], axis=1)
-    texts: list[tuple[np.ndarray, str, str, bool, float]] = []  # place, text, colour, on the front, size
+    texts: list[tuple[np.ndarray, str, str, bool, float]] = []  # position, text, color, on the front, size
     if oracle is not None:
         height = axes.transData.transform((points[0].x, oracle))[1]
         texts.append((np.array([frame.x1 - 60, height]), "with true poses", "0.35", False, 8.5))
@@ -233,5 +233,9 @@ def _name(axes: Any, renderer: Any, task: str, points: Sequence[_Point], oracle:
         axes.text(*at, text, color=color, bbox=veil, **style)
     if unnamed:
         axes.text(
-            0.01, 0.01, f"{unnamed} points without room for a name: see the table", transform=axes.transAxes, fontsize=8
+            0.01,
+            0.01,
+            f"{unnamed} points without room for a label: see the table",
+            transform=axes.transAxes,
+            fontsize=8,
         )

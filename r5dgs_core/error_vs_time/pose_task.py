@@ -1,4 +1,4 @@
-"""Predicted poses of objects against true ones: sources of group motion, motion models one by one, confidence band."""
+"""Task "poses": predicted against true object poses, for group motions, motion models and the confidence band."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ..scene.scene import MotionGroup, Scene
 from . import timing
 from .report_rows import Row, spread
 
-MODELS = tuple(candidates.BY_NAME)  # tried one by one
-STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # what a swing is where nothing swings
-_SAME = 1e-9
-_LEAST_MOMENT = 1e-6  # share of the largest: members on a line have none about it, where a top needs some
+MODELS = tuple(candidates.BY_NAME)  # fitted one at a time
+STEADY = {"spring": "translation, quadratic", "pendulum": "hinge"}  # fallback of a model for objects that do not swing
+_SAME = 1e-9  # tolerance for equal times
+_LEAST_MOMENT = 1e-6  # added to the inertia, which is singular for collinear members but must not be for a free top
 
 
 @dataclass(frozen=True)
 class _Fitted:
-    """One model for every body.
+    """One model fitted to every body.
 
     Attributes:
-        fits: By body; None for an object at rest that has no track of its own.
-        ms: Processor time of fitting them.
+        fits: Fit of each body; None for an object at rest without a track of its own.
+        ms: Processor time of the fits, milliseconds.
     """
 
     fits: tuple[model_selection.Fit | None, ...]
@@ -39,16 +39,16 @@ class _Fitted:
 def measure(
     scene: Scene, ground_truth: GroundTruth | None, rounds: int, clock: str = "wall"
 ) -> tuple[list[Row], list[str]]:
-    """Rows of the task "poses": at the last time of the truth, and along the horizon.
+    """Return the rows of the task "poses", at the last true time and along the horizon.
 
     Args:
         scene: The scene.
-        ground_truth: True poses, where the data set has them.
-        rounds: Rounds of timing.
-        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        ground_truth: True poses, or None if the data set has none.
+        rounds: Timing rounds.
+        clock: Clock of the rows' ``ms``, from `timing.CLOCKS`.
 
     Returns:
-        The rows, and what is absent and why.
+        The rows, and the reasons for missing measurements.
     """
     if ground_truth is None:
         return [], ["poses: no true poses are known (a data set has them in ground_truth.json), so no pose error"]
@@ -65,7 +65,7 @@ def measure(
 def _of_modes(
     scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
-    """Each playback mode. Bodies of hybrid are those of rigid; where Gaussians part, their best rigid motion counts."""
+    """Measure each playback mode except hybrid, whose bodies equal rigid's. Separate Gaussians are fitted rigidly."""
     times = bodies[0].times[later]
     last = float(times[-1])
     players = {
@@ -97,7 +97,7 @@ def _of_modes(
 def _of_models(
     scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, rounds: int, clock: str
 ) -> tuple[list[Row], list[str]]:
-    """Each motion model alone, the one that is chosen of all, and its confidence band."""
+    """Measure each motion model alone, the selected one, and its confidence band."""
     times = bodies[0].times[later]
     taus = times - scene.t_max
     fitted = {name: _fit(scene, bodies, (name, STEADY[name]) if name in STEADY else (name,)) for name in MODELS}
@@ -124,7 +124,7 @@ def _of_models(
 
 
 def _fit(scene: Scene, bodies: tuple[ground_truth_poses.Body, ...], names: tuple[str, ...] | None) -> _Fitted:
-    """Fit the tracks of the bodies as baking does, with one family of motions or several."""
+    """Fit the tracks of the bodies as baking does, choosing from ``names``."""
     started = time.process_time()
     fits = tuple(fit_group(scene, body.group, names) if body.group.role == "body" else None for body in bodies)
     return _Fitted(fits, 1e3 * (time.process_time() - started))
@@ -135,13 +135,13 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
 
     Args:
         scene: The scene.
-        group: Of role "body".
-        names: Motion models to choose from, of `MODELS`; all where None.
+        group: A motion group of role "body".
+        names: Motion models to choose from, of `MODELS`; all if None.
     """
     track = scene.track_poses[group.id]
     first, last = group.seen or (-np.inf, np.inf)
     rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
-    # A free top is told by its shape, and offered by it where all motions are.
+    # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
         shape = free_top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
@@ -162,7 +162,7 @@ def _model(body: ground_truth_poses.Body, fit: model_selection.Fit | None) -> mo
 
 
 def _model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus: np.ndarray) -> np.ndarray:
-    """[H, 4, 4]"""
+    """Return the motion of a body by a model at times past t_max. [H, 4, 4]"""
     quats, displacements = models.evaluate(model, taus)
     return np.stack(
         [ground_truth_poses.matrix(body.group.pivot, q, d) for q, d in zip(quats, displacements, strict=True)]
@@ -172,7 +172,7 @@ def _model_motion(body: ground_truth_poses.Body, model: models.MotionModel, taus
 def _group_motion(
     player: scene_player.Player, bodies: tuple[ground_truth_poses.Body, ...], times: np.ndarray
 ) -> np.ndarray:
-    """How a mode moves the groups of bodies. [B, H, 4, 4]"""
+    """Return the motion of the bodies' groups in a mode. [B, H, 4, 4]"""
     found = [player.group_poses(float(t)) for t in times]
     groups = [body.group for body in bodies]
     return np.stack(
@@ -183,7 +183,7 @@ def _group_motion(
 def _member_motion(
     scene: Scene, player: scene_player.Player, bodies: tuple[ground_truth_poses.Body, ...], times: np.ndarray
 ) -> np.ndarray:
-    """The rigid motions that best carry the Gaussians of bodies where a mode brings them. [B, H, 4, 4]"""
+    """Return the rigid motions that best fit the moved Gaussians of the bodies. [B, H, 4, 4]"""
     members = []
     for body in bodies:
         own = (scene.object_ids == body.object_id) & (scene.motion_ids == body.group.id)
@@ -200,7 +200,7 @@ def _member_motion(
 def _errors(
     bodies: tuple[ground_truth_poses.Body, ...], later: np.ndarray, predicted: np.ndarray, shared: dict
 ) -> list[Row]:
-    """Rows of a prediction [B, H, 4, 4] at the last time, and at the others past t_max."""
+    """Return rows of a prediction [B, H, 4, 4] at the last time, and at the earlier times past t_max."""
     pairs = [
         metrics.pose_errors(some, body.motion[later], body.group.pivot)
         for body, some in zip(bodies, predicted, strict=True)
@@ -221,10 +221,10 @@ def _errors(
 def _band(
     bodies: tuple[ground_truth_poses.Body, ...], chosen: _Fitted, times: np.ndarray, taus: np.ndarray
 ) -> tuple[list[Row], list[str]]:
-    """Share of true errors that lie outside two standard deviations, over bodies and times that the band reaches.
+    """Return the share of errors outside two standard deviations, over bodies and times within reach of the band.
 
-    The error of a body is the root mean square over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2; of one
-    whose rotation the images do not tell, that of its place.
+    The error of a body is the RMS over a sphere of its radius: |dd|^2 + 2/3 (dtheta radius)^2. If the images do not
+    determine the rotation of the body, it is the position error.
     """
     inside, count, widths = 0, 0, []
     for body, fit in zip(bodies, chosen.fits, strict=True):
@@ -233,7 +233,7 @@ def _band(
         reached = taus <= fit.band_tau[-1] + _SAME
         truth = body.motion[np.isin(body.times, times)]
         distances, angles = metrics.pose_errors(_model_motion(body, fit.model, taus), truth, body.group.pivot)
-        if not body.turn_seen:  # its rotation says nothing, and so not how the scene's pivot lies in the true body
+        if not body.turn_seen:  # then neither its rotation nor the pivot's place in the true body is known
             places = body.group.pivot + models.evaluate(fit.model, taus)[1]
             distances, angles = np.linalg.norm(places - body.path[np.isin(body.times, times)], axis=-1), 0.0 * angles
         errors = np.sqrt(distances**2 + 2 / 3 * (np.radians(angles) * fit.model.radius) ** 2)

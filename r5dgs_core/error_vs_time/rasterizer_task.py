@@ -1,4 +1,4 @@
-"""Thresholds of the rasterizer against the finest picture: what each saves, and what it costs."""
+"""Task "raster": error and time of rasterizer thresholds, against the picture with the finest thresholds."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ SETTINGS: tuple[dict[str, float], ...] = (
     {"transmittance_min": 0.2},
     {"alpha_min": 4 / 255, "transmittance_min": 1e-2},
 )
-VIEWS = 4
+VIEWS = 4  # compared and timed views
 
 
 def measure(
     scene: Scene, views: Sequence[datasets.View], rounds: int, *, clock: str = "wall", backend: str = "auto"
 ) -> tuple[list[Row], list[str]]:
-    """Rows of the task "raster", in mode "rigid".
+    """Return the rows of the task "raster", in mode "rigid".
 
     Args:
         scene: The scene.
-        views: Views with true images; none for the cameras of the scene at t_max.
-        rounds: Rounds of timing.
-        clock: Of `timing.CLOCKS`: what the rows' ``ms`` is.
+        views: Views with true images; if empty, the cameras of the scene at t_max are used.
+        rounds: Timing rounds.
+        clock: Clock of the rows' ``ms``, from `timing.CLOCKS`.
         backend: Rasterizer.
 
     Returns:
-        The rows, and what is absent and why.
+        The rows, and the reasons for missing measurements.
     """
     absent, player = [], scene_player.Player(scene)
     shots: list[tuple[Camera, float]] = [(view.camera, view.t) for view in views]
@@ -100,7 +100,7 @@ def measure(
 
 
 def _name(changes: dict[str, float]) -> str:
-    """Settings in a few words, thresholds of alpha in 8-bit levels."""
+    """Return a label of the settings, with alpha thresholds in 8-bit levels."""
     words = {"alpha_min": "alpha", "transmittance_min": "stop"}
     parts = [
         f"{words[key]} {round(255 * value, 2):g}/255" if key == "alpha_min" else f"{words[key]} {value:g}"

@@ -1,6 +1,6 @@
-"""The report "error against run time": integrators, poses, pictures and rasterizer settings of one scene, in one run.
+"""Report "error against run time": integrators, poses, pictures and rasterizer settings of one scene.
 
-Everything that is compared is timed in turns (`timing`), and every time stands beside the error that it buys.
+Compared methods are timed in interleaved rounds (`timing`), and every time is reported with its error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .report_rows import Row
 
 JSON_FILE, CSV_FILE, MARKDOWN_FILE, PLOT_FILE = "report.json", "report.csv", "report.md", "report.png"
 ROUNDS = 7
-SHARE = 1 / 3  # of the observed time: how far past t_max without test views
+SHARE = 1 / 3  # horizon past t_max without test views, as a share of the observed time
 
 
 def measure(
@@ -40,18 +40,18 @@ def measure(
 
     Args:
         scene: The scene.
-        dataset: Its data set: images and true poses are compared with; None leaves that out.
-        tasks: Of `report_rows.TASKS`.
-        splits: Splits whose images are compared; the first one decides the front.
-        rounds: Rounds of timing; medians and quartiles are over them.
-        clock: "wall", or "cpu" for processor time, which other work on the machine hardly disturbs.
+        dataset: Its data set, with images and true poses to compare with; None skips these comparisons.
+        tasks: Tasks from `report_rows.TASKS`.
+        splits: Splits whose images are compared; the first one determines the Pareto front.
+        rounds: Timing rounds, over which medians and quartiles are taken.
+        clock: "wall", or "cpu" for processor time, which is less sensitive to other load.
         backend: Rasterizer.
         progress: Called with events.
 
     Returns:
-        In JSON types ``scene gaussians groups t_max horizon rounds clock machine kinds absent rows``: ``horizon`` is
-        the time past t_max at which errors of integration are measured, ``absent`` says what could not be measured and
-        why, and ``rows`` are those of `report_rows.Row`.
+        In JSON types ``scene gaussians groups t_max horizon rounds clock machine kinds absent rows``. ``horizon`` is
+        the time past t_max at which integration errors are measured, ``absent`` lists missing measurements with the
+        reason, and ``rows`` holds `report_rows.Row`.
     """
     tau, why = horizon(scene, dataset)
     rows: list[Row] = []
@@ -95,7 +95,7 @@ def measure(
     busy = _busy(rows)
     if busy > timing.BUSY and clock == "wall":
         absent.append(
-            f"wall times of a machine at rest: here they are {busy:.1f} times the processor times (median); "
+            f"wall times of an idle machine: here they are {busy:.1f} times the processor times (median); "
             "measure again when nothing else runs, or with --clock cpu"
         )
     rows = report_rows.mark_front(rows)
@@ -115,13 +115,13 @@ def measure(
 
 
 def _busy(rows: Sequence[Row]) -> float:
-    """Median of wall time over processor time, 1 without rows."""
+    """Return the median ratio of wall time to processor time, 1 without rows."""
     ratios = [row.ms_wall / row.ms_cpu for row in rows if row.ms_cpu > 0]
     return float(np.median(ratios)) if ratios else 1.0
 
 
 def horizon(scene: Scene, dataset: Dataset | None) -> tuple[float, str]:
-    """Time past t_max at which integration is compared, > 0, and why that one."""
+    """Return the time past t_max at which integrators are compared, > 0, and the reason for it."""
     last = [view.t for view in dataset.test] if dataset is not None else []
     if last and max(last) > scene.t_max:
         return float(max(last) - scene.t_max), "the last test time"
@@ -133,14 +133,14 @@ def write(report: dict[str, Any], folder: Path) -> tuple[Path, ...]:
     """Write a report as JSON, CSV, Markdown and plot.
 
     Args:
-        report: What `measure` gives.
-        folder: Made where it does not exist.
+        report: Result of `measure`.
+        folder: Output folder, created if missing.
 
     Returns:
-        The files.
+        Paths of the files.
 
     Raises:
-        ConfigError: They cannot be written there.
+        ConfigError: The files cannot be written.
     """
     rows = report_rows.from_dicts(report["rows"])
     content = {

@@ -1,7 +1,7 @@
-"""Rows of the report "error against run time": what was measured, how wrong it was, how long it took.
+"""Rows of the report "error against run time".
 
-A row is one error of one method. The front (`mark_front`) is taken over the rows of a task that have the same kind of
-error.
+A row is one error of one method, with its time. The Pareto front (`mark_front`) is taken over the rows of a task with
+the same kind of error.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ TASKS = ("dynamics", "poses", "images", "raster")
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of error.
+    """Kind of error.
 
     Attributes:
-        label: What people read.
-        more_is_better: Whether larger numbers are better, as of PSNR.
+        label: Label for users.
+        more_is_better: True if larger values are better, as for PSNR.
     """
 
     label: str
@@ -52,26 +52,26 @@ class Row:
     """One error of one method, and its time.
 
     Attributes:
-        task: One of `TASKS`.
+        task: Task, from `TASKS`.
         mode: Playback mode ("rigid/fitted"), or the kind of motion that is integrated.
-        method: What was done: integrator, motion model, rasterizer.
-        setting: Steps, thresholds, what the method was given.
-        error_kind: A key of `KINDS`, with "@t" appended for errors at a time before the last one.
-        error: The error; the median where it is of several objects.
-        ms: Time of one frame by the report's clock, milliseconds; median over rounds. NaN where nothing was timed.
-        error_low: Lower quartile over objects, or of one object the error.
-        error_high: Upper quartile.
-        error_worst: The worst.
-        ms_low: Lower quartile over rounds.
-        ms_high: Upper quartile.
+        method: Integrator, motion model or rasterizer.
+        setting: Settings of the method, such as steps or thresholds.
+        error_kind: Key of `KINDS`, with "@t=..." appended for times before the last one, or "@split" for other splits.
+        error: The error; the median if there are several objects.
+        ms: Time of one frame by the report's clock, milliseconds, median over rounds; NaN if not timed.
+        error_low: Lower quartile over objects; the error itself for one object.
+        error_high: Upper quartile over objects.
+        error_worst: Worst error over objects.
+        ms_low: Lower quartile of ``ms`` over rounds.
+        ms_high: Upper quartile of ``ms`` over rounds.
         ms_wall: Wall time, median over rounds.
         ms_cpu: Processor time over all threads, median over rounds.
-        ms_motion: Share of ``ms`` for motion, where it has several.
-        ms_raster: Share of ``ms`` for rasterization.
-        ms_once: Processor time of what was computed before, once per scene, such as a fit.
-        count: Objects, Gaussians or images that the error is over.
-        note: What else a reader must know.
-        pareto: Whether it is on the front of its task and kind of error.
+        ms_motion: Part of ``ms`` spent on motion, if measured separately.
+        ms_raster: Part of ``ms`` spent on rasterization.
+        ms_once: Processor time of work done once per scene, such as a fit.
+        count: Number of objects, Gaussians or images behind the error.
+        note: Further information for the reader.
+        pareto: True if the row is on the Pareto front of its task and kind of error.
     """
 
     task: str
@@ -97,11 +97,11 @@ class Row:
 
     @property
     def kind(self) -> Kind:
-        """What the error is."""
+        """Kind of the error."""
         return KINDS[self.error_kind.partition("@")[0]]
 
     def to_dict(self) -> dict[str, Any]:
-        """The row as JSON types, in the order of the report's columns; None where a number was not measured."""
+        """Return the row as JSON types, in the order of the report's columns; missing numbers become None."""
         values = {name: getattr(self, name) for name in COLUMNS}
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
@@ -111,7 +111,7 @@ COLUMNS = (*_FIRST, *(f.name for f in fields(Row) if f.name not in _FIRST))
 
 
 def spread(values: np.ndarray, *, more_is_better: bool = False) -> dict[str, float]:
-    """Median, quartiles and worst of several errors, by the names of `Row`; NaN where there are none."""
+    """Return median, quartiles and worst of several errors, by the names of `Row`; NaN if there are none."""
     values = np.asarray(values, np.float64)
     if not len(values):
         return dict.fromkeys(("error", "error_low", "error_high", "error_worst"), math.nan)
@@ -122,16 +122,16 @@ def spread(values: np.ndarray, *, more_is_better: bool = False) -> dict[str, flo
 
 
 def mark_front(rows: Sequence[Row]) -> list[Row]:
-    """The rows with those on the front marked: what no other row of the task and kind of error beats.
+    """Return the rows with the Pareto front of each task and kind of error marked.
 
-    A row is beaten by one that is better and not slower, where times whose quartiles overlap count as equal: of methods
-    that take the same time within the noise only the best one is on the front. Rows without a time or an error are not.
+    A row is dominated by a row that is better and not slower. Times whose quartiles overlap count as equal, so of
+    methods that are equally fast within noise only the best is on the front. Rows without time or error are not.
 
     Args:
-        rows: Of any tasks and kinds.
+        rows: Rows of any tasks and kinds.
 
     Returns:
-        The rows, in their order.
+        The rows in their order.
     """
     marked = list(rows)
     key = [(row.task, row.error_kind) for row in rows]
@@ -152,14 +152,14 @@ def _badness(row: Row) -> float:
 
 
 def _faster(row: Row, other: Row) -> bool:
-    """Whether a row is faster than another beyond the spread of both."""
+    """Return True if a row is faster than another by more than the spread of both."""
     high = row.ms_high if math.isfinite(row.ms_high) else row.ms
     low = other.ms_low if math.isfinite(other.ms_low) else other.ms
     return high < low
 
 
 def to_csv(rows: Sequence[Row]) -> str:
-    """The rows with a header line; empty cells where nothing was measured."""
+    """Return the rows as CSV with a header line; missing numbers are empty cells."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -169,17 +169,17 @@ def to_csv(rows: Sequence[Row]) -> str:
 
 
 def by_task(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows of each task that has some, in the order of `TASKS`."""
+    """Return the non-empty lists of rows by task, in the order of `TASKS`."""
     found = {task: [row for row in rows if row.task == task] for task in TASKS}
     return {task: some for task, some in found.items() if some}
 
 
 def kinds_of(rows: Sequence[Row]) -> list[str]:
-    """The kinds of error of some rows, in the order in which they appear."""
+    """Return the kinds of error of the rows, in order of appearance."""
     return list(dict.fromkeys(itertools.chain(row.error_kind for row in rows)))
 
 
 def from_dicts(rows: Sequence[dict[str, Any]]) -> list[Row]:
-    """Inverse of `Row.to_dict`: numbers that were not measured become NaN."""
+    """Convert dicts of `Row.to_dict` back to rows; None becomes NaN."""
     found: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in row.items()} for row in rows]
     return [Row(**values) for values in found]

@@ -1,4 +1,4 @@
-"""The report "error against run time" as tables: for the terminal, and as Markdown."""
+"""Tables of the report "error against run time", for the terminal and as Markdown."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ ABSENT = "-"
 FRONT = "*"
 CLOCKS = {"wall": "wall time", "cpu": "processor time over all threads"}
 _TITLES = {
-    "dynamics": "Dynamics: where the integrators leave the groups, against a fine reference",
-    "poses": "Poses: where the objects are at the last time, against the truth",
-    "images": "Images: what each mode shows, against true images",
-    "raster": "Rasterizer: what its thresholds save, against the finest picture",
+    "dynamics": "Dynamics: integrators against a fine reference",
+    "poses": "Poses: predicted object poses at the last time against the truth",
+    "images": "Images: pictures of each mode against true images",
+    "raster": "Rasterizer: thresholds against the finest picture",
 }
 _HEADS = {
     "position": "position, % of size",
@@ -47,10 +47,10 @@ _FORMS: dict[str, Callable[[float], str]] = {
 
 
 def sheets(report: dict[str, Any]) -> list[Sheet]:
-    """The tables of a report: one per task that has rows, and the poses along the horizon.
+    """Return the tables of a report: one per task with rows, and the poses along the horizon.
 
     Args:
-        report: What `report.measure` gives.
+        report: Result of `report.measure`.
     """
     found = []
     for task, rows in report_rows.by_task(report_rows.from_dicts(report["rows"])).items():
@@ -62,7 +62,7 @@ def sheets(report: dict[str, Any]) -> list[Sheet]:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """All tables, what is absent, and what the times were measured on."""
+    """Return all tables, the missing measurements, and the machine, as Markdown."""
     count, tau = report["gaussians"], report["horizon"]["tau"]
     parts = [
         f"# Error against run time: {report['scene']}\n\n{count} Gaussians, {report['groups']} motion groups, "
@@ -115,21 +115,21 @@ def _sheet(task: str, rows: Sequence[Row], report: dict[str, Any]) -> Sheet:
         cells.append(tuple(line))
         if first.note:
             notes[f"{first.method}{', ' + first.setting if first.method == 'playback' else ''}: {first.note}"] = None
-    caption = f"{FRONT} on the front: nothing that is better is as fast; less is better"
+    caption = f"{FRONT} on the Pareto front: no better method is as fast; less is better"
     better = [_head(kind) for kind in kinds if report_rows.KINDS[kind.partition("@")[0]].more_is_better]
     caption += f", but more of {', '.join(better)}" if better else ""
     if task in ("dynamics", "poses"):
-        caption += "; medians over objects, in brackets the worst"
+        caption += "; medians over objects, worst in brackets"
     if notes:
         caption += ". " + ". ".join(notes)
     return Sheet(_TITLES[task], tuple(head), (tuple(cells),), caption, words=3)
 
 
 def _horizon(rows: Sequence[Row]) -> Sheet:
-    """Position and rotation of the poses at every time past t_max."""
+    """Return position and rotation errors of the poses at every time past t_max."""
     later = sorted(
         {row.error_kind.partition("@t=")[2] for row in rows if "@t=" in row.error_kind}, key=float
-    )  # the last time carries none
+    )  # rows of the last time have no suffix
     head = ["mode", "method", *(f"t = {t}" for t in later), "last"]
     lines: dict[tuple[str, str], dict[str, Row]] = {}
     for row in rows:
@@ -162,7 +162,7 @@ def _error(row: Row | None) -> str:
 
 
 def _short(value: float) -> str:
-    """Three digits, whatever the size."""
+    """Format a number with three significant digits."""
     if not math.isfinite(value):
         return ABSENT
     if value == 0:
@@ -174,11 +174,11 @@ def _short(value: float) -> str:
 
 
 def show(report: dict[str, Any]) -> None:
-    """Print the tables, and what is absent."""
+    """Print the tables and the missing measurements."""
 
     for sheet in sheets(report):
         table, console = to_rich(sheet), terminal.console()
         wide = console.measure(table, options=console.options.update(width=1000)).maximum
-        terminal.console(width=max(min(wide, 240), console.width)).print(table)  # rather long than cut short
+        terminal.console(width=max(min(wide, 240), console.width)).print(table)  # too wide is better than truncated
     for text in report["absent"]:
         print(f"not measured: {text}")

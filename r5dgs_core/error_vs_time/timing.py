@@ -1,4 +1,4 @@
-"""Timing several ways to do the same: they take turns, so that what else the machine does meets all of them alike."""
+"""Timing of several callables in interleaved rounds, so that background load affects all of them equally."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TypeVar
 import numpy as np
 
 CLOCKS = ("wall", "cpu")
-SAMPLE_MS = 4.0  # a turn repeats its call until it lasts this long
-MOST_CALLS = 1000
-BUSY = 1.25  # wall time over processor time of one thread from which the machine did other things, too
+SAMPLE_MS = 4.0  # minimum duration of a turn, milliseconds; shorter calls are repeated
+MOST_CALLS = 1000  # maximum calls per turn
+BUSY = 1.25  # ratio of wall to single-thread processor time above which the machine counts as busy
 Key = TypeVar("Key", bound=Hashable)
 
 
@@ -21,7 +21,7 @@ class Times:
     """Times of one call in milliseconds: lower quartile, median and upper quartile over rounds.
 
     Attributes:
-        wall: Of the fastest call of each turn. [3]
+        wall: Wall time of the fastest call of each turn. [3]
         cpu: Processor time over all threads, mean of each turn. [3]
     """
 
@@ -29,33 +29,33 @@ class Times:
     cpu: np.ndarray
 
     def __add__(self, other: Times) -> Times:
-        """Of one call after the other."""
+        """Return the times of both calls in sequence."""
         return Times(self.wall + other.wall, self.cpu + other.cpu)
 
     def scaled(self, factor: float) -> Times:
-        """Times by a factor, such as one over the frames of a call."""
+        """Return the times multiplied by a factor, such as one over the frames of a call."""
         return Times(factor * self.wall, factor * self.cpu)
 
     def columns(self, clock: str = "wall") -> dict[str, float]:
-        """By the names of `report_rows.Row`: ``ms`` and its quartiles by a clock of `CLOCKS`, and both medians."""
+        """Return columns of `report_rows.Row`: ``ms`` and its quartiles by a clock of `CLOCKS`, and both medians."""
         low, middle, high = (self.wall if clock == "wall" else self.cpu).tolist()
         both = {"ms_wall": float(self.wall[1]), "ms_cpu": float(self.cpu[1])}
         return {"ms": middle, "ms_low": low, "ms_high": high, **both}
 
     def ms(self, clock: str = "wall") -> float:
-        """The median by a clock."""
+        """Return the median by a clock."""
         return float((self.wall if clock == "wall" else self.cpu)[1])
 
 
 def take(calls: Mapping[Key, Callable[[], object]], rounds: int) -> dict[Key, Times]:
-    """Time calls in rounds over all of them.
+    """Benchmark callables in interleaved rounds.
 
     Args:
-        calls: What to time. A first call of each does not count: it compiles. A second one tells how often to repeat.
-        rounds: Turns of each, >= 1; every other round goes backwards, so that none is always after the same one.
+        calls: The callables. The first call of each compiles and is not counted; the second determines the repeats.
+        rounds: Turns of each, >= 1; every other round is reversed, so that no call always follows the same one.
 
     Returns:
-        The times, by the keys of ``calls``.
+        Times by the keys of ``calls``.
     """
     if rounds < 1:
         raise ValueError(f"rounds: expected 1 or more, got {rounds}")
@@ -75,7 +75,7 @@ def take(calls: Mapping[Key, Callable[[], object]], rounds: int) -> dict[Key, Ti
 
 
 def _turn(call: Callable[[], object], count: int) -> tuple[float, float]:
-    """Wall time of the fastest call, which nothing interrupted, and processor time of the mean one, ms."""
+    """Return the wall time of the fastest, undisturbed call and the mean processor time, milliseconds."""
     fastest, began = float("inf"), time.process_time()
     for _ in range(count):
         start = time.perf_counter()
