@@ -22,9 +22,9 @@ def scene_path(tmp_path):
 
 
 def drawn_scenes():
-    """`tests.datasets`, which draws with torch; a Blender may lack that."""
+    """`tests.support.tiny_datasets`, which draws with torch; a Blender may lack that."""
     pytest.importorskip("torch", reason="torch is not installed here")
-    return importlib.import_module("tests.datasets")
+    return importlib.import_module("tests.support.tiny_datasets")
 
 
 def anchor_of(collection, name):
