@@ -180,8 +180,8 @@ def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.
         return image_evidence.ImageEvidence(scene, sampled, train_views.behind(dataset, config))
     except DatasetError as error:
         log.warning(
-            "the motion is simplified without the training images, so only what is too small to be seen is left out: "
-            "%s. Remedy: name the data with --data",
+            "the motion is simplified without the training images, so only motion below fixed thresholds is dropped: "
+            "%s. Remedy: give the data set with --data",
             error,
         )
         return None

@@ -7,10 +7,7 @@ import numpy as np
 from ..motion.models import MotionModel
 from ..motion_fit import model_selection, shared_gravity
 
-UP = {
-    "blender": np.array([0.0, 0.0, 1.0]),
-    "opengl": np.array([0.0, 1.0, 0.0]),
-}  # up axis; undefined in other conventions
+UP = {"blender": np.array([0.0, 0.0, 1.0]), "opengl": np.array([0.0, 1.0, 0.0])}  # up axis
 
 
 def share_gravity(

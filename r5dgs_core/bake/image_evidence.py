@@ -28,7 +28,7 @@ from ..train.train_views import spread
 PIXELS = 700_000  # total of the sampled views
 FEWEST, MOST = 20, 40  # limits of the number of sampled views
 CLUSTERS = 8  # smallest number of clusters; with fewer cameras, their views are split in time
-PATCHES = 8  # of a body: its octants
+PATCHES = 8  # patches per body: its octants
 STEP = 0.02  # change of the poses for finite differences of the images, rad or radii
 
 
@@ -63,7 +63,7 @@ class ImageEvidence:
     """
 
     def __init__(self, scene: Scene, views: Sequence[datasets.View], behind: np.ndarray | None):
-        # Without an end of the observed time poses are those of the track at t_max too, where a model would start.
+        # With an infinite t_max, the player uses the track at the last knot, too, and never the motion model.
         self._scene = dataclasses.replace(scene, t_max=math.inf)
         self._views = views
         self._truths = [datasets.load_image(view, behind) for view in views]
@@ -212,7 +212,7 @@ def _clusters(views: Sequence[datasets.View]) -> np.ndarray:
         for part in np.array_split(np.arange(len(group)), min(parts, len(group))):
             found |= {id(group[i]): count for i in part}
             count += 1
-    if count > 2 * CLUSTERS and all(len(group) == 1 for group in cameras.values()):  # a camera that moves
+    if count > 2 * CLUSTERS and all(len(group) == 1 for group in cameras.values()):  # one moving camera
         order = np.argsort([view.t for view in views], kind="stable")
         result = np.zeros(len(views), int)
         for cluster, part in enumerate(np.array_split(order, CLUSTERS)):

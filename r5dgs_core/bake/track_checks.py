@@ -26,7 +26,8 @@ def sound(group: GroupTrack, name: str) -> GroupTrack:
         return group
     if group.role == "body":  # its shadow follows it
         log.warning(
-            "%s: %d of %d poses are not finite; it stays where it is, the others are as they were. Remedy: train again",
+            "%s: %d of %d poses are not finite; the object is left at rest, others are not affected. "
+            "Remedy: train again",
             name,
             int(bad.sum()),
             len(bad),
@@ -47,8 +48,8 @@ def warn_of_aliasing(name: str, times: np.ndarray, track: np.ndarray) -> None:
     if found is not None:
         angle, first, second = found
         log.warning(
-            "%s turns by %.0f degrees between t = %g and %g: it may turn the other way in truth, and go on so past the "
-            "last observed time. Remedy: frames at more times",
+            "%s turns by %.0f degrees between t = %g and %g: its direction is ambiguous, also past the last observed "
+            "time. Remedy: frames at more times",
             name,
             np.degrees(angle),
             first,

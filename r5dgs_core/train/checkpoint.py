@@ -62,8 +62,8 @@ class Run:
         """
         if given is None and not self.dataset_root.is_dir():
             raise CheckpointError(
-                f"{self.folder}: its data set was in {self.dataset_root}, where there is none now; "
-                "give its place with --data DIR"
+                f"{self.folder}: its data set was in {self.dataset_root}, which no longer exists; "
+                "give its new location with --data DIR"
             )
         return given if given is not None else self.dataset_root
 

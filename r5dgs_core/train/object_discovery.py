@@ -59,7 +59,7 @@ def find(
     if not training_needs.discovery(dataset, config):
         return None
     progress = progress or (lambda event: None)
-    progress({"event": "prepare", "text": "no masks: looking for what moves"})
+    progress({"event": "prepare", "text": "no masks: looking for moving objects"})
     trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
     if trainer.motion.name == representation.STILL:
         return None
@@ -70,7 +70,7 @@ def find(
             progress({"event": NAME, "done": trainer.iteration, "total": total, "unit": "steps"})
     labels = parts(trainer, config)
     count = int(labels.max(initial=-1)) + 1
-    progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
+    progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
     return masks(trainer, labels) if count > 0 else None
 
 

@@ -104,7 +104,7 @@ def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarra
             if step % config.train.log_every == 0 or step == steps:
                 progress({"event": TRIAL, "done": step, "total": steps, "unit": "steps"})
     except TrainingError as error:
-        log.warning("residuals cannot be tried, all bodies stay rigid: %s", error)
+        log.warning("the trial of residuals failed, all bodies stay rigid: %s", error)
         return field, unknown
     learned = residual.residual_of(trainer.state().tensors)
     assert learned is not None

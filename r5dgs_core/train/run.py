@@ -95,7 +95,7 @@ def _train(
     if not is_new:
         claim()
     if resume and not (folder / checkpoint.RUN_FILE).exists():
-        log.warning("%s: no run to go on with; starting a new one", folder)
+        log.warning("%s: no run to resume; starting a new one", folder)
         resume = False
     if not resume and not overwrite:
         checkpoint.refuse_to_lose(folder)
@@ -128,7 +128,7 @@ def _train(
     began = time.monotonic()
     if state is not None and state.finished:
         count = len(state.tensors["gaussians.means"])
-        progress({"event": "trained", "gaussians": count, "text": "was finished already"})
+        progress({"event": "trained", "gaussians": count, "text": "already finished"})
         return run
     kept = f"{folder} is as it was; give the same command to begin again" if replaces else f"go on with: {go_on}"
     with interrupt.at_once(f"stopped before the first step; {kept}" if state is None else f"stopped; {kept}"):
@@ -147,7 +147,7 @@ def _train(
     pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, go_on, progress, probe, pictures)
-    with interrupt.at_once(f"stopped after the last step, with labels still to be made; go on with: {go_on}"):
+    with interrupt.at_once(f"stopped after the last step, before the labels; go on with: {go_on}"):
         _finish(trainer, run, began, progress)
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
@@ -341,10 +341,10 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
     elif trainer.motion.name == representation.FIELD and training_needs.sorting(trainer.dataset, trainer.config):
         from . import object_discovery
 
-        progress({"event": "prepare", "text": "no masks: sorting what moves into parts"})
+        progress({"event": "prepare", "text": "no masks: sorting moving Gaussians into parts"})
         labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
         count = int(labels.max())
-        progress({"event": "prepare", "text": f"no masks: {count} part{'s' * (count != 1)} found that move"})
+        progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
         extra |= {"labels": labels, "object_ids": torch.arange(count + 1), packed_masks.LABELS: labels}
     with torch.no_grad():
         shown = probe.training_psnr(

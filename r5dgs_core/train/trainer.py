@@ -76,13 +76,13 @@ class Trainer:
         start = initialize.start(shown, config, behind is None, rng, self._cloud(), still)
         if len(start.gaussians) == 0:
             raise DatasetError(
-                f"{dataset.root}: nothing can be placed: no masks show an object, and what lies behind is seen by one "
-                "camera alone or is all sky. Remedy: give masks, or more cameras"
+                f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "
+                "or visible to only one camera. Remedy: add masks or cameras"
             )
         missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
         if missing and len(start.object_ids) > 1 and found is None:
             named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
-            log.warning("no training mask shows object %s: it is left out. Remedy: check ids in objects.json", named)
+            log.warning("no training mask shows object %s: left out. Remedy: check the ids in objects.json", named)
         self.behind = behind
         most = config.densify.max_gaussians
         if most:
@@ -289,9 +289,7 @@ class Trainer:
         if name == "shading" and not self.config.train.shading:
             return 0.0
         progress = self.iteration / self.config.train.iterations
-        begin = (
-            self.config.residual.start if name == "residual" else rates.decay_from
-        )  # residuals start later, so they decay later
+        begin = self.config.residual.start if name == "residual" else rates.decay_from  # residuals start late
         if progress <= begin or name not in GEOMETRY + APPEARANCE + NETWORKS:
             return base
         decay = rates.decay_networks if name in NETWORKS else rates.decay

@@ -96,7 +96,7 @@ def clean(
     sure = certainty(shares, start, total, opacities, nearest)
     measured = sure[1:][np.isfinite(sure[1:])]
     if len(measured) and np.median(measured) < AGREED:
-        log.warning("masks do not agree on which object is which: labels are left as they voted")
+        log.warning("masks contradict each other about the objects: labels are not cleaned")
         return start, Changes(gaussians=len(votes))
     shares /= np.where(np.isnan(sure), 1.0, np.maximum(sure, AGREED)).astype(np.float32)
     shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)

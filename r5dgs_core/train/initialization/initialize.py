@@ -118,20 +118,20 @@ def start(
     init = config.init
     times = observed_times(views)
     if still and len(times) > 1:
-        log.info("nothing moves in any view: trained as a static scene")
+        log.info("nothing moves in any view: training a static scene")
         times = times[-1:]
     places = triangulation.locate(views, times, init.min_mask_pixels)
     unmasked = all(v.mask is None for v in views)
     by_field = config.train.representation == "field" and not still
     if unmasked and not still:
         if by_field:
-            log.warning("no masks: the field moves every Gaussian, objects are what moves as one in the end. %s", MASKS)
+            log.warning("no masks: the field moves all Gaussians, and objects are found by their motion. %s", MASKS)
         else:
             log.warning(
                 "no masks: everything is trained as one static scene. %s, or --set train.representation=field", MASKS
             )
     elif len({view.t for view in views}) == 1:
-        log.warning("only one observed time: nothing can be said of motion. Remedy: frames at more times")
+        log.warning("only one observed time: motion cannot be learned. Remedy: frames at more times")
     first = 0 if config.curriculum.start == "first" else _first_time(places, len(times))
     if unmasked and by_field and config.curriculum.start != "first":
         first = (len(times) - 1) // 2
@@ -165,8 +165,8 @@ def start(
     log.info("background: %d points from %d cameras; %d objects", len(where), len(scenes), bodies - 1)
     if len(where) == 0:
         log.warning(
-            "the background cannot be placed: too little of it is seen by two cameras (there %s). Remedy: more cameras "
-            "that look at the same place",
+            "the background cannot be placed: too little of it is visible to two cameras (there %s). Remedy: more "
+            "cameras that look at the same place",
             "is one" if len(scenes) == 1 else f"are {len(scenes)}",
         )
     parts = [place_gaussians.solid([*clouds, (where, shade, 0)], init.opacity)]

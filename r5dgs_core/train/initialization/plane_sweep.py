@@ -73,7 +73,7 @@ def _median(images: Sequence[np.ndarray], free: np.ndarray) -> np.ndarray:
     for top in range(0, height, rows):
         band = slice(top, top + rows)
         values = np.stack([image[band] for image in images]).astype(np.int16)
-        values[~free[:, band]] = 256  # after all colours
+        values[~free[:, band]] = 256  # sorts after all colours
         values.sort(axis=0)
         free_count = free[:, band].sum(0)
         low, high = (
@@ -351,7 +351,7 @@ class _Support:
         """True for points [..., 3] near the plane inside the region. [...]"""
         if self._sides is None:
             return np.zeros(points.shape[:-1], bool)
-        # The sides' half-planes; searching a triangulation takes seconds where many points lie outside.
+        # The sides' half-planes; searching a triangulation takes seconds if many points lie outside.
         flat = points @ self._axes.T
         return np.logical_and.reduce([flat @ side[:2] + side[2] <= 0 for side in self._sides])
 

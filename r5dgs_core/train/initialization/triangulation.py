@@ -90,7 +90,7 @@ def locate(views: Sequence[TrainView], times: np.ndarray, min_share: float) -> P
         centers[row], measured[row] = _path(used, times)
         if not measured[row].any():
             log.warning(
-                "object %d is never seen whole enough from two sides: its depth is a guess. "
+                "object %d is never fully visible from two sides: its depth is a guess. "
                 "Remedy: more cameras at the same times, or masks that follow it",
                 object_id,
             )
@@ -117,8 +117,8 @@ def _sightings(views: Sequence[TrainView], times: np.ndarray, min_share: float) 
     for object_id in [i for i, seen in found.items() if len(seen) == 1 and len(masked) > 1]:
         del found[object_id]
         log.warning(
-            "object %d is shown by one mask only: it is left to the background. Remedy: correct the id in that mask, "
-            "or give masks of the object in other views",
+            "object %d is shown by one mask only: treated as background. Remedy: correct the id in that mask, "
+            "or add masks of the object in other views",
             object_id,
         )
     return found
@@ -213,9 +213,7 @@ def _bends(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     secants = (np.eye(count)[1:] - np.eye(count)[:-1]) / h[:, None]
     middle = 0.5 * (h[1:] + h[:-1])
     accelerations = np.diff(secants, axis=0) / middle[:, None]
-    share = np.concatenate([middle, h]) * (
-        count - 1
-    )  # share of the span that each represents, times the number of intervals
+    share = np.concatenate([middle, h]) * (count - 1)  # in mean intervals
     noise = np.repeat([ACCELERATION, VELOCITY], [count - 2, count - 1])
     return np.concatenate([accelerations, secants]), share / noise**2
 

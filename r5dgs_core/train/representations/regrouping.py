@@ -66,7 +66,7 @@ def tidy(
     bodies, shadows, rest = (int((roles == role).sum()) for role in ("body", "shadow", "pinned"))
     resting = sum(group.role == "shadow" and not np.any(group.follow_matrix) for group in groups)
     moves = Moves(bodies, shadows, rest, resting, len(ids))
-    log.info("%d of %d Gaussians that move go with another group than their object's", moves.moved, moves.moving)
+    log.info("%d of %d moving Gaussians joined another group than that of their object", moves.moved, moves.moving)
     return ids, groups, moves
 
 

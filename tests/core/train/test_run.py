@@ -228,7 +228,7 @@ def test_resuming_where_there_is_no_run_says_that_a_new_one_starts(tiny, tmp_pat
     settings = tiny_datasets.settings("train.iterations=2", "identity.iterations=0")
     run.train(tiny.root, tmp_path / "run", settings, resume=True)
     assert [record.getMessage() for record in caplog.records if record.name == run.__name__] == [
-        f"{tmp_path / 'run'}: no run to go on with; starting a new one"
+        f"{tmp_path / 'run'}: no run to resume; starting a new one"
     ]
     assert checkpoint.load(tmp_path / "run").finished
 
