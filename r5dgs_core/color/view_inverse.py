@@ -91,9 +91,6 @@ def loss(forward: Forward, made: Inverse, display: np.ndarray, weights: np.ndarr
         made: Its inverse.
         display: The target colours. [N, 3]
         weights: Weight of each colour. [N]
-
-    Returns:
-        The loss.
     """
     wanted = np.asarray(display, np.float64)
     off = np.asarray(forward(made.scene_linear(wanted)), np.float64) - wanted
@@ -108,9 +105,6 @@ def invert(forward: Forward, scale: float = 1.0) -> Inverse:
         forward: Maps scene-linear to display colours; called a few dozen times with up to 110,000 colours.
         scale: Factor on the colours, 2 ** -exposure, such that ``forward(scale * BRIGHTEST)`` is about white; up to
             `MOST` times as bright is allowed.
-
-    Returns:
-        The inverse.
     """
 
     def shown(codes: np.ndarray) -> np.ndarray:

@@ -395,7 +395,7 @@ def _go_on(
     model, error = fit_drawn_curve.fit(later, quats, moves, course.reach, course.allowed)
     if error > 10 * course.allowed:
         notes.append(
-            f"{first.name}: no motion model goes on past t_max as its curves do; the nearest one is up to "
-            f"{error:.3g} away from them"
+            f"{first.name}: no motion model matches its curves past t_max; the nearest one deviates by up to "
+            f"{error:.3g}"
         )
     return replace(source, **known, model=model, follows=None, follow_matrix=None), False

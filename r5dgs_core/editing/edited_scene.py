@@ -51,7 +51,7 @@ def edit(
         for name in ("dynamics", "canonical_means"):
             if arrays.get(name) is not None:
                 arrays[name] = None
-                notes.append(f"'{name}' of single Gaussians hold for the unedited scene only and are left out")
+                notes.append(f"'{name}' of individual Gaussians are valid only for the unedited scene and are omitted")
     result = replace(
         scene,
         **arrays,

@@ -21,14 +21,11 @@ _LONG_NAMES = 1 << 10
 
 
 def write_png(path: str | Path, pixels: np.ndarray) -> Path:
-    """Write integers as a greyscale PNG, atomically.
+    """Write integers as a greyscale PNG, atomically, and return the path.
 
     Args:
         path: Target file.
         pixels: Top row first. [H, W] uint8 or uint16
-
-    Returns:
-        The path.
     """
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16) or pixels.size == 0:
         raise ValueError(f"pixels: expected [H, W] of uint8 or uint16, got {pixels.shape} of {pixels.dtype}")
@@ -44,14 +41,11 @@ def write_png(path: str | Path, pixels: np.ndarray) -> Path:
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> Path:
-    """Write channels as one OpenEXR image of 32-bit floats, losslessly compressed, atomically.
+    """Write channels as one OpenEXR image of 32-bit floats, losslessly compressed, atomically; return the path.
 
     Args:
         path: Target file.
         channels: Values by name, top row first, all of one size. [H, W] each
-
-    Returns:
-        The path.
     """
     names = sorted(channels)  # order required by the format
     planes = [np.ascontiguousarray(channels[name], "<f4") for name in names]

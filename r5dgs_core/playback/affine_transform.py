@@ -97,9 +97,6 @@ def place(
         tint: Factor on the display-referred colour, or None. [3]
         bend: Deviations applied in the bind state before the map, or None.
 
-    Returns:
-        The Gaussians.
-
     Raises:
         ValueError: The range exceeds the scene, or the matrix is singular or not finite.
     """

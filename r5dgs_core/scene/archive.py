@@ -81,7 +81,7 @@ class Archive:
         try:
             self._stream: BinaryIO = _Bounded(io.FileIO(path))
         except OSError as error:
-            raise SceneFileError(f"{path}: cannot be read: {error}; ask for the right to read it") from error
+            raise SceneFileError(f"{path}: cannot be read: {error}; check its read permission") from error
         try:
             self._zip = zipfile.ZipFile(self._stream)
             self._members = self._checked(path.stat().st_size)
@@ -139,13 +139,13 @@ class Archive:
             twice = Counter(info.filename for info in found).most_common(1)[0][0]
             raise SceneFileError(f"{self.place}: expected each member once, found {twice[:60]!r} twice")
         if sum(info.compress_size for info in found) > size:
-            raise SceneFileError(f"{self.place}: expected members beside each other, found members that overlap")
+            raise SceneFileError(f"{self.place}: expected members that do not overlap, found overlapping ones")
         declared, most = sum(info.file_size for info in found), most_content(size)
         if declared > most:
             raise SceneFileError(
                 f"{self.place}: expected at most {most >> 20} MiB of content in a file of {size / 2**20:.1f} MiB, "
-                f"found {declared >> 20} MiB declared; no scene compresses so well, so nothing was read. "
-                "Get the file from somebody you trust"
+                f"found {declared >> 20} MiB declared; scenes do not compress so well, so the file was not read. "
+                "Get the file from a trusted source"
             )
         return members
 
@@ -161,7 +161,7 @@ class Archive:
                 yield stream  # type: ignore[misc]
         except _BROKEN as error:
             raise SceneFileError(
-                f"{self.place}: {member}: found damage ({error}); bake or copy the file again"
+                f"{self.place}: {member}: found damaged data ({error}); bake or copy the file again"
             ) from error
 
     def _header(self, stream: BinaryIO, member: str, dtypes: Collection[str]) -> Header:

@@ -88,7 +88,8 @@ def check(data: dict[str, Any], place: str) -> None:
         words = ", ".join(f"{feature.name!r} (since R5DGS {feature.since})" for feature in lacking[:5])
         newest = max((feature.since for feature in lacking), key=lambda since: tuple(map(int, since.split("."))))
         raise errors.SceneFileError(
-            f"{place}: the scene needs what R5DGS {__version__} lacks: {words}; update R5DGS to {newest} or later"
+            f"{place}: the scene requires features that R5DGS {__version__} lacks: {words}; "
+            f"update R5DGS to {newest} or later"
         )
 
 

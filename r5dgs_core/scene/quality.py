@@ -40,7 +40,7 @@ class Quality:
             return f"views past the observed time {self.psnr_later:.1f} dB PSNR"
         if self.rigid_rms is not None:
             return f"motion {100 * self.rigid_rms:.2g} % of the scene's size (rms); picture error not measured"
-        return "error not measured; 'r5dgs evaluate' does"
+        return "error not measured; run 'r5dgs evaluate'"
 
 
 def of(scene: Scene, path: Path | None = None) -> Quality:

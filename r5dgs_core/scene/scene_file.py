@@ -117,8 +117,8 @@ def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
     size = float(np.exp(np.median(scene.log_scales[some].astype(np.float64))))
     if step > 0.2 * size:
         _log.warning(
-            "%s: lies so far from the origin that its Gaussians of %.2g units are placed to %.2g units only. "
-            "Bake its run again with this release for sharp pictures",
+            "%s: is so far from the origin that its Gaussians, of %.2g units, are positioned only to %.2g units. "
+            "Bake its run again with this release for sharp images",
             path,
             size,
             step,
@@ -215,7 +215,7 @@ def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
     with guard():
         fields |= format_features.fields(top)
         if skipped := format_features.skipped(top.data):
-            _log.warning("%s: skipped what this release cannot read: %s", top.place, ", ".join(skipped))
+            _log.warning("%s: skipped features that this release does not support: %s", top.place, ", ".join(skipped))
     shapes = _shapes(headers)
     still = not set(headers) & set(_TRACKS)
     with guard():

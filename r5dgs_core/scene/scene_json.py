@@ -77,7 +77,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
     try:
         data = json.dumps(tree, indent=1, allow_nan=False, default=_plain, ensure_ascii=False).encode()
     except (ValueError, TypeError, RecursionError) as error:  # caused by the caller's provenance or needs
-        raise errors.SceneFileError(f"scene.json: expected what JSON can hold: {error}") from error
+        raise errors.SceneFileError(f"scene.json: expected JSON types and finite numbers: {error}") from error
     strict_json.parse(data, "scene.json", errors.SceneFileError, "change names, provenance or needs")
     return data
 
