@@ -1,6 +1,6 @@
-"""Blender for the add-on's tests: the extension loaded once as package `r5dgs`, factory settings around each test.
+"""Fixtures of the add-on's tests: extension loaded once as package `r5dgs`, factory settings for each test.
 
-Modules that need another scene than the one here have a ``scene_path`` or a ``loaded`` of their own.
+Modules that need another scene override ``scene_path`` or ``loaded``.
 """
 
 import importlib
@@ -37,9 +37,9 @@ class _OneCore(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def load_extension():
-    """The repository root as package `r5dgs`, loaded once.
+    """Load the repository root as package `r5dgs`, once.
 
-    In a folder that is called `r5dgs` pytest itself has loaded it under that name already.
+    In a folder named `r5dgs`, pytest itself has already loaded it under that name.
     """
     if not any(isinstance(finder, _OneCore) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OneCore())

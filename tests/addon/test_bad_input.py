@@ -1,6 +1,6 @@
-"""Bad input: a message that names the place and says what to do, nothing half-built, and a .blend that saves and opens.
+"""Bad input gives a message with place and remedy, changes nothing, and leaves a .blend that saves and opens.
 
-Each test prints what the user sees; ``-rP`` shows it.
+Each test prints the messages that the user sees; ``-rP`` shows them.
 """
 
 import contextlib
@@ -34,14 +34,14 @@ def scene_path(tmp_path):
 
 
 def contents(bpy, users=0):
-    """Names of all data that a user would notice, and that have so many users."""
+    """Names and user counts of all data-blocks that a user would notice."""
     found = {kind: {data.name for data in getattr(bpy.data, kind) if data.users >= users} for kind in KINDS}
     return {kind: sorted(names - OWN_OF_BLENDER) for kind, names in found.items()}
 
 
 @contextlib.contextmanager
 def refused(bpy, match):
-    """Expects a message, and everything as it was: here, and in the .blend when it is saved and opened again."""
+    """Expect an error, and an unchanged state, both here and after saving and opening the .blend."""
     scene, before = bpy.context.scene, [contents(bpy), contents(bpy, 1)]  # what nobody uses is not saved
     timeline = scene.frame_start, scene.frame_end, scene.frame_current, len(scene.timeline_markers)
     selected = [obj.name for obj in bpy.context.selected_objects]
@@ -80,7 +80,7 @@ def loaded(saved, scene_path, monkeypatch):
 
 
 def f12(bpy):
-    """Render a picture and save it beside the .blend; whether it was written."""
+    """Render and save an image. Returns True if it was written."""
     path = Path(bpy.data.filepath).with_name("f12.png")
     path.unlink(missing_ok=True)
     bpy.context.scene.render.filepath = str(path)

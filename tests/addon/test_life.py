@@ -31,7 +31,7 @@ def loaded(bpy):
 
 
 def plays(bpy, collection, path):
-    """Whether every point of a loaded scene stands where the core has it."""
+    """True if every point of a loaded scene is at its position in the core."""
     scene = scene_file.read(path)
     found = [motions.offsets(bpy, collection, scene, t) for t in (0.0, 0.333, scenes.T_MAX, 0.9)]
     return bool((np.array(found) <= motions.POSITION_TOLERANCE).all())
@@ -300,7 +300,7 @@ def test_a_linked_scene_is_not_loaded_into(blender, scene_path, tmp_path):
 
 
 def traces(bpy):
-    """What the extension has hung up in Blender: classes, properties, handlers, timers, menus, keymaps."""
+    """Registrations of the extension in Blender: classes, properties, handlers, timers, menus, keymaps."""
     found = {name for name in dir(bpy.types) if "R5DGS" in name.upper()}
     for owner in ("Object", "Collection", "Scene", "WindowManager", "Material", "Camera", "PointCloud"):
         properties = getattr(bpy.types, owner).bl_rna.properties

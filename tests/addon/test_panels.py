@@ -146,7 +146,7 @@ def test_cycles_shows_points_in_the_colours_of_the_file(blender, tmp_path):
 
 
 def _texts(rna):
-    """Where and what the interface says of a type: labels, tooltips and those of its properties and their items."""
+    """Labels and tooltips of a type, its properties and their items, with their location."""
     yield rna.identifier, rna.name
     yield rna.identifier, rna.description
     for item in rna.properties:

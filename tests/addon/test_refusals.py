@@ -1,4 +1,4 @@
-"""What cannot be done is refused before anything of it is done."""
+"""Impossible actions are refused before anything is changed."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ LAST = 46  # frame of the last observed time
 
 
 def fields(anchor):
-    """What the physics panel holds of an anchor."""
+    """Values of an anchor's physics panel."""
     state = anchor.r5dgs_motion
     return state.kind, tuple(state.velocity), tuple(state.angular_velocity), state.taken
 

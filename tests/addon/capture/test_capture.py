@@ -95,7 +95,7 @@ def capture(service, bpy, directory, **changes):
 
 
 def fingerprint(bpy):
-    """Everything of the file that a capture changes on its way."""
+    """State of the file that a capture changes temporarily."""
     scene, found = bpy.context.scene, {}
     owners = [scene.render, scene.render.image_settings, scene.cycles, scene.view_settings, scene.display_settings]
     owners += [*scene.view_layers, *(layer.cycles for layer in scene.view_layers)]
@@ -397,7 +397,7 @@ def test_poses_are_rigid_whatever_the_scale(service, blender, scene):
 
 
 def unusual(scene, bpy):
-    """Give the file settings that a capture must put back."""
+    """Give the file settings that a capture must restore."""
     scene.view_settings.view_transform = "AgX"
     scene.view_settings.look = "AgX - Punchy"
     scene.render.engine = "BLENDER_WORKBENCH"

@@ -31,7 +31,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def loaded(blender, scene, tmp_path, monkeypatch):
-    """The scene as Blender renders it: engine, its first camera, multilayer EXR."""
+    """Scene with render engine, first camera and multilayer EXR output."""
     monkeypatch.delenv("R5DGS_PYTHON", raising=False)
     blender.ops.r5dgs.load_scene(filepath=str(scene_file.write(scene, tmp_path / "scene.r5dgs")))
     collection = next(c for c in blender.data.collections if c.r5dgs.is_scene)
@@ -57,7 +57,7 @@ def go_to(bpy, t):
 
 
 def render_png(bpy, folder, name="out"):
-    """What Blender saves, as 8 bits per channel, / 255. [H, W, 3 or 4]"""
+    """Image that Blender saves, with 8 bits per channel, divided by 255. [H, W, 3 or 4]"""
     settings = bpy.context.scene.render
     settings.filepath = str(folder / f"{name}.png")
     if hasattr(settings.image_settings, "media_type"):
@@ -114,7 +114,7 @@ def to_linear(srgb):
 
 
 def assert_almost_all_close(actual, expected, atol):
-    """But for a few pixels at which a Gaussian is at the border of what is drawn, and rounding decides."""
+    """Assert closeness except for a few pixels at the border of a Gaussian, which depend on rounding."""
     assert actual.shape == expected.shape
     assert (np.abs(actual - expected) > atol).mean() < 1e-3 and np.abs(actual - expected).max() < 0.02
 
@@ -479,7 +479,7 @@ def test_what_no_camera_of_ours_can_see_is_refused(blender, loaded, tmp_path):
 
 
 class Engine:
-    """As much of Blender's engine as asking the worker touches; the user stops it at once."""
+    """Stub of the render engine whose user stops at once."""
 
     def __init__(self, module):
         self.said = []

@@ -234,7 +234,7 @@ def test_a_moved_scene_file_is_found_beside_the_blend_or_missed_by_name(blender,
 
 
 class Window:
-    """As much of Blender's window and operator as `modal` touches: bpy has no window to run one in."""
+    """Stub of window and operator for `modal`, because bpy has no window."""
 
     def __init__(self, operator, job):
         self.workspace, self.window, self.windows, self.said, self.removed = self, self, [], [], []

@@ -36,7 +36,7 @@ def stereo(blender, tmp_path, monkeypatch):
 
 
 def render_views(bpy, folder, suffixes):
-    """What Blender writes, by suffix. [H, W, 3] each"""
+    """Images that Blender writes, by suffix. [H, W, 3] each"""
     bpy.context.scene.render.filepath = str(folder / "out.png")
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
     return {suffix: images.read(folder / f"out{suffix}.png")[..., :3] for suffix in suffixes}

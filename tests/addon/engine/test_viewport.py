@@ -37,7 +37,7 @@ def viewport(blender):
 
 
 def run(module):
-    """Look like Blender's timer does, until nothing is left to do; the shapes of the pictures that came."""
+    """Run the timer until nothing is left to do. Returns the shapes of the received images."""
     pictures, wait, deadline = [], 0.0, time.monotonic() + 120
     while wait is not None:
         assert time.monotonic() < deadline

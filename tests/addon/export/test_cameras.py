@@ -37,7 +37,7 @@ def loaded(blender, tmp_path):
 
 
 def pixel(camera, point):
-    """Where a point of Blender's world is in a picture, by Blender, from the upper left corner."""
+    """Pixel of a world point according to Blender, from the upper left corner."""
     import bpy
     from bpy_extras.object_utils import world_to_camera_view
 

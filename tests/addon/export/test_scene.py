@@ -40,7 +40,7 @@ def cloud(collection, name):
 
 
 def places(bpy, collection, times=TIMES):
-    """Where Blender shows every Gaussian, object after object, at each time: sorted by object and place at t_max."""
+    """Positions of all Gaussians at each time in Blender, sorted by object and position at t_max."""
     result = []
     for t in times:
         frame = 1 + 60 * t

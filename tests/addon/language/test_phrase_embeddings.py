@@ -39,7 +39,7 @@ def loaded(blender, folders, monkeypatch):
 
 
 def wait_for_the_answer():
-    """Look as often as Blender's timer does until there is nothing more to look for."""
+    """Run the timer until the response has been received."""
     patience.wait_until(lambda: motions.addon("language.phrase_embeddings").look() is None)
 
 
@@ -101,7 +101,7 @@ def test_beside_a_window_the_answer_comes_later(loaded, monkeypatch):
 
 @pytest.fixture
 def windowed(loaded, monkeypatch):
-    """`loaded` as if somebody looked at a window, which must not wait."""
+    """`loaded` with a simulated window, which must not be blocked."""
     monkeypatch.setattr(motions.addon("language.prompt"), "_has_window", lambda: True)
     return loaded
 

@@ -1,4 +1,4 @@
-"""How sure a path is shows as a tube that is one standard deviation thick."""
+"""The uncertainty of a path is shown as a tube with a radius of one standard deviation."""
 
 import dataclasses
 

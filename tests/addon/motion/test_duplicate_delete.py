@@ -1,4 +1,4 @@
-"""Objects are copied, removed and given the motion of others as wholes; what else is there stays."""
+"""Objects are copied, removed and given other motions as a whole; other data is kept."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The exact mode plays what bends, and leaves nothing when it is off."""
+"""Exact Mode plays residual motion and leaves no traces when disabled."""
 
 import dataclasses
 import importlib
@@ -162,7 +162,7 @@ def bending(loaded, scene):
 
 
 def seen(bpy, cloud):
-    """Points as the viewport shows them, Blender's world. [n, 3]"""
+    """World positions of the points in the viewport. [n, 3]"""
     evaluated = cloud.evaluated_get(bpy.context.evaluated_depsgraph_get())
     points = np.empty(3 * len(evaluated.data.points), np.float32)
     evaluated.data.attributes["position"].data.foreach_get("vector", points)

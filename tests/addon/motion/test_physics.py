@@ -253,7 +253,7 @@ def test_a_shadow_follows_its_caster_again(blender, loaded, mug):
 
 
 def push_down(bpy, anchor):
-    """What *Push Down* does: the action becomes a strip of the NLA."""
+    """Push the action down to an NLA strip, like *Push Down*."""
     action = anchor.animation_data.action
     slot = getattr(anchor.animation_data, "action_slot", None)
     track = anchor.animation_data.nla_tracks.new()
@@ -400,7 +400,7 @@ def test_a_later_end_obeys_edited_physics_and_leaves_keys_edited_by_hand(blender
 
 
 def snapshot(bpy):
-    """What an undo has to bring back."""
+    """State that an undo must restore."""
     names = {kind: sorted(d.name for d in getattr(bpy.data, kind)) for kind in ("objects", "collections", "actions")}
     places = {}
     for frame in (1, 30, 55):

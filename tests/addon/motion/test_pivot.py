@@ -1,4 +1,4 @@
-"""What a motion turns or swings about is shown, moved and turned, in every kind that has such a point."""
+"""Pivot and axis of a motion are shown and edited in every kind that has them."""
 
 import importlib
 
@@ -53,7 +53,7 @@ def body_point(bpy, collection, anchor, place):
 
 
 def paths(bpy, collection, anchor, *points):
-    """Where points of the body are over time, along the root's axes. [n, T, 3]"""
+    """Trajectories of points of the body in the root's axes. [n, T, 3]"""
     found = []
     for t in TIMES:
         motions.go_to(bpy, collection, t)

@@ -21,7 +21,7 @@ def selected(bpy):
 
 
 def choose(bpy, name, extend=False):
-    """What Blender's own click does."""
+    """Select an object like a click in Blender."""
     if not extend:
         for obj in bpy.context.selected_objects:
             obj.select_set(False)

@@ -158,7 +158,7 @@ def psnr(a, b):
 
 @pytest.fixture
 def rendered(blender, scene, loaded):
-    """A function that gives the worker's picture of all that is shown, and the camera."""
+    """Function that returns the worker's image of the visible scene, and the camera."""
     picture, views = (
         importlib.import_module(f"r5dgs.r5dgs_addon.{name}")
         for name in ("engine.render_request", "engine.view_cameras")

@@ -28,7 +28,7 @@ def row_of(collection, name):
 
 
 def drawn(bpy, collection, name):
-    """What the list says in the row of an object."""
+    """Texts in the row of an object."""
     said = []
     lists = importlib.import_module("r5dgs.r5dgs_addon.panels.objects")
     layout = layouts.Layout(bpy, said)

@@ -1,4 +1,4 @@
-"""What stands for Gaussians in the viewport: points, or ellipsoids of their size, direction and opacity."""
+"""Gaussians are shown in the viewport as points, or as ellipsoids with their size, orientation and opacity."""
 
 import numpy as np
 import pytest

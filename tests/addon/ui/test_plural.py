@@ -1,4 +1,4 @@
-"""Amounts in messages are said in the singular and in the plural."""
+"""Counts in messages use singular and plural forms."""
 
 import importlib
 

@@ -1,4 +1,4 @@
-"""Long work in a window goes on step by step, says where it stands, and ends tidily however it ends."""
+"""Long operators run step by step in a window, report progress, and clean up however they end."""
 
 import importlib
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Who asks the worker, in which turn, and which Python it runs."""
+"""Order of worker jobs, and selection of the worker's Python."""
 
 import importlib
 import json
@@ -45,7 +45,7 @@ def preferences(blender, monkeypatch):
 
 @pytest.fixture
 def held(worker):
-    """A worker that is at work on a job and does not go on."""
+    """Worker that is busy with a job and does not proceed."""
     running = worker.current()
     os.kill(running.pid, signal.SIGSTOP)
     job = worker.start(HELLO)
@@ -235,7 +235,7 @@ def test_where_none_will_do_blenders_own_python_says_what_it_lacks(preferences, 
 
 
 def elsewhere_called(function):
-    """What a function returns in another thread than Blender's main one."""
+    """Result of a function called outside Blender's main thread."""
     results = []
     thread = threading.Thread(target=lambda: results.append(function()))
     thread.start()
