@@ -1,4 +1,4 @@
-"""Files that are replaced whole or not at all: whatever happens on the way, the old content or the new is there."""
+"""Atomic replacement of files: after any interruption, a file holds either its old or its new content."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[BinaryIO]:
-    """A stream for the new content of a file, which becomes the file when the block ends without an error.
+    """Open a stream for the new content of a file, which replaces the file if the block ends without an error.
 
-    The content goes under a hidden temporary name in the same folder, then to the disk, then to its place. After an
-    error the temporary file is gone and the old one untouched.
+    The content is written to a hidden temporary file in the same folder, flushed to disk and renamed. After an error
+    the temporary file is removed and the old file is unchanged.
 
     Args:
         path: The file; its folder must exist.
-        previous: Place of the old file from then on, in the same folder; None to drop it. A kill between the two moves
-            leaves the old content there and nothing at ``path``.
+        previous: New path of the old file, in the same folder; None drops the old file. A kill between the two renames
+            leaves the old content there and no file at ``path``.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     path = Path(path)
     temporary = _temporary(path, ".part")
-    created = open(temporary, "xb")  # noqa: SIM115  # exclusive: what others put there is neither written nor removed
+    created = open(temporary, "xb")  # noqa: SIM115  # exclusive: never overwrite or remove a file of others
     try:
         with created as stream:
             yield stream
@@ -46,10 +46,12 @@ def replacing(path: str | Path, previous: str | Path | None = None) -> Iterator[
 
 @contextmanager
 def replacing_by_name(path: str | Path) -> Iterator[Path]:
-    """As `replacing`, for libraries that open files themselves: the name of an empty file with the suffix of ``path``.
+    """Yield the path of an empty temporary file, for libraries that open files themselves; see `replacing`.
+
+    The path has the suffix of ``path``.
 
     Raises:
-        OSError: The file cannot be made or moved to its place.
+        OSError: The file cannot be created or renamed.
     """
     path = Path(path)
     temporary = _temporary(path, path.suffix)
@@ -66,19 +68,19 @@ def _temporary(path: Path, suffix: str) -> Path:
 
 
 def write(path: str | Path, content: bytes) -> None:
-    """Replace a file by ``content``, see `replacing`."""
+    """Replace a file by ``content``; see `replacing`."""
     with replacing(path) as stream:
         stream.write(content)
 
 
 def leftovers(path: str | Path) -> list[Path]:
-    """Temporary files that `replacing` left beside a file when its process was killed, or is writing right now."""
+    """Return temporary files of `replacing` beside a file, of killed processes or of writes in progress."""
     path = Path(path)
     return [p for p in path.parent.glob(f".{path.name}.*.part") if p.is_file()]
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put the rename itself on the disk, where the system can (not on Windows)."""
+    """Flush the rename to disk if the system supports it (Windows does not)."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

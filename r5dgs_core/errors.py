@@ -1,8 +1,8 @@
-"""Errors that a user can act on; their messages name the place, what was expected, what was found and the remedy."""
+"""Errors that a user can resolve; messages name the place, what was expected, what was found and the remedy."""
 
 
 class R5dgsError(Exception):
-    """Base of everything that the command line and the add-on report without a traceback.
+    """Base class of errors that the command line and the add-on report without a traceback.
 
     Attributes:
         code: Code of the fault in the table of `r5dgs check`, "" if it has none.
@@ -18,7 +18,7 @@ class ConfigError(R5dgsError):
 
 
 class UsageError(ConfigError):
-    """Arguments are wrong, whatever the files hold: an unknown value, or options that contradict each other."""
+    """Arguments are wrong, independently of any file: an unknown value, or contradictory options."""
 
 
 class DatasetError(R5dgsError):
@@ -34,12 +34,12 @@ class SceneFileError(R5dgsError):
 
 
 class BackendError(R5dgsError):
-    """Something optional (a rasterizer, an encoder, a Blender) is asked for and not there."""
+    """An optional dependency (a rasterizer, an encoder, a Blender) is required but missing."""
 
 
 class TrainingError(R5dgsError):
-    """Training cannot go on."""
+    """Training cannot continue."""
 
 
 class Interrupted(R5dgsError):
-    """The user or the system asked to stop; what was done is kept, and the message says how to go on."""
+    """The user or the system requested a stop; finished work is kept, and the message explains how to continue."""

@@ -1,8 +1,8 @@
-"""Faults of files as data: what `r5dgs check` lists, and how readers go on after one.
+"""Faults of files as data, as listed by `r5dgs check`, and guards that let readers continue after a fault.
 
-A reader takes a `Guard` and enters it around each item (a frame, an image, an array). `STRICT`, the default, lets the
-first error through. A `Collector` keeps errors and lets the reader go on without the item, so that `check` and the
-reader have the same rules. `UNREAD` replaces a value whose error was kept.
+A reader takes a `Guard` and enters it around each item (a frame, an image, an array). `STRICT`, the default, propagates
+the first error. A `Collector` records errors and lets the reader continue without the item, so that `check` applies the
+same rules as the reader. `UNREAD` replaces a value whose error was recorded.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from . import errors
 
 T = TypeVar("T")
 ERROR, WARNING = "error", "warning"
-MOST_FINDINGS = 10_000  # of one file, so that a hostile one cannot fill the memory
+MOST_FINDINGS = 10_000  # per file, so that a malicious file cannot fill the memory
 Guard = Callable[[], AbstractContextManager[Any]]
 _NOTHING = contextlib.nullcontext()
 
 
 def _let_through() -> AbstractContextManager[None]:
-    return _NOTHING  # one for all, as readers enter it for each entry of a row
+    return _NOTHING  # one shared object, because readers enter the guard for every entry of a row
 
 
 STRICT: Guard = _let_through
 
 
 class _Unread:
-    """Value whose error was kept. Each use of it raises, which a `Collector` drops; only ``is`` may be applied."""
+    """Value whose error was recorded. Any use but ``is`` raises, which a `Collector` drops."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -48,7 +48,7 @@ UNREAD: Any = _Unread()
 
 
 def attempt(guard: Guard, read: Callable[[], T]) -> T:
-    """Return the result of a function, or `UNREAD` if the guard kept an error of it."""
+    """Return the result of a function, or `UNREAD` if the guard recorded its error."""
     with guard():
         return read()
     return UNREAD
@@ -56,12 +56,12 @@ def attempt(guard: Guard, read: Callable[[], T]) -> T:
 
 @dataclass(frozen=True)
 class Code:
-    """A kind of fault.
+    """Kind of fault.
 
     Attributes:
-        severity: `ERROR`: the reader refuses the file. `WARNING`: it is read, but probably not what was meant.
-        meaning: One phrase.
-        remedy: Advice for findings that bring none of their own.
+        severity: `ERROR` if the reader refuses the file; `WARNING` if it reads the file, but probably not as intended.
+        meaning: Short description.
+        remedy: Advice for findings without their own.
     """
 
     severity: str
@@ -76,7 +76,7 @@ class Finding:
     Attributes:
         code: Key of the table of codes.
         severity: `ERROR` or `WARNING`.
-        place: File or folder.
+        place: Path of the file or folder.
         problem: Expected and found content.
         remedy: Advice to the user.
     """
@@ -94,7 +94,7 @@ class Finding:
 
 @contextlib.contextmanager
 def coded(code: str, *, instead: bool = False) -> Iterator[None]:
-    """Give errors of a block a code: those without one, or all of them with ``instead``."""
+    """Set the code of errors raised in a block: of those without one, or of all with ``instead``."""
     try:
         yield
     except errors.R5dgsError as error:
@@ -117,9 +117,9 @@ class Collector:
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """Guard of an item: keep the error of a reader instead of passing it on.
+        """Guard of an item: record an error of the reader instead of propagating it.
 
-        Once an error was kept, what later items need may be missing; other exceptions are then dropped.
+        After a recorded error, values that later items depend on may be missing, so other exceptions are dropped.
         """
         try:
             yield
@@ -132,12 +132,12 @@ class Collector:
                 raise
 
     def add(self, code: str, message: str) -> None:
-        """Keep a fault; of more than `MOST_FINDINGS`, only that there are more.
+        """Record a fault; beyond `MOST_FINDINGS`, record once that there are more.
 
         Args:
-            code: Its code.
-            message: "place: problem; remedy" or "place: problem. Remedy: remedy", as errors have it; the remedy of the
-                code if there is none.
+            code: Code of the fault.
+            message: "place: problem; remedy" or "place: problem. Remedy: remedy", the forms of error messages. Without
+                a remedy, that of the code is used.
         """
         kind = self.codes[code]
         body, mark, remedy = message.partition("Remedy: ")

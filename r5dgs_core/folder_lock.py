@@ -1,6 +1,6 @@
-"""Locks of run folders: one process at a time writes into a folder.
+"""Locks of run folders: only one process at a time writes into a folder.
 
-The system releases a lock when its process ends, however that happens. Readers take none.
+The system releases a lock when its process ends in any way. Readers take no lock.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 LOCK_FILE = ".lock"
-_PLACE = 1 << 30  # of the locked byte on Windows, which nobody else can read: past the holder's description
-_MOST_BYTES = 1 << 16  # of that description
+_PLACE = 1 << 30  # offset of the locked byte, past the description: Windows blocks reads of a locked range
+_MOST_BYTES = 1 << 16  # maximum size of the holder's description
 
 
 @contextlib.contextmanager
 def hold(folder: Path) -> Iterator[bool]:
-    """Lock a folder for the block; a missing folder is made.
+    """Lock a folder for the block; creates a missing folder.
 
     Yields:
-        False if the file system has no locks; a warning names the folder then.
+        False if the file system does not support locks; a warning then names the folder.
 
     Raises:
-        CheckpointError: Another process holds the folder, which the message names, or the folder cannot be written.
+        CheckpointError: Another process, named in the message, holds the lock, or the folder cannot be written.
     """
     path = Path(folder) / LOCK_FILE
     try:
@@ -56,18 +56,18 @@ def hold(folder: Path) -> Iterator[bool]:
         yield locked
     finally:
         if locked and os.name == "posix":
-            path.unlink(missing_ok=True)  # before the release: the next process makes a file of its own
+            path.unlink(missing_ok=True)  # before the release, so that the next process creates its own file
         os.close(descriptor)
         if os.name != "posix":
-            with contextlib.suppress(OSError):  # Windows keeps a file that another process has open
+            with contextlib.suppress(OSError):  # Windows cannot remove a file that another process has open
                 path.unlink(missing_ok=True)
 
 
 def hold_run_around(path: Path) -> contextlib.AbstractContextManager[object]:
-    """Lock the run folder in which a command writes a file or folder; nothing if the path is in no run folder.
+    """Lock the run folder that contains an output path; does nothing if the path is in no run folder.
 
     Raises:
-        CheckpointError: As of `hold`.
+        CheckpointError: See `hold`.
     """
     path = Path(path).absolute()
     run = next((folder for folder in (path, *path.parents) if _is_run(folder)), None)
@@ -75,7 +75,7 @@ def hold_run_around(path: Path) -> contextlib.AbstractContextManager[object]:
 
 
 def _is_run(folder: Path) -> bool:
-    """Return True for a folder whose ``run.json`` is ours or damaged; other programs have files of that name, too."""
+    """Return True if ``run.json`` is ours or damaged; other programs write files of that name too."""
     path = folder / input_paths.RUN_FILE
     if not path.is_file():
         return False
@@ -87,10 +87,10 @@ def _is_run(folder: Path) -> bool:
 
 
 def writes(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Return a decorator that locks the run folder around what a function writes, see `hold_run_around`.
+    """Return a decorator that locks the run folder around the output of a function; see `hold_run_around`.
 
     Args:
-        names: Arguments with the path; the first one that is not None counts.
+        names: Names of arguments that may hold the output path; the first that is not None is used.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
@@ -108,23 +108,23 @@ def writes(*names: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
 
 def _open(path: Path) -> tuple[int, bool]:
-    """Open and lock the file at a path, and describe this process in it.
+    """Open and lock the file at a path, and write a description of this process into it.
 
     Raises:
         BlockingIOError: Another process holds the lock.
         OSError: The file cannot be opened.
     """
     while True:
-        # A link is refused: its target would be overwritten.
+        # Symbolic links are refused, because their target would be overwritten.
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise OSError(f"{path} is not a regular file")
             locked = _lock(descriptor, path)
-            if locked and not _is_at(path, descriptor):  # the holder removed it in between
+            if locked and not _is_at(path, descriptor):  # the previous holder removed the file meanwhile
                 os.close(descriptor)
                 continue
-            with contextlib.suppress(OSError):  # a full disk takes no description, but the lock holds
+            with contextlib.suppress(OSError):  # the lock holds even if a full disk prevents the description
                 os.ftruncate(descriptor, 0)
                 os.lseek(descriptor, 0, os.SEEK_SET)
                 os.write(descriptor, json.dumps(_description()).encode())
@@ -135,7 +135,7 @@ def _open(path: Path) -> tuple[int, bool]:
 
 
 def _lock(descriptor: int, path: Path) -> bool:
-    """Lock an open file; returns False if its file system has no locks."""
+    """Lock an open file; returns False if its file system does not support locks."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -178,7 +178,7 @@ def _description() -> dict[str, str | int]:
 
 
 def _holder(path: Path) -> str:
-    """Describe the process that holds a lock, from the lock file; "another process" if that cannot be read."""
+    """Return a description of the process that holds a lock; "another process" if the lock file cannot be read."""
     try:
         with open(path, "rb") as stream:
             found = strict_json.parse(stream.read(_MOST_BYTES), str(path), CheckpointError)

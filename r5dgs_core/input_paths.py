@@ -1,6 +1,6 @@
-"""Checks of the paths that commands are given. Needs the standard library alone, so a wrong path is reported at once.
+"""Checks of path arguments. Only needs the standard library, so that a wrong path is reported at once.
 
-A path that the user may not look at passes: whoever opens it reports why.
+A path without read permission passes: the code that opens it reports the reason.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def check_run(folder: Path) -> None:
 
 
 def check_foreign_run(folder: Path) -> None:
-    """Raise `CheckpointError` if a path is not a folder; its layout is up to the importer."""
+    """Raise `CheckpointError` if a path is not a folder; the importer checks its layout."""
     if not _holds(folder.is_dir):
         raise errors.CheckpointError(f"{folder}: expected a run folder, found {_found(folder)}")
 
@@ -64,7 +64,7 @@ def check_target(path: Path) -> None:
 
 
 def check_scene_output(out: Path) -> None:
-    """Refuse an output path for a scene file that Blender would not find, or whose folder is missing.
+    """Check the output path of a scene file: its suffix, which Blender's file browser filters by, and its folder.
 
     Raises:
         UsageError: The name has another suffix.
@@ -73,22 +73,22 @@ def check_scene_output(out: Path) -> None:
     if out.is_dir():
         raise errors.SceneFileError(f"{out}: is a folder; name the file, for example {out / 'scene.r5dgs'}")
     if out.suffix.lower() != SCENE_SUFFIX:
-        raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which is what Blender looks for")
+        raise errors.UsageError(f"{out}: expected a name that ends in {SCENE_SUFFIX}, which Blender filters files by")
     if not out.parent.is_dir():
         raise errors.SceneFileError(f"{out}: expected the folder {out.parent} to exist; make it first")
 
 
 def check_output(option: str, path: Path | None) -> None:
-    """Raise `ConfigError` if the file that an option names cannot be written because of its folder."""
+    """Raise `ConfigError` if the file that an option names is a folder, or its folder is missing."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         expected = "a file" if path.is_dir() else f"the folder {path.parent} to exist; make it first"
         raise errors.ConfigError(f"{option} {path}: expected {expected}")
 
 
 def check_output_folder(option: str, path: Path) -> None:
-    """Raise `ConfigError` if the path for an output folder is taken by a file."""
+    """Raise `ConfigError` if the path of an output folder is a file."""
     if path.exists() and not path.is_dir():
-        raise errors.ConfigError(f"{option} {path}: expected a folder, or nothing yet; found a file")
+        raise errors.ConfigError(f"{option} {path}: expected a folder or an unused path, found a file")
 
 
 def _found(path: Path) -> str:

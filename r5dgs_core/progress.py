@@ -1,4 +1,4 @@
-"""Progress of long work: a live line in a terminal, one JSON object per line for programs, plain lines in a log."""
+"""Progress of long operations: live bars in a terminal, one JSON object per line for programs, plain lines in a log."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .time_left import Timed
 Event = dict[str, Any]
 Progress = Callable[[Event], None]
 PLAIN_EVERY_S = 10.0
-LABELS = {"step": "train", "identity": "identities"}  # of the bars; others are called like their event
+LABELS = {"step": "train", "identity": "identities"}  # labels of bars; the default is the name of the event
 
 
 @contextmanager
 def make(kind: str) -> Iterator[Timed]:
-    """Yield a function that shows events, counted ones with the seconds that are left.
+    """Yield a function that shows events and adds the remaining seconds to counted ones.
 
     Args:
-        kind: "auto" (rich in a terminal, else a plain line per phase and every ten seconds), "json" or "none".
+        kind: "auto" (bars in a terminal, else a plain line per phase and every ten seconds), "json" or "none".
     """
     if kind == "json":
         yield Timed(lambda event: print(json.dumps(event), flush=True))
@@ -45,7 +45,7 @@ def _rich() -> Iterator[Progress]:
         BarColumn(),
         TextColumn("{task.fields[count]}"),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}", markup=False),  # paths and names may hold brackets
+        TextColumn("{task.fields[note]}", markup=False),  # paths and names may contain markup brackets
     ]
     with Progress(*columns, console=terminal.console()) as bars:
         tasks: dict[str, TaskID] = {}
@@ -56,7 +56,7 @@ def _rich() -> Iterator[Progress]:
         def show(event: Event) -> None:
             event = last(event)
             name, position = str(event["event"]), count_of(event)
-            for task in waiting:  # what had no measure is over when the next thing is told
+            for task in waiting:  # a phase without a count is finished when the next event arrives
                 bars.update(task, total=1, completed=1)
             waiting.clear()
             if name == "start":
@@ -89,7 +89,7 @@ def _plain() -> Progress:
 
 
 def _remembering() -> Callable[[Event], Event]:
-    """A function that gives steps in between the PSNR that the last look at held-out views of their run found."""
+    """Return a function that adds the last held-out PSNR of the run to step events without one."""
     known: Event = {}
 
     def complete(event: Event) -> Event:
@@ -104,7 +104,7 @@ def _remembering() -> Callable[[Event], Event]:
 
 
 def count_of(event: Event) -> tuple[int, int | None] | None:
-    """How far something with a measure is, and where it ends if the event says; None for other events."""
+    """Return the position of a counted event and its end, if known; None for other events."""
     if "iteration" in event:
         return event["iteration"], event.get("iterations")
     if "done" in event:
@@ -113,7 +113,7 @@ def count_of(event: Event) -> tuple[int, int | None] | None:
 
 
 def describe(event: Event) -> str:
-    """An event in a few words."""
+    """Return a short description of an event."""
     parts = []
     if "text" in event:
         parts.append(event["text"])

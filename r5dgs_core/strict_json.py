@@ -1,4 +1,4 @@
-"""The one reader of JSON: bounded in size, depth and memory; every fault is one error of the caller's class.
+"""JSON parser limited in size, depth and memory; every fault raises one error of the caller's class.
 
 Accepted content can be written as JSON again: numbers are finite and in range, and text is valid Unicode.
 """
@@ -12,10 +12,10 @@ from typing import Any
 
 from .errors import R5dgsError
 
-MOST_BYTES = 64 << 20  # of a file
-MOST_MEMORY = 256 << 20  # of what the parser builds, as `memory_of` estimates it
-MOST_DEPTH = 64
-_MOST_DIGITS = 19  # of integers of 64 bits; Python limits what it converts to 4300
+MOST_BYTES = 64 << 20  # per file
+MOST_MEMORY = 256 << 20  # bytes of parsed values, as estimated by `memory_of`
+MOST_DEPTH = 64  # nesting levels
+_MOST_DIGITS = 19  # of a 64-bit integer; longer text is not converted, because that takes quadratic time
 
 
 def parse(
@@ -31,18 +31,18 @@ def parse(
 
     Args:
         data: UTF-8 text.
-        place: Start of messages: the file, or the member of a file.
+        place: Start of error messages: the file, or the member of a file.
         kind: Class of the error.
-        remedy: End of messages about damage.
-        memory: Limit of the memory that the result may take beside its text, bytes.
-        size: Limit of the length of ``data``, bytes.
+        remedy: End of error messages about damage.
+        memory: Memory limit of the result, without its text, bytes.
+        size: Size limit of ``data``, bytes.
 
     Returns:
-        Dictionaries, lists, strings, integers of 64 bits, finite floats, booleans and None.
+        Dictionaries, lists, strings, 64-bit integers, finite floats, booleans and None.
 
     Raises:
-        R5dgsError: Of class ``kind``: not JSON, too large, nested deeper than `MOST_DEPTH`, a key that occurs twice in
-            an object, NaN, infinity, a number out of range, or half of a surrogate pair.
+        R5dgsError: Of class ``kind``: invalid JSON, too large, nested deeper than `MOST_DEPTH`, a repeated key in an
+            object, NaN, infinity, a number out of range, or an unpaired surrogate.
     """
     needed = memory_of(data)
     if len(data) > size or needed > memory:
@@ -65,13 +65,13 @@ def parse(
         raise kind(f"{place}: damaged, {fault}; {remedy}") from error
     except RecursionError as error:
         raise kind(f"{place}: damaged, JSON nested deeper than {MOST_DEPTH} levels; {remedy}") from error
-    except ValueError as error:  # of `decode` and of the functions below
+    except ValueError as error:  # from `decode` and the hooks
         raise kind(f"{place}: damaged, {error}; {remedy}") from error
     return content
 
 
 def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -> Any:
-    """Parse a JSON file, as `parse`; a missing or unreadable file is an error of class ``kind`` too."""
+    """Parse a JSON file, see `parse`; a missing or unreadable file is also an error of class ``kind``."""
     try:
         with open(path, "rb") as stream:
             data = stream.read(MOST_BYTES + 1)
@@ -83,12 +83,12 @@ def read(path: Path, kind: type[R5dgsError], remedy: str = "is it truncated?") -
 
 
 def memory_of(data: bytes) -> int:
-    """Return an upper bound of the memory of parsed values, without their text, from counts of separators; bytes."""
+    """Return an upper bound of the memory of parsed values, without their text, from separator counts; bytes."""
     return 240 * data.count(b"{") + 64 * (data.count(b"[") + data.count(b","))
 
 
 def _refuse(constant: str, data: bytes) -> float:
-    line = data.count(b"\n", 0, data.find(constant.encode())) + 1  # it may stand in a name before
+    line = data.count(b"\n", 0, data.find(constant.encode())) + 1  # may be too small if a name contains the constant
     raise ValueError(f"expected finite numbers, found {constant} (line {line})")
 
 
@@ -129,6 +129,6 @@ def _check_depth(content: Any) -> None:
 
 
 def _check_text(data: bytes, content: Any) -> None:
-    """Refuse half surrogate pairs, which only an escape can bring into UTF-8."""
+    """Raise UnicodeEncodeError, a ValueError, for unpaired surrogates, which only an escape can encode in UTF-8."""
     if b"\\u" in data:
         json.dumps(content, ensure_ascii=False).encode()

@@ -1,4 +1,4 @@
-"""Output to terminals: text of files, such as names of objects, can neither move the cursor nor forge a line."""
+"""Safe terminal output: text from files, such as object names, can neither move the cursor nor forge a line."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     from rich.console import Console
 
-_JOINERS = "\u200c\u200d"  # of letters, in several scripts; they show nothing by themselves
+_JOINERS = "\u200c\u200d"  # zero-width letter joiners, which several scripts need
 
 
 def printable(text: str, keep: str = "") -> str:
-    """Return a text with all but visible characters escaped, as ``\\n`` and ``\\x1b``.
+    """Return a text with invisible characters escaped, such as ``\\n`` and ``\\x1b``.
 
     Args:
-        text: Any text, also with half surrogate pairs.
-        keep: Further characters that stay.
+        text: Any text, including unpaired surrogates.
+        keep: Further characters to keep.
     """
     if text.isprintable():
         return text
@@ -28,7 +28,7 @@ def printable(text: str, keep: str = "") -> str:
 
 
 class _SafeStream:
-    """A text stream that escapes control characters; lines and tabs stay."""
+    """Text stream that escapes control characters, except line breaks and tabs."""
 
     def __init__(self, stream: TextIO):
         self.unsafe = stream
@@ -46,7 +46,7 @@ class _SafeStream:
 
 
 class _OneLine(logging.Formatter):
-    """Messages of logs, each in one line."""
+    """Log formatter that keeps each message on one line."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # the name is logging's
         return printable(super().formatMessage(record))
@@ -54,7 +54,7 @@ class _OneLine(logging.Formatter):
 
 @contextlib.contextmanager
 def safe_output() -> Iterator[None]:
-    """Escape control characters in all that the block prints and logs; `console` alone may style its output."""
+    """Escape control characters in everything that the block prints and logs; only `console` may style its output."""
     last = logging.lastResort
     assert last is not None
     before = last.formatter
@@ -69,7 +69,7 @@ def safe_output() -> Iterator[None]:
 
 
 def console(**options: Any) -> Console:
-    """Return a rich console on standard output that escapes control characters in what it shows."""
+    """Return a rich console on standard output that escapes control characters in its content."""
     from rich.console import Console
     from rich.segment import Segment
 

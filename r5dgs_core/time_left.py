@@ -1,9 +1,8 @@
-"""An estimate of the time that a command still takes, over all of its phases, which changes smoothly.
+"""Smooth estimate of the remaining time of a command, over all of its phases.
 
 The work of a phase is its number of units (steps, images) times the expected cost of one, relative to the other
-phases. Seconds per cost are measured in the phase that runs; phases to come take those of the phase with most work so
-far. What is shown follows this raw estimate under a limit, so that one slow step or one slow phase does not make it
-jump.
+phases. Seconds per cost are measured in the running phase; future phases use those of the phase with the most measured
+work. The shown value follows this raw estimate at a limited rate, so that one slow step or phase does not make it jump.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-SETTLED = 0.05  # share of the work before which the estimate may change by any amount
-CHANGE = 0.2  # largest change between two reports after that, as a share of the estimate, beside SLACK_S
-SLACK_S = 2.0
+SETTLED = 0.05  # share of the work before which the estimate may change without limit
+CHANGE = 0.2  # largest change between two reports, as a share of the estimate, in addition to SLACK_S
+SLACK_S = 2.0  # largest change between two reports, seconds, in addition to CHANGE
 MEMORY = 0.03  # share of the work over which seconds per cost are averaged
-OUTLIER = 4.0  # slower pieces of work count as this many times the rate known so far
+OUTLIER = 4.0  # limit of the seconds per cost of one report, as a multiple of the average
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase of a command.
+    """Phase of a command.
 
     Attributes:
         name: Name of its events.
@@ -37,11 +36,11 @@ class Phase:
 
 
 class TimeLeft:
-    """The estimate.
+    """Estimate of the remaining time.
 
     Args:
-        phases: Phases of the command; `add` adds those that become known later.
-        clock: Seconds of a clock that never goes back.
+        phases: Phases of the command; later phases are added by `add`.
+        clock: Monotonic clock, seconds.
     """
 
     def __init__(self, *phases: Phase, clock: Callable[[], float] = time.monotonic):
@@ -49,9 +48,9 @@ class TimeLeft:
         self._phases: dict[str, Phase] = {}
         self._done: dict[str, float] = {}
         self._rates: dict[str, float] = {}  # seconds per cost
-        self._measured: dict[str, float] = {}  # cost whose time was measured
+        self._measured: dict[str, float] = {}  # cost of the measured work
         self._last: tuple[str, float] | None = None  # phase and time of the last report
-        self._shown: tuple[float, float] | None = None  # seconds left, time
+        self._shown: tuple[float, float] | None = None  # last estimate in seconds, and its time
         self.add(*phases)
 
     def __contains__(self, name: str) -> bool:
@@ -64,7 +63,7 @@ class TimeLeft:
             self._done[phase.name] = 0.0
 
     def finish(self, name: str) -> None:
-        """Count a phase as done, whether it ran or was left out."""
+        """Count a phase as finished, whether it ran or was skipped."""
         if name not in self._phases:
             return
         phase = self._phases[name]
@@ -74,16 +73,16 @@ class TimeLeft:
         self._done[name] = phase.units
 
     def at(self, name: str, done: float, units: float | None = None) -> float | None:
-        """Return the seconds left when ``done`` of the units of a phase are done; None before anything was measured.
+        """Return the seconds left after ``done`` units of a phase; None before the first measurement.
 
-        A number of ``units`` replaces the planned one.
+        ``units`` replaces the planned number of units.
         """
         now, phase = self._clock(), self._phases[name]
         if units is not None and units != phase.units:
             phase = self._phases[name] = replace(phase, units=units)
         done = min(done, phase.units)
         fresh = done - self._done[name]
-        # Between phases other work may have been done: that time counts only if nothing else is known of the phase.
+        # Time since a report of another phase may include other work, so it counts only for a phase without a rate.
         if self._last is not None and fresh > 0 and (self._last[0] == name or name not in self._rates):
             self._measure(phase, fresh, now - self._last[1])
         self._last = (name, now)
@@ -108,7 +107,7 @@ class TimeLeft:
         self._measured[phase.name] = self._measured.get(phase.name, 0.0) + cost
 
     def _limited(self, raw: float, now: float) -> float:
-        """Return the raw estimate, limited to a small change from the one shown before."""
+        """Return the raw estimate, with a limited change from the previous one."""
         if self._shown is not None and self._work_done() >= SETTLED * self._total() and raw > 0:
             expected = max(0.0, self._shown[0] - (now - self._shown[1]))
             most = CHANGE * expected + SLACK_S
@@ -117,7 +116,7 @@ class TimeLeft:
         return raw
 
     def _usual(self) -> float:
-        """Seconds per cost of the phase of which most was measured."""
+        """Return the seconds per cost of the phase with the most measured work."""
         return self._rates[max(self._measured, key=self._measured.__getitem__)]
 
     def _total(self) -> float:
@@ -128,14 +127,14 @@ class TimeLeft:
 
 
 class Timed:
-    """A function for progress that adds ``seconds_left`` to counted events, over all phases of the command.
+    """Progress function that adds ``seconds_left`` to counted events, over all phases of the command.
 
     Args:
         show: Function that shows an event.
-        clock: As of `TimeLeft`.
+        clock: Clock of `TimeLeft`.
 
     Attributes:
-        estimate: The estimate; phases that are known beforehand are added to it. Others are added by their first event.
+        estimate: The estimate. Phases known in advance are added to it; others are added by their first event.
     """
 
     def __init__(self, show: Callable[[dict[str, Any]], None], clock: Callable[[], float] = time.monotonic):
@@ -146,7 +145,7 @@ class Timed:
         self._show(self.timed(event))
 
     def timed(self, event: dict[str, Any]) -> dict[str, Any]:
-        """Return an event with the seconds that are left, if it is counted and they can be told."""
+        """Return an event with the remaining seconds, if it is counted and they are known."""
         name, done = event["event"], event.get("iteration", event.get("done"))
         total = event.get("iterations", event.get("total"))
         if done is None or "seconds_left" in event:

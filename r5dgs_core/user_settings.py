@@ -1,6 +1,6 @@
-"""The user's settings: paths of weights and of the worker's Python, in the configuration folder of the platform.
+"""User settings: paths of weights and of the worker's Python, in the platform's configuration folder.
 
-The file is TOML with one ``key = "value"`` per line. Needs no library outside the standard one.
+The file is TOML with one ``key = "value"`` per line. Only needs the standard library.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from .errors import ConfigError, UsageError
 
 MEANINGS = {
     "encoder": "folder of the text and image encoder, or 'text' (lookup and query --encoder)",
-    "sam2": "folder of SAM2 (masks --model)",
+    "sam2": "folder of the SAM2 weights (masks --model)",
     "worker_python": "Python program with r5dgs_core that Blender starts as worker",
 }
 
 
 def path() -> Path:
-    """Return the path of the settings file, which may be missing.
+    """Return the path of the settings file, which may not exist.
 
     Raises:
         ConfigError: The user has no home folder.
@@ -40,10 +40,10 @@ def path() -> Path:
 
 
 def read() -> dict[str, str]:
-    """Return the settings; a missing file has none.
+    """Return the settings; empty if the file is missing.
 
     Raises:
-        ConfigError: The file cannot be read, is not TOML, or has an unknown key or another value than text.
+        ConfigError: The file cannot be read, is not TOML, or has an unknown key or a value that is not text.
     """
     place = path()
     try:
@@ -51,11 +51,11 @@ def read() -> dict[str, str]:
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{place}: cannot be read: {error}; mend or remove the file") from None
+        raise ConfigError(f"{place}: cannot be read: {error}; correct or remove the file") from None
     try:
         found = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:  # the message has line and column
-        raise ConfigError(f"{place}: not valid TOML: {error}; mend or remove the file") from None
+        raise ConfigError(f"{place}: not valid TOML: {error}; correct or remove the file") from None
     for key, value in found.items():
         if key not in MEANINGS or not isinstance(value, str):
             expected = "text in quotes" if key in MEANINGS else f"one of the keys {', '.join(MEANINGS)}"
@@ -90,14 +90,14 @@ def write(key: str, value: str) -> Path:
 
 
 def _quoted(text: str) -> str:
-    """A TOML string; unlike JSON, TOML also escapes DEL."""
+    """Return a TOML string, which unlike JSON also escapes DEL."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _checked(key: str, value: str) -> str:
     if (key, value) == ("encoder", "text"):
         return value
-    # absolute(), not resolve(): the Python of a virtual environment is a link, and works only by its own path.
+    # absolute(), not resolve(): the Python of a virtual environment is a link that must not be followed.
     place = Path(value).expanduser().absolute()
     wanted = place.is_file() if key == "worker_python" else place.is_dir()
     if not wanted:
@@ -108,7 +108,7 @@ def _checked(key: str, value: str) -> str:
 
 
 def _line(text: str, key: str) -> int:
-    """Number of the line that sets a key, or opens the table of that name; 1 if it cannot be found."""
+    """Return the number of the line that sets a key or opens the table of that name; 1 if not found."""
     for number, line in enumerate(text.splitlines(), 1):
         if line.lstrip(" \t[\"'").startswith(key):
             return number
