@@ -1,7 +1,8 @@
-"""`r5dgs report --stability`: stiff, extreme and degenerate cases on the code as it is shipped, one row each.
+"""``r5dgs report --stability``: stiff, extreme and degenerate cases that run the shipped code, one row each.
 
-Nothing is read but the code itself, and nothing is random: the rows are the same on every run but for their seconds
-and, on another processor, their last digits.
+The cases read no files and use fixed seeds: the rows are the same on every run, except for their seconds and, on
+    another
+processor, their last digits.
 """
 
 from __future__ import annotations
@@ -50,20 +51,20 @@ _CAPTION = (
 
 @dataclass(frozen=True)
 class Row:
-    """A case with what came of it.
+    """Result of a case.
 
     Attributes:
-        topic: Rows of one topic stand together.
-        name: What was tried.
-        method: Our function.
-        quantity: What was measured; less is better.
-        measured: The value, NaN where the case could not be measured.
+        topic: Topic, by which rows are grouped.
+        name: Description of the case.
+        method: Tested function.
+        quantity: Measured quantity; less is better.
+        measured: Measured value; NaN if the case raised an error.
         tolerance: Largest value that passes.
-        source: Where the tolerance comes from.
-        trace_rk2: The same value for TRACE's integrator, or None where it has no part in the case.
+        source: Origin of the tolerance.
+        trace_rk2: The same value for TRACE's integrator, or None if it does not apply.
         passed: True if the value is within the tolerance and the case took at most `MOST_SECONDS`.
-        seconds: CPU time of our side.
-        message: The error of a case that raised one, else "".
+        seconds: Processor time of our code.
+        message: Error of a case that raised one, else "".
     """
 
     topic: str
@@ -80,11 +81,11 @@ class Row:
 
 
 def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | None = None) -> list[Row]:
-    """Measure cases. One that raises fails with its message, and the others still run.
+    """Measure cases. A case that raises an error fails with its message; the others still run.
 
     Args:
-        cases: Which ones; None for all.
-        progress: Called with the number of cases that are done.
+        cases: Cases to run; None for all.
+        progress: Called with the number of finished cases.
     """
     rows: list[Row] = []
     for case in CASES if cases is None else cases:
@@ -96,7 +97,7 @@ def run(cases: Iterable[Case] | None = None, progress: Callable[[int], None] | N
 
 def _measured(case: Case) -> Row:
     message, start = "", 0.0
-    # What the core warns of belongs to the case; that the value is right is what counts.
+    # Warnings of the core are expected in extreme cases; only the value decides.
     with logged(), warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)
         try:
@@ -104,7 +105,7 @@ def _measured(case: Case) -> Row:
                 case.prepare()
             start = time.process_time()
             value = float(case.measure())
-        except Exception as error:  # the table is there to show what breaks, whatever it is
+        except Exception as error:  # any failure becomes a row of the table
             value, message = math.nan, f"{type(error).__name__}: {error}"
         seconds = time.process_time() - start
         other = None
@@ -132,7 +133,7 @@ def _measured(case: Case) -> Row:
 
 
 def make(rows: Sequence[Row]) -> Table:
-    """Lay out the rows, to print with rich."""
+    """Return the rows as a rich table."""
     table = Table(title="stability", title_justify="left", caption=_CAPTION, caption_justify="left")
     table.add_column("case", overflow="fold")
     for name in ("measured", "at most", "CPU s"):
@@ -152,12 +153,12 @@ def make(rows: Sequence[Row]) -> Table:
 
 
 def _plain(text: str) -> str:
-    """Text whose brackets rich leaves alone."""
+    """Escape brackets, which rich reads as markup."""
     return text.replace("[", r"\[")
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """One line: how many passed, which failed, in what time."""
+    """Return the number of passed cases, the failed ones and the time, as text."""
     failed = [row for row in rows if not row.passed]
     seconds = sum(row.seconds for row in rows)
     text = f"{len(rows) - len(failed)} of {len(rows)} cases pass, in {seconds:.1f} s of CPU time"
@@ -165,7 +166,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 
 def to_json(rows: Sequence[Row]) -> dict[str, Any]:
-    """The rows as JSON types; numbers that JSON has none for become "nan", "inf" and "-inf"."""
+    """Return the rows as JSON types; non-finite numbers become "nan", "inf" and "-inf"."""
     return {
         "passed": sum(row.passed for row in rows),
         "failed": sum(not row.passed for row in rows),
@@ -182,7 +183,7 @@ def write(rows: Sequence[Row], path: Path) -> Path:
     """Write the rows as JSON; returns ``path``.
 
     Raises:
-        ConfigError: It cannot be written there.
+        ConfigError: The file cannot be written.
     """
     try:
         atomic_files.write(path, json.dumps(to_json(rows), indent=2).encode())

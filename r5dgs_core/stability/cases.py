@@ -1,4 +1,4 @@
-"""What a case of the stability table is, and what the cases share: bodies, twists and references without our code.
+"""Type of a stability case, and shared bodies, twists and reference solutions independent of our code.
 
 Notation: a twist (w, v) with rates (eps, a) moves the point x with velocity v + a t + (w + eps t) x x.
 """
@@ -27,19 +27,19 @@ _SERIES = 20  # terms of the reference; half a radian a step makes the last one 
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table before it is measured.
+    """Row of the table before it is measured.
 
     Attributes:
-        topic: Rows of one topic stand together.
-        name: What is tried, as a person would say it.
-        method: Our function.
-        quantity: What is measured; less is better.
+        topic: Topic, by which rows are grouped.
+        name: Description of the case.
+        method: Tested function.
+        quantity: Measured quantity; less is better.
         tolerance: Largest measured value that passes.
-        source: Where the tolerance comes from.
-        measure: Runs our code and gives the measured value. An exception is a failure.
-        trace_rk2: The same value for TRACE's integrator on each point (`point_dynamics.rk2`), or None where it has no
-            part in it. Tells, and never fails.
-        prepare: Run before the case and not timed, such as compilation.
+        source: Origin of the tolerance.
+        measure: Runs our code and returns the measured value. An exception is a failure.
+        trace_rk2: Returns the same value for TRACE's integrator on each point (`point_dynamics.rk2`), or None if it
+            does not apply. For information only; it never fails a case.
+        prepare: Untimed preparation, such as compilation.
     """
 
     topic: str
@@ -64,11 +64,11 @@ class Twist:
 
     @staticmethod
     def of(w: object, v: object = (0, 0, 0), eps: object = (0, 0, 0), a: object = (0, 0, 0)) -> Twist:
-        """From anything that numpy takes."""
+        """Construct a twist from array-like values."""
         return Twist(*(np.array(x, np.float64) for x in (w, v, eps, a)))
 
     def about(self, center: np.ndarray) -> Twist:
-        """The same motion, its velocities those of the point at the old origin when that lies at ``center``."""
+        """Return the same motion, with velocities of the point at the new origin; the old origin lies at ``center``."""
         away = -np.asarray(center, np.float64)
         return Twist(self.w, self.v + np.cross(self.w, away), self.eps, self.a + np.cross(self.eps, away))
 
@@ -80,7 +80,7 @@ TILTING_TIME = 2.0
 
 @contextlib.contextmanager
 def logged() -> Iterator[list[str]]:
-    """Messages that the core logs inside, in the order of the log; nobody else sees them."""
+    """Yield the list of messages that the core logs in the block; they are not propagated to other handlers."""
     logger, messages = logging.getLogger(__name__.rpartition(".report.")[0]), []
     handler = logging.Handler()
     handler.emit = lambda record: messages.append(record.getMessage())
@@ -101,24 +101,24 @@ def body(radius: float = RADIUS) -> np.ndarray:
 
 
 def moved(pose: tuple[np.ndarray, np.ndarray], points: np.ndarray) -> np.ndarray:
-    """Points of a body in a pose, a unit quaternion [4] and a displacement [3]. [n, 3]"""
+    """Move points of a body by a pose: unit quaternion [4] and displacement [3]. [n, 3]"""
     return rotations.rotate(pose[0], points) + pose[1]
 
 
 def largest(difference: np.ndarray) -> float:
-    """Largest length of a row; NaN where one is not a number. [n, 3]"""
+    """Return the largest norm of a row; NaN if an entry is NaN. [n, 3]"""
     return float(np.sqrt((np.asarray(difference, np.float64) ** 2).sum(-1)).max())
 
 
 def angle(p: np.ndarray, q: np.ndarray) -> float:
-    """Largest angle between unit quaternions, rad; by their difference, which keeps the digits of small angles."""
+    """Return the largest angle between unit quaternions, rad; computed from differences to resolve small angles."""
     p, q = np.asarray(p, np.float64), np.asarray(q, np.float64)
     gap = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
     return float(4 * np.arcsin(np.minimum(gap / 2, 1)).max())
 
 
 def different(first: object, second: object) -> float:
-    """Number of values that are not the same to the bit, up to the sign of zero; NaN is the same as NaN."""
+    """Return the number of values that differ, ignoring the sign of zero; NaN equals NaN."""
     x, y = np.asarray(first), np.asarray(second)
     if x.shape != y.shape:
         return math.inf
@@ -126,9 +126,9 @@ def different(first: object, second: object) -> float:
 
 
 def truth(twist: Twist, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation matrix [3, 3] and displacement [3] after a signed time, exact to rounding.
+    """Return rotation matrix [3, 3] and displacement [3] after a signed time, exact to rounding.
 
-    Taylor series of the matrix equation T' = X(t) T in steps of at most half a radian: independent of exponentials,
+    Taylor series of the matrix equation T' = X(t) T in steps of at most half a radian; independent of exponentials,
     brackets and quaternions.
     """
     turn = (np.linalg.norm(twist.w) + np.linalg.norm(twist.eps) * abs(duration)) * abs(duration)
@@ -148,7 +148,7 @@ def truth(twist: Twist, duration: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def true_points(twist: Twist, duration: float, points: np.ndarray) -> np.ndarray:
-    """Where `truth` brings points. [n, 3]"""
+    """Move points by `truth`. [n, 3]"""
     rotmat, displacement = truth(twist, duration)
     return points @ rotmat.T + displacement
 
@@ -172,7 +172,7 @@ def model_of(kind: str, **rates: Any) -> models.MotionModel:
 
 
 def rk2_points(twist: Twist, duration: float, points: np.ndarray, steps: int) -> np.ndarray:
-    """Where TRACE's integrator brings points, in the precision of ``points``. [n, 3]"""
+    """Move points by TRACE's integrator, in the precision of ``points``. [n, 3]"""
     v, w, a, e = (np.asarray(x, points.dtype) for x in (twist.v, twist.w, twist.a, twist.eps))
     with np.errstate(all="ignore"):
         return point_dynamics.rk2(points, v, w, a, e, duration, abs(duration) / steps)[0]

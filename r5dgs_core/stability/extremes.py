@@ -1,4 +1,4 @@
-"""Cases of the stability table on extremes: far origins, fast, reversing, tiny and huge rates, long horizons."""
+"""Stability cases on extremes: distant origins, fast, reversing, tiny and huge rates, long horizons."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _fast(model_kind: str) -> float:
 
 
 def _huge_rates() -> float:
-    """Numbers that are not finite in poses under rates of 1e30, closed forms and steps."""
+    """Number of non-finite values in poses under rates of 1e30, for closed forms and steps."""
     vectors = {"velocity": [1e30, 0, -1e30], "acceleration": [0, 1e30, 0]}
     spins = {"angular_velocity": [1e30, 1e29, 0], "angular_acceleration": [0, 0, 1e30]}
     with np.errstate(all="ignore"):

@@ -1,4 +1,4 @@
-"""Cases of the stability table on groups: degenerate bodies, twists of members, poses that are missing or alias."""
+"""Stability cases on groups: degenerate bodies, twists of members, missing and aliased poses."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _fits(shape: str) -> list[tuple[np.ndarray, rigid_fit.RigidFit]]:
 
 
 def _calibration(shape: str) -> float:
-    """How far the errors of the rotation are from those that the covariance predicts, relative."""
+    """Relative deviation of the rotation errors from those that the covariance predicts."""
     scores = []
     for quat, fit in _fits(shape):
         error = rotations.quats_to_rotvecs(rotations.multiply(rotations.conjugate(quat), fit.quat))

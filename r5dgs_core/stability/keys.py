@@ -1,4 +1,4 @@
-"""Cases of the stability table on keys for Blender, and how Blender evaluates them in float32."""
+"""Stability cases on keys for Blender, including their float32 evaluation in Blender."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _keys(name: str) -> float:
 
 
 def _blender_keys(name: str) -> float:
-    """The same as Blender evaluates them: keys and handles in float32, counted in frames."""
+    """Error of keys as in `_keys`, evaluated like Blender: keys and handles in float32, counted in frames."""
     curves, sample = _reduced(name)
     frames = np.arange(60 * T_MAX, 60 * (T_MAX + _KEYED), 0.25)
     quats, displacements, _, _ = sample(frames / 60)
@@ -60,7 +60,7 @@ def _static_keys() -> float:
 
 
 def blender_values(keys: key_reduction.Keys, frames: np.ndarray, frames_per_unit: float = 60.0) -> np.ndarray:
-    """A curve as Blender evaluates Bezier keys with free handles: float32 control points, a cubic solved for its time.
+    """Evaluate a curve like Blender's Bezier keys with free handles: float32 control points, a cubic solved for time.
 
     Args:
         keys: The keys; their handles lie at a third of the interval.

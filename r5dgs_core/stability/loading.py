@@ -1,6 +1,6 @@
-"""Cases of the stability table on what stands around motion: scene files, keys, cameras and the rasterizer.
+"""Stability cases on code around motion: scene files, keys, cameras and the rasterizer.
 
-Every one has to end within `cases.MOST_SECONDS` of processor time.
+Each case must finish within `cases.MOST_SECONDS` of processor time.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _finite(shape: tuple[float, float, float], at: float = 0.0) -> float:
 
 
 def _warm() -> None:
-    """Compile the kernels, which is no part of a case."""
+    """Compile the kernels before the timed part of a case."""
     from ..render import warm_up
 
     warm_up.warm_up(gradients=False)

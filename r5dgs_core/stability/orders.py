@@ -1,4 +1,4 @@
-"""Cases of the stability table on the order of integrators, their step rule, and closed forms."""
+"""Stability cases on the order of integrators, their step rule, and closed forms."""
 
 from __future__ import annotations
 

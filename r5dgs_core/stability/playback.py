@@ -1,4 +1,4 @@
-"""Cases of the stability table on what is played: distances in float32, random access, scenes that lack things."""
+"""Stability cases on playback: distances in float32, random access, incomplete scenes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _rk2_distances(distance: float) -> float:
 
 
 def _places(distance: float) -> float:
-    """Where points of every motion are, relative to their body, against float64: distance over the radius."""
+    """Largest distance of points, relative to their body, from float64 for every motion, over the radius."""
     scene, worst = every_motion(distance), 0.0
     for t in (1.0, HORIZON):
         for g in range(1, len(scene.groups)):
@@ -89,7 +89,7 @@ def _at_t_max(mode: str) -> float:
 
 
 def _jump(mode: str) -> float:
-    """How far points get in a billionth of a unit before and after t_max, over the radius."""
+    """Largest displacement of points within 1e-9 units before and after t_max, over the radius."""
     scene = every_motion(singles=True)
     frames = [scene_player.frame(scene, scene.t_max + step, mode) for step in (-1e-9, 0.0, 1e-9)]
     return max(largest(frame.means.astype(np.float64) - frames[1].means) for frame in frames) / RADIUS
@@ -130,7 +130,7 @@ def _ten_turns() -> float:
 
 
 def _wild(scene: Scene, group: int, name: str, value: float) -> Scene:
-    """The scene with rates of a group that no check of ours lets pass."""
+    """Return the scene with invalid rates in a group, bypassing validation."""
     model = copy.copy(scene.groups[group].model)
     object.__setattr__(model, name, np.array([value, 0, value]))
     changed = dataclasses.replace(scene.groups[group], model=model)
@@ -155,11 +155,11 @@ def _isolated(value: float) -> float:
 
 
 def _singles(value: float) -> tuple[float, float]:
-    """Mode "standard" where the dynamics of one group after the other are not numbers.
+    """Play mode "standard" with non-finite dynamics in one group at a time.
 
     Returns:
-        Values that differ from those of a scene in which that group stands still, and how far the others get from where
-        they are with it, over the scene's extent.
+        Number of values that differ from a scene in which that group stands still, and the largest distance of the
+        other groups from the valid scene, over the scene's extent.
     """
     scene, count, away = every_motion(singles=True), 0.0, 0.0
     assert scene.dynamics is not None
@@ -176,7 +176,7 @@ def _singles(value: float) -> tuple[float, float]:
 
 
 def _refused_rates() -> float:
-    """Motion models with a rate that is no number, or infinite, that are accepted."""
+    """Number of motion models with a NaN or infinite rate that are accepted."""
     accepted = 0
     for name in ("velocity", "acceleration", "angular_velocity", "angular_acceleration", "center_offset"):
         for value in (math.nan, math.inf):
@@ -189,7 +189,7 @@ def _refused_rates() -> float:
 
 
 def _huge(rate: float, mode: str) -> float:
-    """Numbers that are not finite in frames of bodies with rates near the end of float32's range, one unit on."""
+    """Number of non-finite values in frames of bodies with rates near the end of float32's range, after one unit."""
     fast = [
         model_of(kind, velocity=[rate, 0, 0], angular_velocity=[0, rate, 0], acceleration=[0, 0, rate])
         for kind in models.KINDS
@@ -205,7 +205,7 @@ def _huge(rate: float, mode: str) -> float:
 
 
 def _lacking(clouds: list[np.ndarray]) -> float:
-    """Numbers that are not finite, and shapes that are wrong, in all modes of a scene that lacks something."""
+    """Number of non-finite values and wrong shapes in all modes of an incomplete scene."""
     motions = list(MOTIONS.values())[1 : 1 + len(clouds)]
     scene, bad = scene_of(clouds, motions, singles=True), 0
     for mode in _EVERY_MODE:

@@ -1,4 +1,4 @@
-"""Cases of the stability table on rotations: series at small angles, half turns, signs, angles, precision."""
+"""Stability cases on rotations: series at small angles, half turns, signs, angles, precision."""
 
 from __future__ import annotations
 

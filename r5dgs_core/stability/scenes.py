@@ -1,4 +1,4 @@
-"""Small scenes for the stability table: bodies of known motion in float32, as a scene file would hold them."""
+"""Small scenes for the stability table: bodies of known motion in float32, as in a scene file."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def scene_of(
     singles: bool = False,
     times: np.ndarray = TIMES,
 ) -> Scene:
-    """A scene of bodies with a background that holds nothing.
+    """Return a scene of bodies with an empty background.
 
     Args:
         clouds: Points of each body in the bind state, any number of them. [n, 3] each
-        motions: How each goes on past t_max. Its curve before t_max is its track.
-        singles: Give every Gaussian the dynamics of its body, rewritten about its own centre, and a canonical state,
-            so that the scene plays in every mode.
+        motions: Motion of each body past t_max. Its curve before t_max is the track.
+        singles: Give every Gaussian the dynamics of its body, relative to its own center, and a canonical state, so
+            that the scene plays in every mode.
         times: Knots. [S]
     """
     groups = [MotionGroup(0, 0, "pinned", -1, np.zeros(3), models.STATIC)]
@@ -118,13 +118,13 @@ def scene_of(
 
 
 def every_motion(distance: float = 0.0, *, singles: bool = False) -> Scene:
-    """One body of each of `MOTIONS`, all at one distance from the origin."""
+    """Return a scene with one body for each of `MOTIONS`, all at one distance from the origin."""
     centers = distance * DIAGONAL + np.arange(len(MOTIONS))[:, None] * np.array([1.0, 0, 0])
     return scene_of([body() + c for c in centers], list(MOTIONS.values()), singles=singles)
 
 
 def _track(motion: MotionModel, times: np.ndarray) -> np.ndarray:
-    """Poses at the knots relative to the bind state, of which the last is the identity to the bit. [S, 7]"""
+    """Return poses at the knots relative to the bind state; the last one is exactly the identity. [S, 7]"""
     quats, displacements, _, _ = models.curve(motion, times - times[-1])
     return np.concatenate([rotations.normalize(quats), displacements], axis=-1)
 

@@ -1,4 +1,4 @@
-"""Cases of the stability table on many steps: growth, drift, the time grid, both directions of time."""
+"""Stability cases on many steps: growth, drift, the time grid, both directions of time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _STEP = point_dynamics.TRACE_STEP
 
 
 def _growth(x: float) -> float:
-    """How much longer the arm of a point gets in one step of x radians."""
+    """Return the relative growth of a point's arm in one step of x radians."""
     pose = se3.integrate(np.array([0, 0, x]), np.zeros(3), np.zeros(3), np.zeros(3), np.float64(1.0), 1)
     return abs(float(np.linalg.norm(moved(pose, np.array([1.0, 0, 0])))) - 1)
 
@@ -58,7 +58,7 @@ _LONG_TWIST = Twist(_LONG_SPIN, np.array([0.3, 0.1, -0.2]), np.zeros(3), np.zero
 
 
 def _million() -> tuple[np.ndarray, np.ndarray]:
-    """Product of a million equal steps, in blocks that memory does not notice."""
+    """Return the product of a million equal steps, computed in blocks to limit memory."""
     block = 50_000
     step = se3.exp(_STEP * _LONG_TWIST.w, _STEP * _LONG_TWIST.v)
     blocks = [se3.product(*(np.tile(part, (block, 1)) for part in step)) for _ in range(_LONG // block)]
@@ -109,7 +109,7 @@ _unheard = itertools.count()
 
 
 def _unguarded() -> float:
-    """1 where TRACE's integrator takes steps of a radian without a word; it warns once for each length of step."""
+    """Return 1 if TRACE's integrator takes steps of a radian without a warning; it warns once per step length."""
     step = 0.1 + 1e-6 * next(_unheard)
     with logged() as messages:
         point_dynamics.rk2(np.ones(3), np.zeros(3), np.array([0, 0, 1 / step]), np.zeros(3), np.zeros(3), step, step)

@@ -1,7 +1,7 @@
-"""Cases of `r5dgs report --stability` on training: a few steps on data that is extreme but valid.
+"""Stability cases on training: a few steps on extreme but valid data.
 
-A case passes if everything that was trained is finite. Data that cannot be trained may be refused by a `TrainingError`
-or `DatasetError`, which names the reason.
+A case passes if all trained values are finite. Data that cannot be trained may be refused by a `TrainingError` or
+`DatasetError` with the reason.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _trained(
     turn: float = 0.0,
     settings: tuple[str, ...] = (),
 ) -> float:
-    """Numbers in the last state of a short training that are not finite."""
+    """Return the number of non-finite values in the last state of a short training."""
     from ..config import config
     from ..train import checkpoint, run
     from ..train.representations import residual
@@ -95,7 +95,7 @@ def _trained(
 
 
 def _warm() -> None:
-    """Compile the kernels by a first training, which is no part of a case."""
+    """Compile the kernels by a first training, before the timed part of a case."""
     from ..render import warm_up
 
     warm_up.warm_up()
