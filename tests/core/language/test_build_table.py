@@ -340,7 +340,7 @@ def test_naming_an_object_changes_that_alone(file, capsys):
     arguments = ["name", str(file), "3", "glazed donut", "--alias", "snack", "--alias", "bun", "--caption", "a sweet"]
     assert main.main(arguments) == 0
     said = capsys.readouterr().out
-    assert "object 3 is 'glazed donut', also snack, bun" in said and "make it again: r5dgs lookup" in said
+    assert "object 3 is 'glazed donut', also snack, bun" in said and "rebuild it: r5dgs lookup" in said
     after = scene_file.read(file)
     assert after.object(3) == dataclasses.replace(
         before.object(3), name="glazed donut", aliases=("snack", "bun"), caption="a sweet"
