@@ -45,8 +45,9 @@ from r5dgs_core.error_vs_time import image_task
 from r5dgs_core.evaluation import evaluate, metrics
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster import rasterize, warm_up
+from r5dgs_core.raster import rasterize
 from r5dgs_core.render import scene_renderer
+from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene import cameras
 from r5dgs_core.scene.cameras import Camera
 from r5dgs_core.scene.scene import Scene

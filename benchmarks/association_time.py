@@ -25,8 +25,8 @@ from r5dgs_core.association import mask_repair
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.data import masks as id_masks
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster import warm_up
 from r5dgs_core.render import scene_renderer
+from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.scene.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

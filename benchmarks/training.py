@@ -19,7 +19,7 @@ from r5dgs_core.bake import bake
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate
-from r5dgs_core.raster import warm_up
+from r5dgs_core.render.warm_up import warm_up
 from r5dgs_core.train import run
 
 

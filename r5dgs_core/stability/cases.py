@@ -81,7 +81,7 @@ TILTING_TIME = 2.0
 @contextlib.contextmanager
 def logged() -> Iterator[list[str]]:
     """Yield the list of messages that the core logs in the block; they are not propagated to other handlers."""
-    logger, messages = logging.getLogger(__name__.rpartition(".report.")[0]), []
+    logger, messages = logging.getLogger(__name__.rpartition(".stability.")[0]), []
     handler = logging.Handler()
     handler.emit = lambda record: messages.append(record.getMessage())
     passes_on, logger.propagate = logger.propagate, False

@@ -18,6 +18,7 @@ from .. import atomic_files
 
 _MARK = b"sha256:"
 _COMMENT_SIZE = len(_MARK) + hashlib.sha256().digest_size * 2
+_DIRECTORY = 0x10  # of the MS-DOS attributes of a member
 _LENGTH = struct.Struct("<H")  # length of the comment, in front of it at the end of a zip archive
 
 
@@ -76,6 +77,8 @@ def _check(data: bytes) -> None:
             raise DamagedError("its digest is incomplete")
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise DamagedError("a member is compressed, which torch.save never does")
+        if any(member.external_attr & _DIRECTORY for member in members):
+            raise DamagedError("a member is marked as a folder, whose content torch does not read")
         if len({member.filename for member in members}) < len(members):
             raise DamagedError("two members have the same name")
         broken = None if sealed else archive.testzip()

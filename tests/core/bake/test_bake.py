@@ -153,7 +153,7 @@ def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_p
     state = checkpoint.load(trained.folder)
     tensors = state.tensors
     keep = (tensors["gaussians.motion_ids"] != 2) & (tensors["labels"] != 2)
-    for name in [n for n in tensors if n.startswith("gaussians.")] + ["labels", "identities"]:
+    for name in [n for n in tensors if n.startswith("gaussians.")] + ["labels", "identities", "held"]:
         tensors[name] = tensors[name][keep]
     made = checkpoint.create_run(tmp_path, datasets.read(trained.dataset_root), trained.config)
     checkpoint.save(tmp_path, state)

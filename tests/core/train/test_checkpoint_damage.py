@@ -22,7 +22,7 @@ import torch
 from r5dgs_core.bake import bake
 from r5dgs_core.cli import main
 from r5dgs_core.errors import CheckpointError
-from r5dgs_core.train import checkpoint, checkpoint_content, run
+from r5dgs_core.train import checkpoint, checkpoint_content, checkpoint_file, run
 from tests.support import tiny_datasets
 
 OVERRIDES = ("train.iterations=40", "identity.iterations=4", "train.checkpoint_every=5", "train.probe_every=0")
@@ -97,6 +97,24 @@ def test_no_flipped_bit_changes_a_number(reference, tmp_path, pytestconfig, seal
             assert_same(found, whole)
             accepted += 1
     assert not (sealed and accepted)
+
+
+def test_no_flipped_bit_of_a_directory_without_digest_changes_a_number(tmp_path):
+    tensors = {"means": torch.arange(5.0), "ids": torch.arange(7)}
+    buffer = io.BytesIO()
+    torch.save(tensors, buffer)
+    data, path = buffer.getvalue(), tmp_path / "checkpoint.pt"
+    with zipfile.ZipFile(buffer) as archive:
+        start = archive.start_dir
+    for bit in range(8 * start, 8 * len(data)):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        try:
+            found = checkpoint_file.read(path)
+        except checkpoint_file.DamagedError:
+            continue
+        assert all(torch.equal(found[name], tensor) for name, tensor in tensors.items()), bit
 
 
 def interrupted(tiny, folder, at=20):
