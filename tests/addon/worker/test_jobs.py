@@ -78,7 +78,7 @@ def test_the_latest_request_of_a_key_wins_and_other_keys_keep_their_turn(worker,
     waiting = [worker.submit("view", HELLO) for _ in range(3)]
     assert [job.dropped for job in waiting] == [True, True, False] and not other.dropped
     assert worker.busy() and worker.busy("view") and worker.busy("other") and not worker.busy("third")
-    with pytest.raises(errors.BackendError, match="taken back"):
+    with pytest.raises(errors.BackendError, match="dropped before it started"):
         waiting[0].answer()
     os.kill(running.pid, signal.SIGCONT)
     for job in (first, other, waiting[2]):

@@ -138,7 +138,7 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
     monkeypatch.setattr(object_discovery, "sort", sort)
     events = []
     made = run.train(unmasked.root, tmp_path / "run", config, progress=events.append)
-    assert "2 parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]
+    assert "2 moving parts found" in [event["text"] for event in events if event["event"] == "prepare"][-1]
     tensors = checkpoint.load(made.folder).tensors
     assert tensors["object_ids"].tolist() == [0, 1, 2] and packed_masks.LABELS in tensors
     scene = bake.bake(made)
