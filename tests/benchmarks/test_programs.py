@@ -58,7 +58,7 @@ def check_times(rows):
     for row in rows:
         assert list(row) == COLUMNS
         assert 0 < row["wall_ms_min"] <= row["wall_ms_median"]
-        assert row["cpu_ms"] > 0
+        assert row["cpu_ms"] >= 0  # 0 for a peer that takes less than the rounding
         assert row["peak_mb"] is None or row["peak_mb"] >= 0
 
 

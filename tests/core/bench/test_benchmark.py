@@ -200,7 +200,7 @@ def test_a_finished_run_of_other_data_is_refused_before_anything_is_done(made, t
 def test_a_run_that_was_begun_with_other_settings_is_refused_before_anything_is_done(made, tiny):
     plan, case, _, _ = made
     before = contents(plan.out)
-    with pytest.raises(ConfigError, match="train.iterations = 20, not 30"):
+    with pytest.raises(ConfigError, match="train.iterations = 20, expected 30"):
         cases.make(plan_for(tiny, plan.out, overrides=(*OVERRIDES, "train.iterations=30")))
     assert contents(plan.out) == before and case.run.is_dir()
 

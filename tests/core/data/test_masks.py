@@ -211,7 +211,7 @@ def test_masks_of_ids_among_masks_of_colours_are_refused_as_what_they_mean_is_op
     rgb[:3], rgb[3:] = (200, 0, 0), (90, 90, 90)
     images.write_png(tmp_path / "rgb.png", rgb)
     images.write_png(tmp_path / "ids.png", np.full((6, 6), 3, np.uint8))
-    with pytest.raises(errors.DatasetError, match=r"ids\.png: shows \(3, 3, 3\).*rgb\.png.*one channel of ids"):
+    with pytest.raises(errors.DatasetError, match=r"ids\.png: contains \(3, 3, 3\).*rgb\.png.*one channel of ids"):
         masks.color_table([tmp_path / "ids.png", tmp_path / "rgb.png"])
 
 
