@@ -116,7 +116,8 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
         if not fits:
             expected = ", ".join(f"{x} = {lengths[x]}" if x in lengths else str(x) for x in map(str, shape))
             raise CheckpointError(f"'{name}': expected shape [{expected}], found {list(found)}")
-        if (name in _WHOLE_NUMBERS) != (tensor.dtype in _WHOLE) and name != "generator":
+        wrong = (name in _WHOLE_NUMBERS) != (tensor.dtype in _WHOLE) and name != "generator"
+        if wrong or (name == "held" and tensor.dtype != torch.bool):
             raise CheckpointError(f"'{name}': expected another type of number than {tensor.dtype}")
     if len(tensors["observed"]) != max(0, lengths["B"] - 1) and "discovery.labels" not in tensors:
         raise CheckpointError(f"'observed': expected {lengths['B'] - 1} rows, found {len(tensors['observed'])}")

@@ -290,12 +290,10 @@ class Sweep:
         agreed = np.zeros(len(points), int)
         for k, (rays, values) in enumerate(zip(self.rays, maps, strict=True)):
             camera = self.scenes[rays.backdrop].camera
-            T, (height, width) = camera.T_cam_world, rays.depths.shape
-            x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
-            with np.errstate(divide="ignore", invalid="ignore"):
-                column = (camera.intrinsics[0, 0] * x / z + camera.intrinsics[0, 2]) / camera.width * width
-                row = (camera.intrinsics[1, 1] * y / z + camera.intrinsics[1, 2]) / camera.height * height
-                visible = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height) & (owner != k)
+            height, width = rays.depths.shape
+            pixels, z = cameras.project(camera, points)
+            column, row = pixels[:, 0] / camera.width * width, pixels[:, 1] / camera.height * height
+            visible = (z > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height) & (owner != k)
             row, column = row[visible].astype(int), column[visible].astype(int)
             inverse = np.pad(1 / values.reshape(height, width), 1, mode="edge")
             beside = sliding_window_view(inverse, (3, 3)).reshape(height, width, 9)[row, column]

@@ -203,6 +203,14 @@ def test_a_tensor_that_does_not_fit_is_named(reference, tmp_path, kind, name):
         checkpoint.load(tmp_path)
 
 
+def test_a_mask_of_numbers_is_refused(reference, tmp_path):
+    state = checkpoint.load(reference)
+    changed = {**state.tensors, "held": torch.zeros(len(state.tensors["gaussians.means"]))}
+    checkpoint.save(tmp_path, dataclasses.replace(state, tensors=changed))
+    with pytest.raises(CheckpointError, match="'held': expected"):
+        checkpoint.load(tmp_path)
+
+
 @pytest.mark.parametrize("name", ["adam.means.exp_avg", "gradients.total", "generator"])
 def test_a_state_that_does_not_fit_the_run_is_named_on_resuming(tiny, reference, tmp_path, name):
     state = checkpoint.load(reference)
