@@ -17,8 +17,7 @@ import torch
 import workloads
 from timing import Contender, take_turns
 
-from r5dgs_core.raster import rasterize_splats
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation, rasterize_splats
 from r5dgs_core.raster.cpu.projection import TILE
 from r5dgs_core.render.static_layer import Backdrop
 

@@ -24,8 +24,7 @@ import torch
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster import RenderOutput
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import RenderOutput, compilation
 from r5dgs_core.render import incremental_renderer, scene_renderer
 from r5dgs_core.render.scene_renderer import Instance
 from r5dgs_core.scene import row_runs

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from timing import Contender, take_turns
 
-from r5dgs_core.raster import shade
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation, shade
 from r5dgs_core.scene import cameras, sh_color
 from r5dgs_core.scene.cameras import Camera
 

@@ -101,7 +101,7 @@ class Remote(timing.Contender):
 
 def _serve(connection: Connection, coefficients: tuple[float, ...], make_run: Callable[[], Callable]) -> None:
     """Answer requests until the other end closes."""
-    from r5dgs_core.raster.cpu import compilation
+    from r5dgs_core.raster import compilation
     from r5dgs_core.raster.cpu.simd import float32x16
 
     float32x16._EXP2 = coefficients

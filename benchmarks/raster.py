@@ -269,7 +269,7 @@ def _compare_images(peer: ModuleType, workload: Workload) -> str:
 
 @contextmanager
 def _rasterizer_threads(count: int) -> Iterator[None]:
-    from r5dgs_core.raster.cpu import compilation
+    from r5dgs_core.raster import compilation
 
     before = compilation.threads()
     compilation.set_threads(count)

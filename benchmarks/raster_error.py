@@ -33,8 +33,7 @@ import torch
 import workloads
 from torch.nn.functional import interpolate
 
-from r5dgs_core.raster import rasterize
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation, rasterize
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 

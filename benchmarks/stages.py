@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 
 PACKAGES = ("r5dgs_core.raster.", "r5dgs_core.render.")
 

@@ -63,7 +63,7 @@ def training_settings(
 def use_threads(count: int | None) -> None:
     """Set the number of threads of the kernels; None keeps NUMBA_NUM_THREADS, or else all usable cores."""
     if count is not None:
-        from ..raster.cpu import compilation
+        from ..raster import compilation
 
         compilation.set_threads(count)
 
@@ -339,7 +339,7 @@ def run_warm_up(*, progress_kind: str) -> dict[str, Any]:
     from ..progress import make
 
     try:
-        from ..raster.cpu import compilation
+        from ..raster import compilation
         from ..train import warm_up
     except ImportError as error:
         raise errors.BackendError(f"warm-up: {sys.executable} lacks '{error.name}'; install r5dgs again") from error

@@ -89,7 +89,8 @@ def sky(sh: np.ndarray, camera: Camera) -> np.ndarray:
         return np.broadcast_to(color.astype(np.float32), (camera.height, camera.width, 3))
     if not backends.numba_is_there():
         return np.clip(sh_color.to_rgb(sh, cameras.pixel_rays(camera)), 0, 1).astype(np.float32)
-    from .cpu import compilation, sky
+    from . import compilation
+    from .cpu import sky
 
     rays = camera.T_cam_world[:3, :3].T @ np.linalg.inv(camera.intrinsics)
     image = np.empty((camera.height, camera.width, 3), np.float32)
@@ -144,7 +145,8 @@ def _plain_colors(
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, sh, rest, factor, poses):
-        from .cpu import compilation, sh_kernels
+        from . import compilation
+        from .cpu import sh_kernels
 
         colors = np.empty((len(means), 3), np.float32)
         inputs = _kernel_inputs(means, sh, rest, factor, poses)
@@ -156,7 +158,8 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, d_colors):
-        from .cpu import compilation, sh_kernels
+        from . import compilation
+        from .cpu import sh_kernels
 
         means, sh, rest, factor = ctx.saved_tensors
         d_sh = np.empty(sh.shape, np.float32)

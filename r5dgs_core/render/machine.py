@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from .. import __version__
-from ..raster.cpu import compilation
+from ..raster import compilation
 
 
 def versions() -> dict[str, str]:

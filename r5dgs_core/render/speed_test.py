@@ -64,7 +64,7 @@ def run() -> Trial:
 def _device() -> str:
     if not backends.numba_is_there():
         return "CPU without kernels"
-    from ..raster.cpu import compilation
+    from ..raster import compilation
 
     count = compilation.threads()
     return f"CPU, {count} threads" if count > 1 else "CPU, 1 thread"

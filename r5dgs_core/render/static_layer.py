@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from ..raster import backends, rasterizer
+from ..raster.compilation import run
 from ..raster.cpu import blend, cpu_backend, projection
 from ..raster.cpu import tiles as cpu_tiles
-from ..raster.cpu.compilation import run
 from ..raster.settings import RasterSettings, SplatImage
 from ..scene.cameras import Camera
 

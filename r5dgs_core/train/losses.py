@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..raster.cpu import compilation as kernels
+from ..raster import compilation as kernels
 
 _OFFSETS = np.arange(11) - 5
 _WINDOW = np.exp(-(_OFFSETS**2) / (2 * 1.5**2))

@@ -84,7 +84,7 @@ class Warming:
 
     def _run(self) -> None:
         try:
-            from ..raster.cpu import compilation
+            from ..raster import compilation
             from ..render import warm_up
         except (ImportError, errors.ConfigError):  # the next render request reports it
             return
@@ -293,7 +293,7 @@ class Server:
     def _warm_up(self, _: dict[str, Any]) -> Answer:
         """Load the rasterizer; returns the number of kernels that this process ``compiled``."""
         self._rasterizer()
-        from ..raster.cpu import compilation
+        from ..raster import compilation
         from ..render import warm_up
 
         warm_up.warm_up(gradients=False)

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 

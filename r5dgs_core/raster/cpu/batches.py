@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numba import float32
 
-from .compilation import helper
+from ..compilation import helper
 from .exact_thresholds import BLOCK, BLOCKS, lanes_at_least
 from .projection import EXTENT_X, EXTENT_Y, GEOMETRY, L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y, TILE
 from .simd.float32x16 import LANES, broadcast, exp2, load, mask_of, splat, store

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import float32
 
+from ..compilation import helper, kernel
 from .batches import (
     BATCH,
     FIRST,
@@ -29,7 +30,6 @@ from .batches import (
     place_of,
     settle,
 )
-from .compilation import helper, kernel
 from .exact_thresholds import (
     ALPHA_MAX,
     BLOCK,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import float32
 
+from ..compilation import helper, kernel
 from .batches import (
     BATCH,
     FIRST,
@@ -25,7 +26,6 @@ from .batches import (
     place_of,
     settle,
 )
-from .compilation import helper, kernel
 from .exact_thresholds import ALPHA_MAX, BLOCK, BLOCKS, CLOSE_LOG2, LOG2_ALPHA_MAX, LOG2_ALPHA_MIN
 from .projection import TILE
 from .simd.float32x16 import LANES, broadcast, load, load_rows, load_rows_of_three, reciprocal, splat, store, totals

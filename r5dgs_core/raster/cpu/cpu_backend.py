@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from ...scene.cameras import Camera
+from ..compilation import run
 from ..reference import frustum_slopes
 from ..settings import RasterSettings, RasterStats, SplatImage
 from . import blend, blend_backward, projection
 from . import segments as cpu_segments
 from . import tiles as cpu_tiles
-from .compilation import run
 
 _WORTH_A_THREAD = 2000  # Gaussians per thread; fewer are projected before a second thread wakes up
 _FEW_LABELS = 16  # labels below this are used without removing gaps

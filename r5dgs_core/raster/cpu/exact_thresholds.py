@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compilation import helper
+from ..compilation import helper
 from .projection import L11, L12, L22, LOG2_OPACITY, MEAN_X, MEAN_Y
 from .simd.float32x16 import LANES
 

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from .compilation import helper, kernel
+from ..compilation import helper, kernel
 from .simd.float32x16 import LANES, load
 from .simd.float64x8 import (
     DOUBLES,

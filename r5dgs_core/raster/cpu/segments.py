@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import float32
 
+from ..compilation import helper, kernel
 from .batches import (
     BATCH,
     FIRST,
@@ -26,7 +27,6 @@ from .batches import (
     opaque_at,
     settle,
 )
-from .compilation import helper, kernel
 from .exact_thresholds import ALPHA_MAX, BLOCK, BLOCKS, CLOSE_LOG2, LOG2_ALPHA_MIN
 from .projection import TILE
 from .simd.float32x16 import LANES, broadcast, load, splat, store

@@ -11,7 +11,7 @@ import numpy as np
 from numba import float32
 
 from ...scene.sh_color import C0
-from .compilation import helper, kernel
+from ..compilation import helper, kernel
 from .sh_kernels import BASES, evaluate_basis
 
 

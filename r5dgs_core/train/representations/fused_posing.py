@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ...model.group_poses import GroupPoses
-from ...raster.cpu import compilation as kernels
+from ...raster import compilation as kernels
 
 CHUNKS = 16
 

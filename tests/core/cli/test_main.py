@@ -23,7 +23,7 @@ from r5dgs_core.config import presets
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.evaluation import evaluate, scene_summary
 from r5dgs_core.playback import modes
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 from r5dgs_core.scene import scene_file
 from r5dgs_core.time_left import Timed
 from r5dgs_core.train import checkpoint

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 
 CORE = Path(__file__).resolve().parents[3] / "r5dgs_core"
 TOY = """
-from r5dgs_core.raster.cpu.compilation import kernel
+from r5dgs_core.raster.compilation import kernel
 
 @kernel
 def double(x):
@@ -81,8 +81,8 @@ def test_the_first_compilation_of_a_machine_is_told_once_and_loading_never(tmp_p
 
 TOLD = """
 import gc, threading, numba
-from r5dgs_core.raster.cpu import compilation
-from r5dgs_core.raster.cpu.compilation import helper, kernel
+from r5dgs_core.raster import compilation
+from r5dgs_core.raster.compilation import helper, kernel
 
 told = []
 gc_inside = []
@@ -126,7 +126,7 @@ def test_only_kernels_are_told_of_and_the_collector_is_left_as_it_was(tmp_path):
 def test_without_a_place_the_notice_says_so_in_every_process(tmp_path):
     script = TOY.replace(
         "from r5dgs_core",
-        "import r5dgs_core.raster.cpu.compilation as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
+        "import r5dgs_core.raster.compilation as c\nc._bases = lambda _: iter(())\nfrom r5dgs_core",
         1,
     )
     complaints = [run_toy(tmp_path, script).stderr.splitlines() for _ in range(2)]

@@ -11,8 +11,16 @@ import pytest
 import torch
 
 from r5dgs_core import errors
-from r5dgs_core.raster import RasterSettings, RasterStats, backends, rasterize, rasterize_splats, rasterizer
-from r5dgs_core.raster.cpu import blend, blend_backward, compilation, cpu_backend, projection, tiles
+from r5dgs_core.raster import (
+    RasterSettings,
+    RasterStats,
+    backends,
+    compilation,
+    rasterize,
+    rasterize_splats,
+    rasterizer,
+)
+from r5dgs_core.raster.cpu import blend, blend_backward, cpu_backend, projection, tiles
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import cameras, sh_color
 from tests.support.splats import camera, draw, relative, splats

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import backends, rasterize, rasterizer, shade
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes, splats

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import scene_file
 from tests.support import scenes, tiny_datasets
@@ -22,7 +22,7 @@ USE_EVERYTHING = """
 import sys
 from pathlib import Path
 import numpy as np
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 from r5dgs_core.render import scene_renderer, incremental_renderer
 from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from r5dgs_core.model.tracks import Tracks
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster.cpu import compilation as kernels
+from r5dgs_core.raster import compilation as kernels
 from r5dgs_core.train import losses
 
 

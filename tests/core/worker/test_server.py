@@ -15,7 +15,7 @@ from r5dgs_core import errors
 from r5dgs_core.language import build_table
 from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.playback import scene_player
-from r5dgs_core.raster.cpu import compilation
+from r5dgs_core.raster import compilation
 from r5dgs_core.render import incremental_renderer, scene_renderer, warm_up
 from r5dgs_core.scene import scene_file
 from r5dgs_core.worker import server as worker_server

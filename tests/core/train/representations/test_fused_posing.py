@@ -5,7 +5,7 @@ import torch
 
 from r5dgs_core.model.tracks import GroupPoses
 from r5dgs_core.motion import rotations
-from r5dgs_core.raster.cpu import compilation as kernels
+from r5dgs_core.raster import compilation as kernels
 from r5dgs_core.train.representations import fused_posing
 
 NAMES = ("means", "quats", "log_scales", "logits", "colors", "shading", "light", "group_quats", "rotmats", "shifts")

@@ -1,4 +1,4 @@
-"""Compilation, caching and multithreaded execution of the numba kernels of the `cpu` backend.
+"""Compilation, caching and multithreaded execution of numba kernels: those of the `cpu` backend and of training.
 
 A kernel is a function ``kernel(worker, workers, ...)`` that does its share of the work without the interpreter lock.
 Plain Python threads run the shares. Compared with numba's parallel loops, this compiles in a fraction of the time,
@@ -251,7 +251,7 @@ def _danger(folder: Path) -> str | None:
 
 def shared_sources() -> list[Path]:
     """Source files that any kernel may use besides its own: helpers and frozen constants."""
-    core = Path(__file__).parents[2]
+    core = Path(__file__).parents[1]
     return sorted(path for pattern in _SHARED for path in core.glob(pattern))
 
 
