@@ -6,8 +6,23 @@ import pytest
 
 from r5dgs_core.bake import bake
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.train import run
+from r5dgs_core.train import learning_curves, run
 from tests.support import pictures, scenes, tiny_datasets
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_plots():
+    """Train without plots of learning curves, which take a third of a tiny run; returns the function left out."""
+    update = learning_curves.Curves.update
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning_curves.Curves, "update", lambda self, *, finished=False: None)
+        yield update
+
+
+@pytest.fixture
+def plots(no_plots, monkeypatch):
+    """Training plots its learning curves, as it does for users."""
+    monkeypatch.setattr(learning_curves.Curves, "update", no_plots)
 
 
 @pytest.fixture(scope="session")

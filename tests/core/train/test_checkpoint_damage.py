@@ -10,6 +10,7 @@ import io
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -129,11 +130,20 @@ def interrupted(tiny, folder, at=20):
     return [(folder / name) for name in checkpoint.GENERATIONS]
 
 
+@pytest.fixture(scope="module")
+def stopped_run(tiny, tmp_path_factory):
+    """Folder of an interrupted run with both of its checkpoints."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    interrupted(tiny, folder)
+    return folder
+
+
 @pytest.mark.parametrize("damage", ["flipped", "empty", "missing"])
 def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
-    tiny, reference, tmp_path, caplog, damage
+    tiny, reference, stopped_run, tmp_path, caplog, damage
 ):
-    newest, previous = interrupted(tiny, tmp_path / "run")
+    shutil.copytree(stopped_run, tmp_path / "run")
+    newest, previous = (tmp_path / "run" / name for name in checkpoint.GENERATIONS)
     stopped = checkpoint.load(newest.parent).iteration
     if damage == "flipped":
         flip(newest, 8 * (newest.stat().st_size // 2))
@@ -142,7 +152,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     else:
         newest.unlink()
     assert checkpoint.load(newest.parent).iteration < stopped
-    assert len(bake.bake(checkpoint.open_run(newest.parent)).means) > 0
+    assert len(bake.bake(tiny_datasets.as_trained(checkpoint.open_run(newest.parent))).means) > 0
     caplog.clear()
     assert main.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
     told = [record.getMessage() for record in caplog.records if "checkpoint before it" in record.getMessage()]

@@ -47,7 +47,7 @@ def test_detached_identities_leave_the_geometry_as_it_is_and_joint_ones_do_not(t
 def test_a_run_hands_its_identities_to_the_scene(tiny, tmp_path, training):
     settings = tiny_datasets.settings(*CHANGES, f"identity.training={training}")
     finished = run.train(tiny.root, tmp_path / "run", settings)
-    scene = bake.bake(finished, datasets.read(tiny.root))
+    scene = bake.bake(tiny_datasets.as_trained(finished), datasets.read(tiny.root))
     if training == "off":
         assert scene.identities is None and scene.classifier_weight is None
         return

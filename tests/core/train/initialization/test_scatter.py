@@ -21,6 +21,8 @@ RANDOM = (
     "init.placement='random'",
     "init.background_points=300",
     "train.iterations=4",
+    "field.place_steps=5",
+    "field.trd_steps=5",
 )
 
 

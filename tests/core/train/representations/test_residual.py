@@ -262,7 +262,6 @@ def test_the_table_says_where_what_bends_is_too_little_to_be_stored():
 
 
 SETTINGS = ("train.iterations=300", "residual.trial_steps=400", "identity.iterations=0")
-DECISION = 120
 
 
 @pytest.fixture(scope="module")
@@ -342,11 +341,12 @@ def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     assert row["decision"] == "off" and row["reason"].startswith("set off by you")
 
 
+FORCED = ("needs.residuals=on", "train.iterations=100", "residual.trial_steps=20")  # tried after 40 steps, and kept
 BESIDE = {
     "alone": (),
-    "detached": ("identity.training='detached'", "identity.iterations=80"),
-    "joint": ("identity.training='joint'", "identity.iterations=80", "needs.residuals=on"),
-    "mcmc": ("densify.strategy='mcmc'", "densify_mcmc.start=10", "densify_mcmc.every=10", "needs.residuals=on"),
+    "detached": ("identity.training='detached'", "identity.iterations=80", *FORCED),
+    "joint": ("identity.training='joint'", "identity.iterations=80", *FORCED),
+    "mcmc": ("densify.strategy='mcmc'", "densify_mcmc.start=10", "densify_mcmc.every=10", *FORCED),
 }
 
 
@@ -355,7 +355,8 @@ def states(breathing, request):
     """Settings, and states of a run with them: just before residuals are tried, and some steps after."""
     settings = (*SETTINGS, *BESIDE[request.param])
     trainer, found = make(breathing[0], *settings), []
-    for k in (DECISION - 1, DECISION + 9, DECISION + 20):
+    decision = run.decision_step(trainer)
+    for k in (decision - 1, decision + 9, decision + 20):
         found.append(advance(trainer, k).state())
     return settings, found
 
@@ -367,7 +368,7 @@ def test_a_run_with_residuals_goes_on_to_the_same_bits(breathing, states, tmp_pa
     trainer = make(breathing[0], *settings)
     trainer.restore(checkpoint.load(tmp_path))
     assert (trainer.motion.residuals is None) == (k == 0)
-    last = advance(trainer, DECISION + 20).state()
+    last = advance(trainer, found[-1].iteration).state()
     assert trainer.motion.residuals.bodies == ([BRICK, BALL] if "needs.residuals=on" in settings else [BALL])
     assert_same_tensors(last.tensors, found[-1].tensors)
     assert (last.queue, last.running_loss) == (found[-1].queue, found[-1].running_loss)

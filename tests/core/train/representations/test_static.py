@@ -33,7 +33,7 @@ from r5dgs_core.playback import scene_player
 from r5dgs_core.scene import scene_file
 from tests.support import tiny_datasets
 data, folder = Path(sys.argv[1]), Path(sys.argv[2])
-run.train(data, folder / "run", tiny_datasets.settings("train.iterations=150", *sys.argv[3:]))
+run.train(data, folder / "run", tiny_datasets.settings("train.iterations=30", *sys.argv[3:]))
 bake.run_bake(folder / "run", folder / "still.r5dgs")
 scene = scene_file.read(folder / "still.r5dgs")
 scene_player.frame(scene, 2.0)
