@@ -13,6 +13,7 @@ from ...r5dgs_core.playback import affine_transform
 from ...r5dgs_core.playback.residuals import Residuals
 from ...r5dgs_core.scene import cameras, scene_file
 from ...r5dgs_core.scene.scene import Scene
+from ...r5dgs_core.scene.splats import Splats
 from ..engine import render_request, visible_clouds
 from ..scene import evaluated_points, loaded_scenes, object_tint
 from ..ui import plural
@@ -100,7 +101,7 @@ def world_to(axes: str, world: np.ndarray) -> np.ndarray:
 
 def splats_of(
     context: bpy.types.Context, wanted: set[bpy.types.Object] | None, axes: str, sources: Sources
-) -> tuple[ply.Splats, list[str]]:
+) -> tuple[Splats, list[str]]:
     """Gaussians that Blender shows at the current frame.
 
     Args:
@@ -135,7 +136,7 @@ def splats_of(
 
 def _placed(
     scene: Scene, one: visible_clouds.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources
-) -> ply.Splats:
+) -> Splats:
     """Gaussians of a visible point cloud, read from its scene file. matrix, turn [4, 4]"""
     start, count, bending = one.start, one.count, None
     if one.edit is not None:
@@ -150,7 +151,7 @@ def _placed(
     return affine_transform.place(scene, start, count, matrix, world=turn @ one.world, tint=tint, bend=bend)
 
 
-def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
+def from_points(cloud: bpy.types.PointCloud, object_id: int) -> Splats:
     """Convert the attributes written by `point_clouds.fill` to Gaussians.
 
     Raises:
@@ -174,7 +175,7 @@ def from_points(cloud: bpy.types.PointCloud, object_id: int) -> ply.Splats:
         rest.append(values(f"radiance:sh_{k}", "vector", 3))
         k += 1
     opacities = np.clip(base[:, 3].astype(np.float64), 1e-7, 1 - 1e-7)
-    return ply.Splats(
+    return Splats(
         means=values("position", "vector", 3),
         quats=values("rotation", "value", 4),
         log_scales=np.log(np.maximum(values("scale", "vector", 3), 1e-30)),

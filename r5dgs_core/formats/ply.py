@@ -8,7 +8,6 @@ encoding) and obj_id. Other columns and elements are skipped.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,6 +16,7 @@ import numpy as np
 from .. import atomic_files, errors, findings
 from ..motion import rotations
 from ..scene import validation
+from ..scene.splats import Splats
 
 _TYPES = {
     "char": "i1",
@@ -40,29 +40,6 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _HEADER_LIMIT = 1 << 16
 _LONGEST_NUMBER = 400  # characters, including the separator
 _MOST_DIGITS = 18  # digits of a row count
-
-
-@dataclass(frozen=True)
-class Splats:
-    """Gaussians without objects or motion.
-
-    Attributes:
-        means: Centres, in the file's world. [N, 3] float32
-        quats: Unit wxyz. [N, 4] float32
-        log_scales: Natural logarithm of the standard deviations. [N, 3] float32
-        opacity_logits: Opacities before the sigmoid. [N] float32
-        sh: Coefficients, 3DGS convention. [N, K, 3] float32
-        identities: Identity encodings, or None. [N, 16] float32
-        object_ids: Values of obj_id, or None. [N] int32
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    log_scales: np.ndarray
-    opacity_logits: np.ndarray
-    sh: np.ndarray
-    identities: np.ndarray | None = None
-    object_ids: np.ndarray | None = None
 
 
 def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.ndarray | None = None) -> Path:

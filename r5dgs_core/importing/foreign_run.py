@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..formats.ply import Splats
 from ..motion import rotations
+from ..scene.splats import Splats
 from .networks import DeformNetwork
 
 SPLATTING_NEAR = 0.2  # near plane of the 3DGS rasterizer, depth

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..color import tints
-from ..formats.ply import Splats
 from ..motion import rotations
 from ..scene import spherical_harmonics
 from ..scene.scene import Scene
+from ..scene.splats import Splats
 from . import posing
 from .residuals import Residuals
 

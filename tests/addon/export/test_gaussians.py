@@ -10,6 +10,7 @@ from r5dgs_core.formats import ply
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras, scene_file, sh_color
+from r5dgs_core.scene.splats import Splats
 from tests.support import scenes
 
 pytest.importorskip("bpy", reason="bpy is not installed; it comes with the extra 'test' on Python 3.11")
@@ -99,7 +100,7 @@ def in_blender(camera):
 def select(splats, rows):
     """Some of the Gaussians of a file."""
     parts = {field.name: getattr(splats, field.name) for field in dataclasses.fields(splats)}
-    return ply.Splats(**{name: None if values is None else values[rows] for name, values in parts.items()})
+    return Splats(**{name: None if values is None else values[rows] for name, values in parts.items()})
 
 
 def test_what_was_moved_turned_scaled_and_mirrored_looks_as_in_blender(blender, scene, loaded, tmp_path):
@@ -159,7 +160,7 @@ def test_what_third_parties_read_looks_as_in_the_preview(blender, scene, preview
     rest = column(*(f"f_rest_{k}" for k in range(45))).reshape(-1, 3, 15).swapaxes(1, 2)
     sh = np.concatenate([column("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], axis=1)
     sigmas, turns = column(*(f"scale_{k}" for k in range(3))), column(*(f"rot_{k}" for k in range(4)))
-    theirs = ply.Splats(column("x", "y", "z"), turns, sigmas, column("opacity")[:, 0], sh)
+    theirs = Splats(column("x", "y", "z"), turns, sigmas, column("opacity")[:, 0], sh)
     assert psnr(render(theirs, scene, camera), shown_there) > 40
     flat = dataclasses.replace(theirs, sh=sh[:, :1])
     assert psnr(render(flat, scene, camera), shown_there) < 40  # the harmonics can be seen

@@ -5,12 +5,13 @@ import pytest
 
 from r5dgs_core import errors
 from r5dgs_core.formats import ply
+from r5dgs_core.scene.splats import Splats
 from tests.support.scenes import make_scene
 
 
 def splats(degree=0, n=50, groups=True):
     scene = make_scene(n=n, sh_degree=degree)
-    return ply.Splats(
+    return Splats(
         scene.means,
         scene.quats,
         scene.log_scales,

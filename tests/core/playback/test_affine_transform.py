@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r5dgs_core.formats.ply import Splats
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import affine_transform, residuals, scene_player
 from r5dgs_core.render import posed_scene, scene_renderer
 from r5dgs_core.scene import sh_color, spherical_harmonics
+from r5dgs_core.scene.splats import Splats
 from tests.support.scenes import make_scene
 
 TURN = rotations.quats_to_rotmats(rotations.normalize(np.array([0.3, -0.5, 0.7, 0.2])))
