@@ -19,7 +19,7 @@ from timing import Contender, take_turns
 
 from r5dgs_core.raster import compilation, rasterize_splats
 from r5dgs_core.raster.cpu.projection import TILE
-from r5dgs_core.render.static_layer import Backdrop
+from r5dgs_core.raster.cpu.static_layer import StaticLayer
 
 COLUMNS = ("workload", "threads", "moving", "covered", "build_ms", "all_ms", "backdrop_ms", "ratio")
 
@@ -34,7 +34,7 @@ def measure(name: str, share: float, threads: int, repeats: int) -> dict:
     moving, still = ([t[rows].contiguous() for t in inputs] for rows in (order[:count], order[count:]))
     compilation.set_threads(threads)
     start = time.perf_counter()
-    backdrop = Backdrop(*still, camera)
+    backdrop = StaticLayer(*still, camera)
     build_ms = 1e3 * (time.perf_counter() - start)
     everything = [torch.cat(parts) for parts in zip(still, moving, strict=True)]
     together, apart = rasterize_splats(*everything, camera), backdrop.draw(*moving)

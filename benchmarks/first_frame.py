@@ -29,7 +29,7 @@ def first_frame(count: int, size: int, sh_degree: int, sky_degree: int) -> dict[
     import frame_rate
 
     from r5dgs_core.playback import scene_player
-    from r5dgs_core.raster.cpu import cpu_backend, sh_kernels, sky  # noqa: F401  (all that frames import)
+    from r5dgs_core.raster.cpu import autograd, sky  # noqa: F401  (all that frames import)
     from r5dgs_core.render import scene_renderer  # noqa: F401  (all that frames import)
 
     imported = time.perf_counter()

@@ -32,10 +32,10 @@ def colors(count: int, degree: int, fused: bool) -> dict[str, Callable]:
 
     def forward_backward():
         leaves = means.detach().requires_grad_(), sh.detach().requires_grad_()
-        shade.seen_colors(*leaves, eye, fused=fused).backward(upstream)
+        shade.seen_colors(*leaves, eye, backend="auto" if fused else "reference").backward(upstream)
 
     return {
-        "forward": lambda: shade.seen_colors(means, sh, eye, fused=fused),
+        "forward": lambda: shade.seen_colors(means, sh, eye, backend="auto" if fused else "reference"),
         "forward_backward": forward_backward,
     }
 

@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         for backend in options.backends:
             on_gpu = backend == "cuda" and torch.cuda.is_available()
-            backends.choose_backend(backend, torch.zeros(1, device="cuda" if on_gpu else "cpu"))
+            backends.choose(backend, torch.zeros(1, device="cuda" if on_gpu else "cpu"))
         chosen = _choose(options)
         peers = [load_peer(name) for name in options.peer]
     except (ValueError, OSError, errors.R5dgsError) as error:

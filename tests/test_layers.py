@@ -100,13 +100,12 @@ LATE_MODULES = {
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
     # numba is optional.
-    "raster.shade": {"raster.compilation", "raster.cpu.sh_kernels", "raster.cpu.sky"},
-    "render.segment_weights": {"raster.cpu.cpu_backend"},
-    "raster.rasterizer": {"raster.cpu.cpu_backend"},
-    "render.incremental_renderer": {"render.static_layer"},
-    "render.speed_test": {"raster.compilation"},
-    # numba is optional, and scipy slow to import.
-    "render.warm_up": {"render.static_layer", "render.segment_weights"},
+    "raster.cpu.backend": {
+        *("raster.compilation", "raster.cpu.autograd", "raster.cpu.forward"),
+        *("raster.cpu.sky", "raster.cpu.static_layer"),
+    },
+    # scipy is slow to import.
+    "render.warm_up": {"render.segment_weights"},
     # The stability table is listed without torch.
     "stability.loading": {"raster", "render.warm_up"},
     # OpenImageIO is needed for images alone, not for words.

@@ -1,58 +1,64 @@
-"""Selection of the rasterizer backend for given tensors on this machine."""
+"""Registry of the rasterizer backends, and selection of one for given tensors on this machine."""
 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import logging
 
 import torch
 
 from .. import errors
-from . import cuda
-from .settings import BACKENDS
+from .backend import Backend
+from .cpu.backend import CpuBackend
+from .cuda import CudaBackend
+from .reference import ReferenceBackend
 
 log = logging.getLogger(__name__)
 
+# Fastest first: "auto" takes the first that suits the tensors and has no obstacle.
+BACKENDS: list[Backend] = [
+    CpuBackend(),
+    CudaBackend(),
+    ReferenceBackend(),
+]
 
-def choose_backend(backend: str, means: torch.Tensor) -> str:
-    """Return the backend to use for tensors like ``means``, resolving "auto".
+
+def choose(name: str, like: torch.Tensor) -> Backend:
+    """Return the backend of that name, or the fastest if "auto", for tensors of the device and dtype of ``like``.
 
     Raises:
         ValueError: The name is unknown.
         BackendError: The backend cannot rasterize these tensors here.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, got {backend!r}")
-    if backend == "auto":
-        if means.device.type == "cpu" and means.dtype == torch.float32 and numba_is_there():
-            return "cpu"
-        if means.device.type == "cpu" and means.dtype == torch.float32:
-            log.warning("rasterizer: numba is not installed, using the slow reference; remedy: pip install numba")
-        if means.device.type == "cuda" and means.dtype == torch.float32:
-            reason = cuda.obstacle(means.device, means.dtype)
-            if reason is None:
-                return "cuda"
-            _warn_once(f"rasterizer: using the slow reference on the GPU, as backend 'cuda' is not available: {reason}")
-        return "reference"
-    if backend == "cuda":
-        reason = cuda.obstacle(means.device, means.dtype)
-        if reason is not None:
-            raise errors.BackendError(f"rasterizer 'cuda': {reason}")
-    if backend == "cpu":
-        if not numba_is_there():
-            raise errors.BackendError("rasterizer 'cpu': numba is not installed; remedy: pip install numba")
-        if means.device.type != "cpu" or means.dtype != torch.float32:
-            raise errors.BackendError(
-                f"rasterizer 'cpu': expected float32 tensors on the CPU, got {means.dtype} on {means.device}; "
-                "remedy: convert them, or use backend='reference'"
-            )
-    return backend
+    if name == "auto":
+        return _fastest(like)
+    found = next((backend for backend in BACKENDS if backend.name == name), None)
+    if found is None:
+        known = ", ".join(["auto", *(backend.name for backend in BACKENDS)])
+        raise ValueError(f"backend: expected one of {known}, got {name!r}")
+    reason = found.obstacle(like)
+    if reason is not None:
+        raise errors.BackendError(f"rasterizer '{name}': {reason}")
+    return found
 
 
-def numba_is_there() -> bool:
-    """Return True if numba is installed. Does not import it."""
-    return importlib.util.find_spec("numba") is not None
+def on_cpu() -> Backend:
+    """Return the fastest backend for float32 tensors on the CPU."""
+    return _fastest(torch.empty(0))
+
+
+def _fastest(like: torch.Tensor) -> Backend:
+    missing = []
+    for backend in BACKENDS:
+        if not backend.suits(like):
+            continue
+        reason = backend.obstacle(like)
+        if reason is None:
+            for name, why in missing:
+                _warn_once(f"rasterizer: using the slower '{backend.name}', as '{name}' is not available: {why}")
+            return backend
+        missing.append((backend.name, reason))
+    raise errors.BackendError(f"rasterizer: no backend for {like.dtype} on {like.device}: {missing}")
 
 
 @functools.cache

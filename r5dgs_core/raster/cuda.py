@@ -23,6 +23,7 @@ import torch
 from .. import errors
 from ..scene.cameras import Camera
 from . import reference
+from .backend import Backend
 from .settings import RasterSettings, RasterStats, SplatImage
 
 log = logging.getLogger(__name__)
@@ -68,55 +69,6 @@ class _Projected:
     pairs: torch.Tensor  # [P] Gaussian of each pair
     width: int
     height: int
-
-
-def rasterize_splats(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    channels: torch.Tensor,
-    camera: Camera,
-    background: torch.Tensor | None,
-    labels: torch.Tensor | None,
-    settings: RasterSettings,
-    stats: RasterStats | None,
-) -> SplatImage:
-    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
-    kernels = find_kernels()
-    if isinstance(kernels, str):
-        raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
-    check_settings(settings, kernels, opacities)
-    with torch.no_grad():
-        projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
-        means2d, axes, z = projected
-        cov, _ = reference.covariances(axes, settings.dilation)
-        order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
-        tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
-    if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
-        # Project only visible Gaussians with gradients: the graph of a float64 projection dominates the memory.
-        seen = (means[order].double(), quats[order].double(), scales[order].double())
-        means2d, axes, z = reference.project(*seen, camera, settings)
-    else:
-        means2d, axes, z = (t[order] for t in projected)
-    cov, determinant = reference.covariances(axes, settings.dilation)
-    if stats is not None:
-        _fill_stats(stats, means2d, cov, order, means)
-
-    inverse = torch.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], 1) / determinant[:, None]
-    splats = _Projected(
-        means2d.float(), inverse.float(), opacities[order], tile_starts, pairs, camera.width, camera.height
-    )
-    blended, alpha = _blend(splats, torch.cat([channels[order], z[:, None].float()], 1), kernels)
-    covered = alpha > 0
-    depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
-    image = blended[..., :-1]
-    if background is not None:
-        image = image + (1 - alpha)[..., None] * background
-    ids = None
-    if labels is not None:
-        ids = _heaviest(splats, labels.to(order.device)[order], alpha, kernels, settings)
-    return SplatImage(image, alpha, depth, ids)
 
 
 def obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
@@ -323,3 +275,70 @@ def _fill_stats(
             stats.grad_norm = spread(grad.norm(dim=1))
 
         means2d.register_hook(keep_norm)
+
+
+class CudaBackend(Backend):
+    """gsplat's kernels, for float32 tensors on a GPU."""
+
+    name = "cuda"
+
+    def hardware(self) -> str:
+        """See `Backend.hardware`."""
+        return torch.cuda.get_device_name()
+
+    def suits(self, like: torch.Tensor) -> bool:
+        """See `Backend.suits`."""
+        return like.device.type == "cuda" and like.dtype == torch.float32
+
+    def obstacle(self, like: torch.Tensor) -> str | None:
+        """See `obstacle`."""
+        return obstacle(like.device, like.dtype)
+
+    def rasterize_splats(
+        self,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        channels: torch.Tensor,
+        camera: Camera,
+        background: torch.Tensor | None,
+        labels: torch.Tensor | None,
+        settings: RasterSettings,
+        stats: RasterStats | None,
+    ) -> SplatImage:
+        """See `Backend.rasterize_splats`."""
+        kernels = find_kernels()
+        if isinstance(kernels, str):
+            raise errors.BackendError(f"rasterizer 'cuda': {kernels}")
+        check_settings(settings, kernels, opacities)
+        with torch.no_grad():
+            projected = reference.project(means.double(), quats.double(), scales.double(), camera, settings)
+            means2d, axes, z = projected
+            cov, _ = reference.covariances(axes, settings.dilation)
+            order, extent = reference.visible_rows(means2d, cov, z, opacities.double(), camera, settings)
+            tile_starts, pairs = _tile_lists(means2d[order], extent[order], camera, kernels)
+        if torch.is_grad_enabled() and any(t.requires_grad for t in (means, quats, scales)):
+            # Project only visible Gaussians with gradients: the graph of a float64 projection dominates the memory.
+            seen = (means[order].double(), quats[order].double(), scales[order].double())
+            means2d, axes, z = reference.project(*seen, camera, settings)
+        else:
+            means2d, axes, z = (t[order] for t in projected)
+        cov, determinant = reference.covariances(axes, settings.dilation)
+        if stats is not None:
+            _fill_stats(stats, means2d, cov, order, means)
+
+        inverse = torch.stack([cov[:, 1, 1], -cov[:, 0, 1], cov[:, 0, 0]], 1) / determinant[:, None]
+        splats = _Projected(
+            means2d.float(), inverse.float(), opacities[order], tile_starts, pairs, camera.width, camera.height
+        )
+        blended, alpha = _blend(splats, torch.cat([channels[order], z[:, None].float()], 1), kernels)
+        covered = alpha > 0
+        depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
+        image = blended[..., :-1]
+        if background is not None:
+            image = image + (1 - alpha)[..., None] * background
+        ids = None
+        if labels is not None:
+            ids = _heaviest(splats, labels.to(order.device)[order], alpha, kernels, settings)
+        return SplatImage(image, alpha, depth, ids)

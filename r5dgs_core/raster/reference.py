@@ -18,62 +18,12 @@ import torch
 from torch.utils.checkpoint import checkpoint
 
 from ..scene.cameras import Camera
-from .settings import RasterSettings, RasterStats, SplatImage
+from .backend import Backend
+from .settings import RasterSettings, RasterStats, SplatImage, frustum_slopes
 
 # A tile is the unit of work: all its pixels with all Gaussians that reach it. Neither constant affects results.
 TILE = 32  # px; smaller tiles skip more Gaussians
 TILE_WORK = 1 << 18  # pixels times Gaussians; tiles grow in scenes with few Gaussians
-
-
-def rasterize_splats(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    channels: torch.Tensor,
-    camera: Camera,
-    background: torch.Tensor | None,
-    labels: torch.Tensor | None,
-    settings: RasterSettings,
-    stats: RasterStats | None,
-) -> SplatImage:
-    """Implement `rasterizer.rasterize_splats`, which checks the inputs."""
-    dtype, height, width = means.dtype, camera.height, camera.width
-    means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
-    means2d, axes, z = project(means, quats, scales, camera, settings)
-    with torch.no_grad():
-        cov, _ = covariances(axes, settings.dilation)
-        order, extent = visible_rows(means2d, cov, z, opacities, camera, settings)
-        if stats is not None:
-            _fill_stats(stats, cov, order, dtype)
-    if stats is not None and means2d.requires_grad:
-        means2d.register_hook(lambda gradient: _keep_norm(stats, gradient, dtype))
-    inputs = [t[order] for t in (means2d, axes, opacities, torch.cat([channels, z[:, None]], 1))]
-    kept_labels = None if labels is None else labels[order]
-    centers, extent = inputs[0].detach(), extent[order]
-
-    tile = TILE
-    while 4 * tile * tile * max(len(order), 1) <= TILE_WORK:
-        tile *= 2
-    rows = []
-    for y0 in range(0, height, tile):
-        row = []
-        for x0 in range(0, width, tile):
-            box = (x0, y0, min(x0 + tile, width), min(y0 + tile, height))
-            near = _overlapping(centers, extent, box)
-            near_labels = None if kept_labels is None else kept_labels[near]
-            arguments = (*(t[near] for t in inputs), near_labels, box, settings)
-            # Checkpointing: otherwise the graph would keep every pixel-Gaussian pair of all tiles.
-            row.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
-        rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
-    blended, transmittance, ids = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
-    alpha = 1 - transmittance
-    covered = alpha > 0
-    depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
-    image = blended[..., :-1]
-    if background is not None:
-        image = image + transmittance[..., None] * background.double()
-    return SplatImage(image.to(dtype), alpha.to(dtype), depth.to(dtype), None if labels is None else ids)
 
 
 def project(
@@ -119,19 +69,6 @@ def project(
         1,
     )
     return means2d, jacobian @ T[:3, :3] @ rotmats(quats) * scales[:, None, :], z
-
-
-def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
-    """Bounds of x/z (low, high) and y/z (low, high) to which the point of linearisation is clamped."""
-    k = camera.intrinsics
-    slack_u = settings.frustum_slack * 0.5 * camera.width / k[0, 0]
-    slack_v = settings.frustum_slack * 0.5 * camera.height / k[1, 1]
-    return (
-        float(-k[0, 2] / k[0, 0] - slack_u),
-        float((camera.width - k[0, 2]) / k[0, 0] + slack_u),
-        float(-k[1, 2] / k[1, 1] - slack_v),
-        float((camera.height - k[1, 2]) / k[1, 1] + slack_v),
-    )
 
 
 def rotmats(quats: torch.Tensor) -> torch.Tensor:
@@ -253,3 +190,60 @@ def _fill_stats(stats: RasterStats, cov: torch.Tensor, order: torch.Tensor, dtyp
 def _keep_norm(stats: RasterStats, gradient: torch.Tensor, dtype: torch.dtype) -> None:
     """Write the norms of the gradient by the projected centres; called in the backward pass."""
     stats.grad_norm = gradient.norm(dim=1).to(dtype)
+
+
+class ReferenceBackend(Backend):
+    """Plain torch, for tensors of any float dtype on any device."""
+
+    name = "reference"
+
+    def rasterize_splats(
+        self,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        channels: torch.Tensor,
+        camera: Camera,
+        background: torch.Tensor | None,
+        labels: torch.Tensor | None,
+        settings: RasterSettings,
+        stats: RasterStats | None,
+    ) -> SplatImage:
+        """See `Backend.rasterize_splats`."""
+        dtype, height, width = means.dtype, camera.height, camera.width
+        means, quats, scales, opacities, channels = (t.double() for t in (means, quats, scales, opacities, channels))
+        means2d, axes, z = project(means, quats, scales, camera, settings)
+        with torch.no_grad():
+            cov, _ = covariances(axes, settings.dilation)
+            order, extent = visible_rows(means2d, cov, z, opacities, camera, settings)
+            if stats is not None:
+                _fill_stats(stats, cov, order, dtype)
+        if stats is not None and means2d.requires_grad:
+            means2d.register_hook(lambda gradient: _keep_norm(stats, gradient, dtype))
+        inputs = [t[order] for t in (means2d, axes, opacities, torch.cat([channels, z[:, None]], 1))]
+        kept_labels = None if labels is None else labels[order]
+        centers, extent = inputs[0].detach(), extent[order]
+
+        tile = TILE
+        while 4 * tile * tile * max(len(order), 1) <= TILE_WORK:
+            tile *= 2
+        rows = []
+        for y0 in range(0, height, tile):
+            row = []
+            for x0 in range(0, width, tile):
+                box = (x0, y0, min(x0 + tile, width), min(y0 + tile, height))
+                near = _overlapping(centers, extent, box)
+                near_labels = None if kept_labels is None else kept_labels[near]
+                arguments = (*(t[near] for t in inputs), near_labels, box, settings)
+                # Checkpointing: otherwise the graph would keep every pixel-Gaussian pair of all tiles.
+                row.append(checkpoint(_blend, *arguments, use_reentrant=False, preserve_rng_state=False))
+            rows.append([torch.cat(parts, 1) for parts in zip(*row, strict=True)])
+        blended, transmittance, ids = (torch.cat(parts, 0) for parts in zip(*rows, strict=True))
+        alpha = 1 - transmittance
+        covered = alpha > 0
+        depth = torch.where(covered, blended[..., -1] / torch.where(covered, alpha, 1), 0)
+        image = blended[..., :-1]
+        if background is not None:
+            image = image + transmittance[..., None] * background.double()
+        return SplatImage(image.to(dtype), alpha.to(dtype), depth.to(dtype), None if labels is None else ids)

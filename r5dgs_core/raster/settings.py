@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
-BACKENDS = ("auto", "cpu", "cuda", "reference")
+    from ..scene.cameras import Camera
 
 
 @dataclass(frozen=True)
@@ -116,3 +118,16 @@ class RenderOutput:
     features: torch.Tensor | None = None
     ids: torch.Tensor | None = None
     holdout: torch.Tensor | None = None
+
+
+def frustum_slopes(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
+    """Bounds of x/z (low, high) and y/z (low, high) to which the point of linearisation is clamped."""
+    k = camera.intrinsics
+    slack_u = settings.frustum_slack * 0.5 * camera.width / k[0, 0]
+    slack_v = settings.frustum_slack * 0.5 * camera.height / k[1, 1]
+    return (
+        float(-k[0, 2] / k[0, 0] - slack_u),
+        float((camera.width - k[0, 2]) / k[0, 0] + slack_u),
+        float(-k[1, 2] / k[1, 1] - slack_v),
+        float((camera.height - k[1, 2]) / k[1, 1] + slack_v),
+    )

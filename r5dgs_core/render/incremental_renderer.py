@@ -1,7 +1,7 @@
 """Incremental rendering of scenes with one camera: instances that have not moved since the last frame are reused.
 
 Moving instances are detected from the frames themselves. The first frame after a change of camera, background or
-visible instances renders everything. From the next frame on, the instances that have not moved form a `Backdrop`, and
+visible instances renders everything. From the next frame on, the instances that have not moved form a static layer, and
 only instances that have moved at least once are drawn into it. The images equal those of
 `scene_renderer.render_frame`.
 """
@@ -17,13 +17,14 @@ import numpy as np
 import torch
 
 from ..raster import backends, rasterize
+from ..raster.backend import StaticLayer
 from ..raster.settings import RasterSettings, RenderOutput
 from ..scene.cameras import Camera
 from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
 from .scene_renderer import Instance
 
-WORTH_A_BACKDROP = 0.7  # largest share of moving Gaussians; above it, the static layer costs more than it saves
+WORTH_A_LAYER = 0.7  # largest share of moving Gaussians; above it, the static layer costs more than it saves
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Stage:
         self._shown: tuple | None = None  # camera, background, ranges and tints of the last frame
         self._places: list[np.ndarray] = []  # first pose of each instance
         self._moving: set[int] = set()
-        self._backdrop = None
+        self._static_layer: StaticLayer | None = None
+        self._backend = backends.on_cpu()
 
     def render(
         self,
@@ -140,21 +142,21 @@ class Stage:
             return self._render_all(instances, camera, sky, settings, distance)
         shown = (view, behind, tuple((one.scene, one.start, one.count, _look(one)) for one in instances))
         if shown != self._shown:
-            self._shown, self._backdrop, self._moving = shown, None, set()
+            self._shown, self._static_layer, self._moving = shown, None, set()
             self._places = [self._place(instance) for instance in instances]
             return self._render_all(instances, camera, sky, settings, distance)
         left = {i for i, one in enumerate(instances) if not np.array_equal(self._place(one), self._places[i])}
         if not left <= self._moving:
             self._moving |= left
-            self._backdrop = None
+            self._static_layer = None
         moving = [i for i in range(len(instances)) if i in self._moving]
         still = [i for i in range(len(instances)) if i not in self._moving]
-        if not self._has_backdrop(instances, still, moving):
+        if not self._wants_static_layer(instances, still, moving):
             return self._render_all(instances, camera, sky, settings, distance)
-        if self._backdrop is None:
-            self._backdrop = self._make_backdrop(instances, still, camera, sky, settings, distance)
+        if self._static_layer is None:
+            self._static_layer = self._make_static_layer(instances, still, camera, sky, settings, distance)
         means, quats, scales, opacities, colors, labels = self._splats(instances, moving, camera, distance)
-        picture = self._backdrop.draw(
+        picture = self._static_layer.draw(
             means, quats, scales, opacities, colors, labels=labels, ranks=_ranks(instances, moving)
         )
         depth = _mean(picture.image[..., 3], picture.alpha) if distance else picture.depth
@@ -183,13 +185,13 @@ class Stage:
         scene, turned = self._scenes[sky.scene], scene_renderer.in_world_of(camera, sky.matrix)
         return scene_renderer.tensor(scene_renderer.behind(scene, turned))
 
-    def _has_backdrop(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
-        if not backends.numba_is_there():
+    def _wants_static_layer(self, instances: Sequence[Instance], still: list[int], moving: list[int]) -> bool:
+        if not self._backend.has_static_layer:
             return False
         moved, kept = (sum(instances[i].count for i in part) for part in (moving, still))
-        return kept > 0 and moved <= WORTH_A_BACKDROP * (moved + kept)
+        return kept > 0 and moved <= WORTH_A_LAYER * (moved + kept)
 
-    def _make_backdrop(
+    def _make_static_layer(
         self,
         instances: Sequence[Instance],
         still: list[int],
@@ -197,14 +199,12 @@ class Stage:
         sky: Sky | None,
         settings: RasterSettings,
         distance: float,
-    ):
-        from .static_layer import Backdrop
-
+    ) -> StaticLayer:
         means, quats, scales, opacities, channels, labels = self._splats(instances, still, camera, distance)
         background = self._sky(sky, camera)
         if background is not None and distance:
             background = torch.cat([background, torch.zeros_like(background[..., :1])], -1)
-        return Backdrop(
+        return self._backend.static_layer(
             means, quats, scales, opacities, channels, camera, background,
             labels=labels, ranks=_ranks(instances, still), settings=settings,
         )  # fmt: skip

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-import torch
 from scipy import sparse
 from torch import Tensor
 
-from ..raster import backends, rasterizer
+from ..raster import backends, checks
 from ..raster.settings import RasterSettings
 from ..scene.cameras import Camera
-
-TOGETHER = 32  # segments per backward pass; bounds the memory
 
 
 def segment_weights(
@@ -51,35 +47,8 @@ def segment_weights(
         raise ValueError(
             f"segments: expected shape ({camera.height}, {camera.width}), the image's, got {tuple(segments.shape)}"
         )
-    settings = settings or RasterSettings()
-    rasterizer.check_splats(*fixed, fixed[0], camera, None, None)
-    chosen = backends.choose_backend(backend, fixed[0])
-    if chosen != "cpu":
-        return _by_gradients(fixed, camera, segments, count, settings, chosen)
-    from ..raster.cpu import cpu_backend
-
-    known = torch.where((segments >= 0) & (segments < count), segments, -1).to(torch.int32).contiguous().numpy()
-    rows, names, weights = cpu_backend.segment_weights(*fixed, camera, known, count, settings)
-    by_gaussian = sparse.coo_matrix((weights, (rows, names)), (len(means), count)).tocsr()  # sums over the tiles
+    checks.check_splats(*fixed, fixed[0], camera, None, None)
+    chosen = backends.choose(backend, fixed[0])
+    rows, names, weights = chosen.segment_weights(*fixed, camera, segments, count, settings or RasterSettings())
+    by_gaussian = sparse.coo_matrix((weights, (rows, names)), (len(means), count)).tocsr()  # adds entries up
     return sparse.csr_matrix(by_gaussian.T)
-
-
-def _by_gradients(
-    fixed: tuple[Tensor, Tensor, Tensor, Tensor],
-    camera: Camera,
-    segments: Tensor,
-    count: int,
-    settings: RasterSettings,
-    backend: str,
-) -> sparse.csr_matrix:
-    """Compute the weights by autograd: the derivative of a segment's blended sum by the Gaussian's value."""
-    means, parts = fixed[0], []
-    for first in range(0, count, TOGETHER):
-        some = torch.arange(first, min(first + TOGETHER, count), device=segments.device)
-        members = (segments[..., None] == some).to(means)
-        channels = means.new_zeros(len(means), len(some)).requires_grad_(True)
-        with torch.enable_grad():
-            image = rasterizer.rasterize_splats(*fixed, channels, camera, settings=settings, backend=backend).image
-        (weights,) = torch.autograd.grad(image, channels, members)
-        parts.append(sparse.csr_matrix(weights.T.cpu().numpy().astype(np.float32)))
-    return sparse.csr_matrix(sparse.vstack(parts) if parts else (0, len(means)), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Compilation of the kernels of the `cpu` backend ahead of use, or loading from the cache of an earlier process."""
+"""Compilation of the rasterizer's kernels on the CPU ahead of use, or loading from an earlier process's cache."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ..raster import rasterizer, shade
+from ..raster import backends, rasterizer, shade
 from ..scene.cameras import Camera
 
 _VIEW = Camera(4, 4, np.array([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]), np.eye(4))
@@ -16,7 +16,7 @@ _SH = 4  # coefficients: degree 1, the least that has kernels
 
 
 def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = None) -> float:
-    """Compile or load all kernels of the `cpu` backend.
+    """Compile or load all kernels of the fastest backend on the CPU.
 
     The first call after installation takes ten to fifteen seconds; later processes take well below one.
 
@@ -26,13 +26,10 @@ def warm_up(gradients: bool = True, progress: Callable[[str], object] | None = N
 
     Returns:
         Elapsed time in seconds.
-
-    Raises:
-        BackendError: numba is missing.
     """
     start = time.perf_counter()
     stages: list[tuple[str, Callable[[], object]]] = [
-        *(("splats", _splats), ("splats before others", _backdrop)),
+        *(("splats", _splats), ("splats before others", _static_layer)),
         *(("colors", _colors), ("sky", _sky)),
     ]
     if gradients:
@@ -54,7 +51,7 @@ def _inputs(row: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor
 
 def _draw(row: torch.Tensor) -> torch.Tensor:
     labels = torch.zeros(1, dtype=torch.int32)
-    return rasterizer.rasterize_splats(*_inputs(row), _VIEW, labels=labels, backend="cpu").image
+    return rasterizer.rasterize_splats(*_inputs(row), _VIEW, labels=labels).image
 
 
 def _shade(row: torch.Tensor) -> torch.Tensor:
@@ -65,11 +62,11 @@ def _splats() -> None:
     _draw(torch.ones(1, 3))
 
 
-def _backdrop() -> None:
-    from . import static_layer  # imports numba, which is optional
-
-    still = moving = _inputs(torch.ones(1, 3))
-    static_layer.Backdrop(*still, _VIEW).draw(*moving)
+def _static_layer() -> None:
+    backend = backends.on_cpu()
+    if backend.has_static_layer:
+        still = moving = _inputs(torch.ones(1, 3))
+        backend.static_layer(*still, _VIEW).draw(*moving)
 
 
 def _splat_gradients() -> None:
@@ -80,7 +77,7 @@ def _segment_weights() -> None:
     from . import segment_weights  # imports scipy, which is slow
 
     segments = torch.zeros(_VIEW.height, _VIEW.width, dtype=torch.int64)
-    segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1, backend="cpu")
+    segment_weights.segment_weights(*_inputs(torch.ones(1, 3))[:4], _VIEW, segments, 1)
 
 
 def _colors() -> None:

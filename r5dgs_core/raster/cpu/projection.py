@@ -35,7 +35,7 @@ from .simd.vectors import any_of, larger, select, smaller
 MEAN_X, MEAN_Y, L11, L12, L22, LOG2_OPACITY, EXTENT_X, EXTENT_Y = range(8)
 GEOMETRY = 8
 
-# Entries of the view vector, see `cpu_backend.pack_view`.
+# Entries of the view vector, see `forward.pack_view`.
 FX, SKEW, CX, FY, CY, U_LOW, U_HIGH, V_LOW, V_HIGH, WIDTH, HEIGHT, NEAR, DILATION, ALPHA_MIN = range(14)
 ROTATION, TRANSLATION = 14, 23
 
@@ -271,7 +271,7 @@ def project_backward(
     """Sum the slots of each Gaussian and write its gradients; rows of Gaussians without pairs stay zero.
 
     Args:
-        view: See `cpu_backend.pack_view`. [26]
+        view: See `forward.pack_view`. [26]
         means, quats, scales, opacities: The inputs, flat.
         slot_starts: Slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]. [N + 1]
         slots, filled: Moments and gradients of the values of each pair of Gaussian and tile, and the mask of slots that

@@ -1,5 +1,6 @@
 """The rasterizer means what 3D Gaussian splatting means, and the fast backend agrees with the reference."""
 
+import importlib.util
 import math
 import multiprocessing
 import os
@@ -20,7 +21,7 @@ from r5dgs_core.raster import (
     rasterize_splats,
     rasterizer,
 )
-from r5dgs_core.raster.cpu import blend, blend_backward, cpu_backend, projection, tiles
+from r5dgs_core.raster.cpu import autograd, blend, blend_backward, projection, tiles
 from r5dgs_core.render import warm_up
 from r5dgs_core.scene import cameras, sh_color
 from tests.support.splats import camera, draw, relative, splats
@@ -322,8 +323,8 @@ def test_the_image_may_be_changed_in_place():
 @pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
 def test_without_gradients_nothing_is_kept_for_them(without, monkeypatch):
     leaves, kept = [t.float().requires_grad_() for t in splats(50, 3)], []
-    original = cpu_backend._forward
-    monkeypatch.setattr(cpu_backend, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
+    original = autograd._forward
+    monkeypatch.setattr(autograd, "_forward", lambda *arguments: kept.append(original(*arguments)) or kept[-1])
     with without():
         still = rasterize_splats(*leaves, camera()).image
     assert kept[0][0] is None and not still.requires_grad
@@ -561,7 +562,8 @@ def test_backends_that_cannot_draw_say_why():
 def test_without_numba_the_reference_draws_and_says_so(monkeypatch, caplog):
     scene = [t.float() for t in splats(10, 3)]
     expected = rasterize_splats(*scene, camera(), backend="reference").image
-    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
+    backends._warn_once.cache_clear()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert torch.equal(rasterize_splats(*scene, camera()).image, expected)
     assert "pip install numba" in caplog.text
     with pytest.raises(errors.BackendError, match="pip install numba"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, shade
+from r5dgs_core.raster import backends, compilation, rasterize, rasterizer, reference, shade
 from r5dgs_core.scene import sh_color
 from r5dgs_core.scene.cameras import Camera
 from tests.support import scenes, splats
@@ -102,12 +102,12 @@ def test_results_do_not_depend_on_the_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.parametrize("fused", [True, False])
-def test_a_gaussian_at_the_eye_shows_degree_zero_and_sends_no_gradient_to_its_centre(fused):
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_gaussian_at_the_eye_shows_degree_zero_and_sends_no_gradient_to_its_centre(backend):
     tensors, _ = draw(40, 16)
     eye = tensors["means"][3].double().numpy()
     colors, gradients = differentiate(
-        lambda means, sh: shade.seen_colors(means, sh, eye, fused=fused),
+        lambda means, sh: shade.seen_colors(means, sh, eye, backend=backend),
         {name: tensors[name] for name in ("means", "sh")},
     )
     torch.testing.assert_close(colors[3], sh_color.dc_to_rgb(tensors["sh"][3, 0]).clamp_min(0))
@@ -125,21 +125,21 @@ def test_far_from_the_origin_colours_are_those_near_it_to_the_bit():
     assert torch.equal(shade.seen_colors(far, tensors["sh"], EYE + 2.0**20), near)
 
 
-@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
 @pytest.mark.parametrize("count", [1, *COUNTS])
-def test_what_is_clamped_sends_no_gradient(count, fused):
+def test_what_is_clamped_sends_no_gradient(count, backend):
     tensors, _ = draw(30, count)
     dark = tensors["sh"].clone()
     dark[:, 0, 1] -= 50
     colors, gradients = differentiate(
-        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, fused=fused),
+        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, backend=backend),
         {"means": tensors["means"], "sh": dark},
     )
     assert (colors[:, 1] == 0).all() and (gradients["sh"][..., 1] == 0).all()
     assert (gradients["sh"][..., 0] != 0).any()
     dark[:, 0] -= 50
     _, gradients = differentiate(
-        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, fused=fused),
+        lambda means, sh: 0 * means.sum() + shade.seen_colors(means, sh, EYE, backend=backend),
         {"means": tensors["means"], "sh": dark},
     )
     assert (gradients["means"] == 0).all()
@@ -160,7 +160,7 @@ def test_gradients_through_the_rasterizer_are_those_of_plain_colours(count):
 
     def render(fused, **named):
         gaussians = SimpleNamespace(**named, opacity_logits=torch.logit(opacities, 1e-4))
-        colors = None if fused else rasterizer.seen_colors(gaussians, view, fused=False)
+        colors = None if fused else rasterizer.seen_colors(gaussians, view, backend="reference")
         return rasterize(gaussians, view, colors=colors).color
 
     value, gradients = differentiate(lambda **t: render(True, **t), tensors)
@@ -230,7 +230,7 @@ def test_degree_zero_needs_no_kernel_and_other_tensors_take_none(monkeypatch):
     torch.testing.assert_close(shade.seen_colors(**constant, eyes=EYE), expected)
     tensors, where = draw(5, 4)
     shade.seen_colors(**{name: value.double() for name, value in tensors.items()}, **where)
-    shade.seen_colors(**tensors, **where, fused=False)
+    shade.seen_colors(**tensors, **where, backend="reference")
     with pytest.raises(AssertionError, match="a kernel ran"):
         shade.seen_colors(**tensors, **where)
 
@@ -245,7 +245,7 @@ def test_the_sky_is_the_harmonics_along_each_ray(count, monkeypatch):
         assert image.shape == (camera.height, camera.width, 3) and image.dtype == np.float32
         assert count == 1 or ((image == 0).any() and (image == 1).any())
         with monkeypatch.context() as without_numba:
-            without_numba.setattr(backends, "numba_is_there", lambda: False)
+            without_numba.setattr(backends, "BACKENDS", [reference.ReferenceBackend()])
             np.testing.assert_allclose(image, shade.sky(sh, camera), atol=1e-6)
 
 
@@ -256,5 +256,5 @@ def test_without_numba_scenes_keep_their_colours(monkeypatch):
     scene, camera = scenes.make_scene(300, sh_degree=3), scenes.orbit_camera(0.4)
     posed = scene_renderer.pose_frame(scene, scene_player.frame(scene, 1.1))
     fused = scene_renderer.colors(posed, camera)
-    monkeypatch.setattr(backends, "numba_is_there", lambda: False)
+    monkeypatch.setattr(backends, "BACKENDS", [reference.ReferenceBackend()])
     np.testing.assert_allclose(scene_renderer.colors(posed, camera), fused, atol=2e-6)

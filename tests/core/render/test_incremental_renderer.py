@@ -9,7 +9,8 @@ import torch
 from r5dgs_core.motion import rotations
 from r5dgs_core.playback import scene_player
 from r5dgs_core.raster import RasterSettings, rasterize_splats
-from r5dgs_core.render import incremental_renderer, scene_renderer, static_layer
+from r5dgs_core.raster.cpu import static_layer
+from r5dgs_core.render import incremental_renderer, scene_renderer
 from r5dgs_core.render.scene_renderer import Instance
 from tests.core.render.test_scene_renderer import group_instances, matrix
 from tests.support import scenes
@@ -26,13 +27,13 @@ def scene(request):
 def made(monkeypatch):
     """Counts the backdrops that are made."""
     count = []
-    original = static_layer.Backdrop.__init__
+    original = static_layer.StaticLayer.__init__
 
     def counted(self, *arguments, **options):
         count.append(1)
         original(self, *arguments, **options)
 
-    monkeypatch.setattr(static_layer.Backdrop, "__init__", counted)
+    monkeypatch.setattr(static_layer.StaticLayer, "__init__", counted)
     return count
 
 

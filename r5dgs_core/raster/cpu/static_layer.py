@@ -12,18 +12,19 @@ import threading
 import numpy as np
 import torch
 
-from ..raster import backends, rasterizer
-from ..raster.compilation import run
-from ..raster.cpu import blend, cpu_backend, projection
-from ..raster.cpu import tiles as cpu_tiles
-from ..raster.settings import RasterSettings, SplatImage
-from ..scene.cameras import Camera
+from ...scene.cameras import Camera
+from .. import checks
+from ..compilation import run
+from ..settings import RasterSettings, SplatImage
+from . import blend, forward, projection
+from . import tiles as cpu_tiles
+from .autograd import to_array
 
 _NOTHING = np.empty((0, 0), np.float32)
 
 
-class Backdrop:
-    """Static Gaussians, rendered once for one camera by `cpu_backend`, without gradients.
+class StaticLayer:
+    """Static Gaussians, rendered once for one camera, without gradients.
 
     Args:
         means, quats, scales, opacities, channels, camera, background: As for `rasterize_splats`; copied.
@@ -33,7 +34,7 @@ class Backdrop:
         settings: As there.
 
     Raises:
-        ValueError, BackendError: As for `rasterize_splats`.
+        ValueError: As for `rasterize_splats`.
     """
 
     def __init__(
@@ -50,30 +51,29 @@ class Backdrop:
         ranks: np.ndarray | None = None,  # [N]
         settings: RasterSettings | None = None,
     ):
-        rasterizer.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
-        backends.choose_backend("cpu", means)
+        checks.check_splats(means, quats, scales, opacities, channels, camera, background, labels)
         settings = settings or RasterSettings()
         self._lock = threading.Lock()
         self._camera = camera
-        self._view, self._limits = cpu_backend.pack_view(camera, settings), cpu_backend.pack_limits(settings)
-        self._background = cpu_backend.pack_background(background, channels.shape[1]).copy()
+        self._view, self._limits = forward.pack_view(camera, settings), forward.pack_limits(settings)
+        self._background = forward.pack_background(to_array(background), channels.shape[1]).copy()
         # Rows of the tables: static Gaussians, padding, moving Gaussians.
         n, rows = len(means), projection.padded_rows(len(means))
         self._count = self._end = rows
-        self._geometry = cpu_backend.aligned((rows, projection.GEOMETRY), np.float64)
+        self._geometry = forward.aligned((rows, projection.GEOMETRY), np.float64)
         self._depths, self._boxes, self._radii = np.empty(rows), np.empty(rows), np.empty(rows, np.float32)
         self._channels = np.zeros((rows, channels.shape[1]), np.float32)
-        self._channels[:n] = cpu_backend.to_array(channels)
+        self._channels[:n] = to_array(channels)
         self._ranks = np.zeros(rows, np.int64)
         self._ranks[:n] = np.arange(n) - n if ranks is None else ranks
         self._labels = None
         if labels is not None:
             self._labels = np.full(rows, -1, np.int64)
-            self._labels[:n] = cpu_backend.to_numbers(labels)
-        shapes = [cpu_backend.to_array(t) for t in (means, quats, scales, opacities)]
-        cpu_backend.project(self._view, shapes, self._geometry, self._depths, self._boxes, self._radii)
+            self._labels[:n] = forward.to_numbers(to_array(labels))
+        shapes = [to_array(t) for t in (means, quats, scales, opacities)]
+        forward.project(self._view, shapes, self._geometry, self._depths, self._boxes, self._radii)
         self._starts, self._rows = self._assign(0, rows)
-        self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+        self._names, self._votes = forward.pack_labels(self._labels)
         size = (camera.height, camera.width)
         self._image = np.empty((*size, channels.shape[1]), np.float32)
         self._alpha, self._depth = np.empty(size, np.float32), np.empty(size, np.float32)
@@ -102,21 +102,18 @@ class Backdrop:
             The output of `rasterize_splats` for all Gaussians in the order of their ranks, without gradients.
 
         Raises:
-            ValueError, BackendError: As for `rasterize_splats`; the static layer stays unchanged.
+            ValueError: As for `rasterize_splats`; the static layer stays unchanged.
         """
-        rasterizer.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
-        backends.choose_backend("cpu", means)
+        checks.check_splats(means, quats, scales, opacities, channels, self._camera, None, labels)
         expected = self._channels.shape[1]
         if channels.shape[1] != expected:
-            raise ValueError(f"channels: expected {expected} as in the backdrop, got {channels.shape[1]}")
+            raise ValueError(f"channels: expected {expected} as in the static layer, got {channels.shape[1]}")
         if (labels is None) != (self._labels is None):
             raise ValueError("labels: expected for static and moving Gaussians, or for neither")
-        numbers = None if labels is None else cpu_backend.to_numbers(labels)
-        shapes = [cpu_backend.to_array(t) for t in (means, quats, scales, opacities)]
+        numbers = None if labels is None else forward.to_numbers(to_array(labels))
+        shapes = [to_array(t) for t in (means, quats, scales, opacities)]
         with self._lock:
-            self._place(
-                shapes, cpu_backend.to_array(channels), numbers, np.arange(len(means)) if ranks is None else ranks
-            )
+            self._place(shapes, to_array(channels), numbers, np.arange(len(means)) if ranks is None else ranks)
             moving_starts, moving_rows = self._assign(self._count, self._end)
             touched = np.flatnonzero(np.diff(moving_starts))
             starts, merged = self._merge(touched, moving_starts, moving_rows)
@@ -132,14 +129,14 @@ class Backdrop:
         if self._end > len(self._geometry):
             self._make_room()
         part = slice(begin, self._end)
-        cpu_backend.project(
+        forward.project(
             self._view, shapes, self._geometry[part], self._depths[part], self._boxes[part], self._radii[part]
         )  # fmt: skip
         self._channels[begin : begin + n] = channels
         self._ranks[begin : begin + n] = ranks
         if self._labels is not None and not np.array_equal(self._labels[begin : begin + n], numbers):
             self._labels[begin : begin + n] = numbers
-            self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+            self._names, self._votes = forward.pack_labels(self._labels)
 
     def _make_room(self) -> None:
         """Enlarge the tables to ``self._end`` rows."""
@@ -149,7 +146,7 @@ class Backdrop:
             result[: self._count] = table[: self._count]
             return result
 
-        geometry = cpu_backend.aligned((self._end, projection.GEOMETRY), np.float64)
+        geometry = forward.aligned((self._end, projection.GEOMETRY), np.float64)
         geometry[: self._count] = self._geometry[: self._count]
         self._geometry = geometry
         self._depths, self._boxes = longer(self._depths, 1.0), longer(self._boxes, 0.0)
@@ -157,7 +154,7 @@ class Backdrop:
         self._ranks = longer(self._ranks, 0)
         if self._labels is not None:
             self._labels = longer(self._labels, -1)
-            self._names, self._votes = cpu_backend.pack_labels(_tensor(self._labels))
+            self._names, self._votes = forward.pack_labels(self._labels)
 
     def _assign(self, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
         """Assign rows to tiles: start of each tile's pairs, and row of each pair."""
@@ -188,7 +185,3 @@ class Backdrop:
             self._background, self._limits, image, alpha, depth, _NOTHING, _NOTHING, ids,
             np.empty(len(tiles), np.int64), np.empty(len(rows), np.uint64),
         )  # fmt: skip
-
-
-def _tensor(numbers: np.ndarray | None) -> torch.Tensor | None:
-    return None if numbers is None else torch.from_numpy(numbers)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from r5dgs_core.raster import RasterSettings, rasterize_splats
-from r5dgs_core.render.static_layer import Backdrop
+from r5dgs_core.raster.cpu.static_layer import StaticLayer
 from tests.support.splats import camera, splats
 
 
@@ -34,7 +34,7 @@ def test_a_body_that_flies_through_is_drawn_as_if_all_were_drawn_together(n_chan
     body = single(splats(203, n_channels, seed=2, radius_px=9.0))
     body[0] = 0.2 * body[0]
     labels, own = torch.randint(-1, 4, (3000,)), torch.full((203,), 40)
-    backdrop = Backdrop(*still, view, behind, labels=labels)
+    backdrop = StaticLayer(*still, view, behind, labels=labels)
     untouched = False
     for offset in ([0.0, 0.0, 0.0], [0.4, -0.3, 0.9], [-0.5, 0.2, -0.9], [9.0, 0.0, 0.0], [0.0, 0.0, 0.1]):
         moving = [body[0] + torch.tensor(offset), *body[1:]]
@@ -49,12 +49,12 @@ def test_equal_depths_keep_still_gaussians_in_front():
     view = camera()
     still = single(splats(200, 3, seed=3, radius_px=12.0))
     moving = [still[0].clone(), *single(splats(200, 3, seed=4, radius_px=12.0))[1:]]
-    assert_equal(Backdrop(*still, view).draw(*moving), rasterize_splats(*joined(still, moving), view))
+    assert_equal(StaticLayer(*still, view).draw(*moving), rasterize_splats(*joined(still, moving), view))
 
 
 def test_any_number_may_move_from_frame_to_frame():
     view, still = camera(), single(splats(100, 3, seed=5))
-    backdrop = Backdrop(*still, view)
+    backdrop = StaticLayer(*still, view)
     for count in (5, 0, 700, 1, 64):
         moving = single(splats(count, 3, seed=count, radius_px=10.0))
         assert_equal(backdrop.draw(*moving), rasterize_splats(*joined(still, moving), view))
@@ -66,14 +66,14 @@ def test_ranks_decide_at_equal_depths():
     scene[0] = scene[0][:100].repeat(3, 1)
     rows = torch.randperm(300, generator=torch.Generator().manual_seed(0))
     still, moving = rows[:180].sort().values, rows[180:].sort().values
-    backdrop = Backdrop(*[t[still] for t in scene], view, ranks=still.numpy())
+    backdrop = StaticLayer(*[t[still] for t in scene], view, ranks=still.numpy())
     found = backdrop.draw(*[t[moving] for t in scene], ranks=moving.numpy())
     assert_equal(found, rasterize_splats(*scene, view))
 
 
 def test_a_backdrop_keeps_its_own_background():
     view, still, behind = camera(), single(splats(100, 3, seed=6)), torch.rand(40, 48, 3)
-    backdrop, moving = Backdrop(*still, view, behind), single(splats(30, 3, seed=7, radius_px=20.0))
+    backdrop, moving = StaticLayer(*still, view, behind), single(splats(30, 3, seed=7, radius_px=20.0))
     before = backdrop.draw(*moving)
     behind.zero_()
     assert_equal(backdrop.draw(*moving), before)
@@ -82,7 +82,7 @@ def test_a_backdrop_keeps_its_own_background():
 def test_a_refused_call_leaves_the_backdrop_as_it_was():
     view, still, moving = camera(), single(splats(100, 3, seed=6)), single(splats(9, 3, seed=7, radius_px=20.0))
     labels = torch.arange(100) % 4
-    backdrop = Backdrop(*still, view, labels=labels)
+    backdrop = StaticLayer(*still, view, labels=labels)
     good = torch.full((9,), 9)
     expected = backdrop.draw(*moving, labels=good)
     for _ in range(2):
@@ -93,7 +93,7 @@ def test_a_refused_call_leaves_the_backdrop_as_it_was():
 
 def test_several_threads_may_draw_on_one_backdrop():
     view, still = camera(150, 130, 160.0), single(splats(2000, 3, seed=1, radius_px=5.0))
-    backdrop = Backdrop(*still, view)
+    backdrop = StaticLayer(*still, view)
     bodies = [single(splats(50 + 40 * k, 3, seed=k, radius_px=9.0)) for k in range(4)]
     expected = [rasterize_splats(*joined(still, body), view) for body in bodies]
     with ThreadPoolExecutor(4) as pool:
@@ -104,7 +104,7 @@ def test_several_threads_may_draw_on_one_backdrop():
 
 def test_results_belong_to_the_caller():
     view, still = camera(), single(splats(100, 3, seed=6))
-    backdrop, moving = Backdrop(*still, view), single(splats(3, 3, seed=7))
+    backdrop, moving = StaticLayer(*still, view), single(splats(3, 3, seed=7))
     first = backdrop.draw(*moving)
     expected = first.image.clone()
     first.image.zero_()
@@ -114,17 +114,17 @@ def test_results_belong_to_the_caller():
 def test_settings_hold_for_both_parts():
     view, settings = camera(), RasterSettings(near_plane=2.9, alpha_min=0.05)
     still, moving = single(splats(300, 3, seed=8)), single(splats(50, 3, seed=9))
-    found = Backdrop(*still, view, settings=settings).draw(*moving)
+    found = StaticLayer(*still, view, settings=settings).draw(*moving)
     assert_equal(found, rasterize_splats(*joined(still, moving), view, settings=settings))
 
 
 def test_parts_that_do_not_fit_together_are_refused():
     view, still = camera(), single(splats(30, 3))
     with pytest.raises(ValueError, match="channels: expected 3"):
-        Backdrop(*still, view).draw(*single(splats(5, 4)))
+        StaticLayer(*still, view).draw(*single(splats(5, 4)))
     with pytest.raises(ValueError, match="labels"):
-        Backdrop(*still, view, labels=torch.zeros(30, dtype=torch.int64)).draw(*single(splats(5, 3)))
+        StaticLayer(*still, view, labels=torch.zeros(30, dtype=torch.int64)).draw(*single(splats(5, 3)))
     moving = single(splats(5, 3))
     moving[0][2, 1] = np.nan
     with pytest.raises(ValueError, match=r"means.*\(2, 1\)"):
-        Backdrop(*still, view).draw(*moving)
+        StaticLayer(*still, view).draw(*moving)
