@@ -116,7 +116,7 @@ def frozen(scene: Scene, shading: bool, shadows: bool) -> tuple[Scene, Move]:
     """The scene with shading, shadows or both as they are at t_max, for times past it."""
     still = scene
     if shading and scene.shading is not None:
-        still = dataclasses.replace(scene, shading=np.zeros_like(scene.shading))
+        still = scene.with_arrays(shading=np.zeros_like(scene.shading.vectors))
 
     def move(t: float) -> scene_player.Frame:
         quats, displacements = (array.copy() for array in scene_player.group_poses(still, t))

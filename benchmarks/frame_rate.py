@@ -29,7 +29,7 @@ from r5dgs_core.render import incremental_renderer, scene_renderer
 from r5dgs_core.render.scene_renderer import Instance
 from r5dgs_core.scene import row_runs
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject, Shading
 
 PLAIN = ("fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
 COLUMNS = ("kind", "share", "threads", "sh_degree", "sky_degree", *PLAIN, "fps_stage", "ms_stage")
@@ -102,8 +102,7 @@ def make_scene(
         world_convention="blender",
         cameras=(camera,),
         background_sh=(fade * random.normal(size=(16, 3)))[: (sky_degree + 1) ** 2].astype(np.float32),
-        shading=(0.2 * random.normal(size=(count, 3))).astype(np.float32),
-        light_direction=np.array([0.0, 0.0, 1.0]),
+        shading=Shading((0.2 * random.normal(size=(count, 3))).astype(np.float32), np.array([0.0, 0.0, 1.0])),
     )
 
 

@@ -17,7 +17,6 @@ networks' median over the row's.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import statistics
 import time
@@ -31,7 +30,7 @@ import torch
 from r5dgs_core.model import deformation, trd
 from r5dgs_core.motion import models, point_dynamics, rotations, se3
 from r5dgs_core.playback import group_dynamics, scene_player
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import Dynamics, MotionGroup, Scene, SceneObject, Shading
 
 T_MAX = 0.75
 KNOTS = 16
@@ -84,10 +83,8 @@ def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int 
         world_convention="blender",
         cameras=(),
         background_sh=np.zeros((1, 3), np.float32),
-        dynamics=own.astype(np.float32),
-        canonical_means=means + np.float32(0.01),
-        shading=rng.normal(scale=0.2, size=(count, 3)).astype(np.float32),
-        light_direction=np.array([0.0, 0.0, 1.0]),
+        dynamics=Dynamics(own.astype(np.float32), means + np.float32(0.01)),
+        shading=Shading(rng.normal(scale=0.2, size=(count, 3)).astype(np.float32), np.array([0.0, 0.0, 1.0])),
     )
 
 
@@ -96,8 +93,7 @@ def bending(scene: Scene) -> Scene:
     shape, rng = (len(scene.means), len(scene.track_times), 3), np.random.default_rng(1)
     fade = (T_MAX - scene.track_times)[:, None]
     turns = rotations.rotvecs_to_quats(rng.normal(scale=0.3, size=shape) * fade)
-    return dataclasses.replace(
-        scene,
+    return scene.with_arrays(
         residual_rows=np.arange(len(scene.means), dtype=np.int32),
         residual_offsets=(rng.normal(scale=0.05, size=shape) * fade).astype(np.float32),
         residual_quats=turns.astype(np.float32),

@@ -117,8 +117,8 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))
         if too_fast:
             self.report({"WARNING"}, too_fast)
-        if scene.residual_rows is not None:  # anchors only hold one transform per group
-            count = len(scene.residual_rows)
+        if scene.residuals is not None:  # anchors only hold one transform per group
+            count = len(scene.residuals.rows)
             self.report(
                 {"WARNING"}, f"{plural.of(count, 'Gaussian', 'bend')} while observed; here groups move as wholes"
             )

@@ -105,8 +105,8 @@ def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list
     animated = [member.cloud.name for member in members if len(member.keys) > 1]
     if animated:
         notes.append(f"{', '.join(animated)}: points that modifiers animate are written as they are at t_max")
-    lost = [name for name in ("dynamics", "canonical_means") if getattr(extended, name) is None]
-    notes += [f"'{name}' of edited points is left out" for name in lost if getattr(source, name) is not None]
+    lost = [name for name in ("dynamics", "canonical_means") if name not in extended.arrays()]
+    notes += [f"'{name}' of edited points is left out" for name in lost if name in source.arrays()]
     return notes
 
 

@@ -28,7 +28,7 @@ from ..motion import rotations
 from ..motion.models import MotionModel
 from ..playback import residuals, visibility
 from ..scene import scene_file, sh_color
-from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
+from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject, Shading
 from ..train import checkpoint, checkpoint_content, observed_motion, probe, train_views
 from ..train.identity import label_cleanup, packed_masks
 from ..train.normalization import Normalization
@@ -72,21 +72,22 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     rows = bound.rows
     order = np.lexsort((cloud.motion_ids, cloud.object_ids))
     used_background = _background(tensors["background"].numpy(), wanted.sky_gradient)
-    single: dict[str, Any] = {}
+    bends, own = None, None
     if motion.points is not None and wanted.tracks != "off":
         extent = float(np.ptp(np.quantile(cloud.means, [0.01, 0.99], axis=0), axis=0).max())
         # Relative to the trained poses, so that motion that the user switched off does not return as residuals.
-        single = point_motion.members(motion.points, norm, cloud.motion_ids, bound.trained, bound.pivots, order, extent)
+        bends, own = point_motion.members(
+            motion.points, norm, cloud.motion_ids, bound.trained, bound.pivots, order, extent
+        )
     bent = (0.0, 0.0, False, "nothing moves")
     if state.representation != representation.STILL:
         from ..train.representations import residual
 
-        bent = residual.need(tensors, dataset.object_names, run.config, "residual_rows" in single)
+        bent = residual.need(tensors, dataset.object_names, run.config, bends is not None)
     if not bent[2] or wanted.residuals == "off":
-        single = {name: value for name, value in single.items() if not name.startswith("residual_")}
-    elif "residual_rows" in single:
-        stored = single["residual_rows"], single["residual_offsets"]
-        rows = point_motion.departures(rows, cloud.motion_ids[order], *stored)
+        bends = None
+    elif bends is not None:
+        rows = point_motion.departures(rows, cloud.motion_ids[order], bends)
     shaded = bool(run.config.train.shading) and wanted.shading != "off"
     rank = np.argsort(order)
     rows = [
@@ -111,9 +112,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         world_convention=dataset.world_convention,
         cameras=dataset.cameras,
         background_sh=used_background.astype(np.float32),
-        shading=cloud.shading[order].astype(np.float32) if shaded else None,
-        shading_rest=cloud.rest[order].astype(np.float32) if shaded and (cloud.rest != 1).any() else None,
-        light_direction=light if shaded else None,
+        shading=_shading(cloud, order, light) if shaded else None,
         provenance={
             "config": run.config.to_dict(),
             "dataset_digest": run.digest,
@@ -128,7 +127,8 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         },
         near_plane=NEAR_PLANE * norm.scale,
         origin=dataset.origin,
-        **single,
+        residuals=bends,
+        dynamics=own,
     )
     observed = np.stack([group.observed for group in motion.groups])
     trained = scene
@@ -149,10 +149,9 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     )
     scene = dataclasses.replace(scene, needs=(*decisions, *simplified.rows))
     if not needs.is_on(decisions, "shading"):
-        scene = dataclasses.replace(scene, shading=None, shading_rest=None, light_direction=None)
+        scene = dataclasses.replace(scene, shading=None)
     if cloud.identities is not None and needs.is_on(decisions, "classifier"):
-        scene = dataclasses.replace(
-            scene,
+        scene = scene.with_arrays(
             identities=cloud.identities[order].astype(np.float16),
             classifier_weight=tensors["classifier.weight"].numpy(),
             classifier_bias=tensors["classifier.bias"].numpy(),
@@ -166,6 +165,11 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
         return scene
     counts = dataclasses.asdict(motion.moves) | {"unexplained": len(residuals.unexplained(scene))}
     return dataclasses.replace(scene, provenance=scene.provenance | {"regrouping": counts})
+
+
+def _shading(cloud: _Cloud, order: np.ndarray, light: np.ndarray) -> Shading:
+    rest = cloud.rest[order].astype(np.float32) if (cloud.rest != 1).any() else None
+    return Shading(cloud.shading[order].astype(np.float32), light, rest)
 
 
 def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.ImageEvidence | None:

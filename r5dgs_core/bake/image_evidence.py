@@ -110,7 +110,7 @@ class ImageEvidence:
         return _support(scores, information, pixels, changed)
 
     def _with(self, poses: np.ndarray) -> Scene:
-        return dataclasses.replace(self._scene, track_poses=poses)
+        return self._scene.with_arrays(track_poses=poses)
 
     def _octants(self, group: int) -> np.ndarray:
         """Return the patch of each Gaussian: its octant about the pivot; `PATCHES` in other groups. [N] int32"""

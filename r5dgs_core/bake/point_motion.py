@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from ..motion import rotations
-from ..scene.scene import MotionGroup
+from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
 from ..train.observed_motion import PointMotion
 
@@ -29,8 +28,8 @@ def members(
     pivots: np.ndarray,
     order: np.ndarray,
     extent: float,
-) -> dict[str, Any]:
-    """Return the fields of `Scene` that store the motion of single Gaussians.
+) -> tuple[Residuals | None, Dynamics | None]:
+    """Return the motion of single Gaussians, each part None if the scene does not need it.
 
     Args:
         points: States at the knots, training coordinates.
@@ -40,17 +39,15 @@ def members(
         pivots: Pivots of the groups, world. [G, 3]
         order: Training row of each row of the scene. [N]
         extent: Size of the scene, world units.
-
-    Returns:
-        ``residual_rows``, ``residual_offsets``, ``residual_quats``, ``residual_log_scales``, ``dynamics`` and
-        ``canonical_means``; fields that the scene does not need are missing.
     """
-    result: dict[str, Any] = {}
+    dynamics = None
     if points.dynamics is not None and np.any(points.dynamics):
         linear = np.repeat([norm.scale, 1.0, norm.scale, 1.0], 3)
-        result["dynamics"] = (points.dynamics * linear)[order].astype(np.float32)
-        if points.canonical is not None:
-            result["canonical_means"] = norm.points_to_world(points.canonical)[order].astype(np.float32)
+        canonical = points.canonical
+        dynamics = Dynamics(
+            rates=(points.dynamics * linear)[order].astype(np.float32),
+            canonical_means=None if canonical is None else norm.points_to_world(canonical)[order].astype(np.float32),
+        )
     rank = np.argsort(order)[points.rows]
     parts = []
     for chosen in np.array_split(np.argsort(rank), max(1, -(-len(rank) // AT_ONCE))):  # in the scene's order
@@ -61,9 +58,8 @@ def members(
         seen |= rotations.angle_between(turns, turns[:, -1:]).max(1, initial=0.0) > VISIBLE
         stored = (offsets[seen], turns[seen], growths[seen])
         parts.append((rank[chosen[seen]].astype(np.int32), *(part.astype(np.float32) for part in stored)))
-    names = ("residual_rows", "residual_offsets", "residual_quats", "residual_log_scales")
-    found = {name: np.concatenate(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
-    return result | found if len(found["residual_rows"]) else result
+    residuals = Residuals(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return residuals if len(residuals.rows) else None, dynamics
 
 
 def _relative(
@@ -89,20 +85,17 @@ def _relative(
     return offsets, np.moveaxis(rotations.make_continuous(backwards), 0, 1)[:, ::-1], growths
 
 
-def departures(
-    groups: Sequence[MotionGroup], motion_ids: np.ndarray, rows: np.ndarray, offsets: np.ndarray
-) -> list[MotionGroup]:
+def departures(groups: Sequence[MotionGroup], motion_ids: np.ndarray, residuals: Residuals) -> list[MotionGroup]:
     """Return the groups with the deviations of their members from rigid motion in the observed time (rms and maximum).
 
     Args:
         groups: Motion groups.
         motion_ids: Group of each Gaussian of the scene. [N]
-        rows: Gaussians with residuals. [R]
-        offsets: Their residual offsets. [R, S, 3]
+        residuals: Residuals of some of them.
     """
-    squares, result = (offsets.astype(np.float64) ** 2).sum(-1), []
+    squares, result = (residuals.offsets.astype(np.float64) ** 2).sum(-1), []
     for group in groups:
-        mine = squares[motion_ids[rows] == group.id]
+        mine = squares[motion_ids[residuals.rows] == group.id]
         count = max(1, int((motion_ids == group.id).sum()) * squares.shape[1])
         rms, largest = float(np.sqrt(mine.sum() / count)), float(np.sqrt(mine.max(initial=0.0)))
         result.append(dataclasses.replace(group, rigid_rms=rms, rigid_max=largest))

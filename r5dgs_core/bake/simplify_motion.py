@@ -246,8 +246,7 @@ def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
     """Return the scene with other poses [G, S, 7], in the bind state of each group's last pose."""
     if np.array_equal(poses, scene.track_poses):
         return scene
-    arrays = {name: getattr(scene, name) for name in _BOUND}
-    arrays = {name: array.copy() for name, array in arrays.items() if array is not None}
+    arrays = {name: array.copy() for name, array in scene.arrays().items() if name in _BOUND}
     if "shading" in arrays:
         arrays.setdefault("shading_rest", np.ones(len(scene.means), np.float32))
     groups, poses = list(scene.groups), poses.copy()
@@ -263,9 +262,9 @@ def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
         if np.any(q[1:] != 0) or np.any(d != 0):
             _bind(scene, arrays, np.flatnonzero(scene.motion_ids == g.id), g.pivot, q, d)
             groups[g.id] = dataclasses.replace(g, pivot=g.pivot + d)
-    if "shading_rest" in arrays and scene.shading_rest is None and (arrays["shading_rest"] == 1).all():
+    if scene.shading is not None and scene.shading.rest is None and (arrays["shading_rest"] == 1).all():
         del arrays["shading_rest"]
-    return dataclasses.replace(scene, track_poses=poses, groups=tuple(groups), **arrays)
+    return dataclasses.replace(scene.with_arrays(track_poses=poses, **arrays), groups=tuple(groups))
 
 
 _BOUND = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")
@@ -281,14 +280,14 @@ def _bind(
         return
     arrays["quats"][rows] = rotations.normalize(rotations.multiply(q, arrays["quats"][rows].astype(np.float64)))
     sh = sh_color.rotate(arrays["sh"][rows].astype(np.float64), q)
-    if "shading" in arrays and scene.light_direction is not None:
+    if scene.shading is not None:
         vectors, rest = (arrays[name][rows].astype(np.float64) for name in ("shading", "shading_rest"))
         sh, arrays["shading"][rows], arrays["shading_rest"][rows] = shading.rebind(
-            sh, vectors, rest, q, scene.light_direction
+            sh, vectors, rest, q, scene.shading.light
         )
     arrays["sh"][rows] = sh
-    if scene.residual_rows is not None:
-        own = np.isin(scene.residual_rows, rows)
+    if scene.residuals is not None:
+        own = np.isin(scene.residuals.rows, rows)
         arrays["residual_offsets"][own] = rotations.rotate(q, arrays["residual_offsets"][own].astype(np.float64))
         turns = rotations.multiply(q, arrays["residual_quats"][own].astype(np.float64))
         arrays["residual_quats"][own] = rotations.normalize(rotations.multiply(turns, rotations.conjugate(q)))

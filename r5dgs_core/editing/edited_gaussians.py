@@ -29,10 +29,11 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
     ordered = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
     ordered.sort(key=lambda entry: entry[:3])
     last, kept, untouched = len(scene.track_times) - 1, [], True
+    old = scene.arrays()
     names = ("means", "quats", "log_scales", "sh", "shading", "shading_rest")
-    columns: dict[str, list[np.ndarray]] = {name: [getattr(scene, name)[:0]] for name in names if _has(scene, name)}
-    if scene.shading is not None and scene.shading_rest is None:
-        columns["shading_rest"] = [np.empty(0, np.float32)]
+    columns = {name: [old[name][:0]] for name in names if name in old}
+    if scene.shading is not None:
+        columns.setdefault("shading_rest", [np.empty(0, np.float32)])
     residuals: list[tuple[np.ndarray, ...]] = []
     object_ids, motion_ids, filled = [], [], 0
     for object_id, motion_id, start, piece in ordered:
@@ -52,23 +53,19 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
         filled += piece.count
     order = np.concatenate([np.empty(0, np.int64), *kept])
     arrays: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
-    if scene.shading_rest is None and "shading_rest" in arrays and (arrays["shading_rest"] == 1).all():
+    if scene.shading is not None and scene.shading.rest is None and (arrays["shading_rest"] == 1).all():
         del arrays["shading_rest"]
     for name in ("opacity_logits", "identities", "dynamics", "canonical_means"):
-        if _has(scene, name):
-            arrays[name] = getattr(scene, name)[order]
+        if name in old:
+            arrays[name] = old[name][order]
     arrays["object_ids"] = np.concatenate([np.empty(0, np.int32), *object_ids])
     arrays["motion_ids"] = np.concatenate([np.empty(0, np.int32), *motion_ids])
-    if scene.residual_rows is not None:
+    if scene.residuals is not None:
         members = ("residual_rows", "residual_offsets", "residual_quats", "residual_log_scales")
         for number, name in enumerate(members):
-            whole = getattr(scene, name)
-            arrays[name] = np.concatenate([whole[:0], *(part[number] for part in residuals)]).astype(whole.dtype)
+            parts = (part[number] for part in residuals)
+            arrays[name] = np.concatenate([old[name][:0], *parts]).astype(old[name].dtype)
     return order, arrays, untouched
-
-
-def _has(scene: Scene, name: str) -> bool:
-    return getattr(scene, name) is not None
 
 
 def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
@@ -91,16 +88,16 @@ def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> d
     Returns:
         ``means quats log_scales sh``, and ``shading shading_rest`` if the scene has shading. [n, ...] each
     """
-    shading = None if scene.shading is None else scene.shading[rows]
+    shading = None if scene.shading is None else scene.shading.vectors[rows]
     rest = posing.rest_factors(scene)[rows]
     splats = affine_transform.bind_state(scene, rows)
     if bind is not None:
         splats = affine_transform.carry(splats, bind)
-        if shading is not None and scene.light_direction is not None:
+        if scene.shading is not None:
             turn = affine_transform.nearest_rotation(bind[:3, :3])
-            light = np.asarray(scene.light_direction, np.float64)
-            rest = (rest + shading @ posing.light_change(light, turn)).astype(np.float32)
-            shading = (shading @ turn.T).astype(np.float32)
+            light = np.asarray(scene.shading.light, np.float64)
+            rest = (rest + scene.shading.vectors[rows] @ posing.light_change(light, turn)).astype(np.float32)
+            shading = (scene.shading.vectors[rows] @ turn.T).astype(np.float32)
     values = {"means": splats.means, "quats": splats.quats, "log_scales": splats.log_scales, "sh": splats.sh}
     if shading is not None:
         values |= {"shading": shading, "shading_rest": rest}
@@ -109,15 +106,14 @@ def placed(scene: Scene, rows: slice | np.ndarray, bind: np.ndarray | None) -> d
 
 def _residuals(scene: Scene, rows: slice, shift: int, linear: np.ndarray | None) -> tuple[np.ndarray, ...]:
     """Residuals of rows of the file, rotated with the bind state: new rows, offsets, rotations, growths."""
-    if scene.residual_rows is None:
+    if scene.residuals is None:
         return ()
-    assert scene.residual_offsets is not None and scene.residual_quats is not None
-    assert scene.residual_log_scales is not None
-    inside = (scene.residual_rows >= rows.start) & (scene.residual_rows < rows.stop)
-    offsets, quats = scene.residual_offsets[inside], scene.residual_quats[inside]
+    found = scene.residuals
+    inside = (found.rows >= rows.start) & (found.rows < rows.stop)
+    offsets, quats = found.offsets[inside], found.quats[inside]
     if linear is not None:
         offsets, quats = turned_residuals(offsets, quats, linear)
-    return scene.residual_rows[inside] + shift, offsets, quats, scene.residual_log_scales[inside]
+    return found.rows[inside] + shift, offsets, quats, found.log_scales[inside]
 
 
 def turned_residuals(

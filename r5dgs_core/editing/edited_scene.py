@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from ..playback import group_dynamics
+from ..scene.lookup_table import Table
 from ..scene.scene import MotionGroup, Scene, SceneObject
 from . import edited_gaussians, edited_motion
 from .edited_motion import Moved, Piece
@@ -52,13 +52,16 @@ def edit(
             if arrays.get(name) is not None:
                 arrays[name] = None
                 notes.append(f"'{name}' of individual Gaussians are valid only for the unedited scene and are omitted")
+    by_object, lookup = _by_object(scene, objects, kept, arrays["object_ids"])
     result = replace(
-        scene,
-        **arrays,
-        track_poses=np.stack([cluster.poses for cluster in clusters]),
+        scene.with_arrays(
+            **arrays,
+            track_poses=np.stack([cluster.poses for cluster in clusters]),
+            **by_object,
+        ),
         objects=objects,
         groups=groups,
-        **_meanings(scene, objects, kept, arrays["object_ids"]),
+        lookup=lookup,
     )
     return _with_representatives(result), notes
 
@@ -118,9 +121,9 @@ def _groups(
     return tuple(groups)
 
 
-def _meanings(
+def _by_object(
     scene: Scene, objects: tuple[SceneObject, ...], kept: np.ndarray, object_ids: np.ndarray
-) -> dict[str, Any]:
+) -> tuple[dict[str, np.ndarray], Table | None]:
     """Rows of the classifier and the embeddings for the new objects; a new object inherits those of its source."""
     rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
     for item in objects:
@@ -129,15 +132,10 @@ def _meanings(
             rows[item.id] = rows.get(source, rows[0])
     offset = sum(item.id < 0 for item in scene.objects)
     named = [rows[item.id] - offset for item in objects if item.id >= 0]
-    weight, bias, embeddings = scene.classifier_weight, scene.classifier_bias, scene.embeddings
-    views, mine = scene.view_embeddings, [rows[item.id] for item in objects]
-    return {
-        "classifier_weight": None if weight is None else weight[named],
-        "classifier_bias": None if bias is None else bias[named],
-        "embeddings": None if embeddings is None else embeddings[mine],
-        "view_embeddings": None if views is None else views[mine],
-        "lookup": None if scene.lookup is None else scene.lookup.select(mine),
-    }
+    mine, old = [rows[item.id] for item in objects], scene.arrays()
+    chosen = {"classifier_weight": named, "classifier_bias": named, "embeddings": mine, "view_embeddings": mine}
+    lookup = None if scene.lookup is None else scene.lookup.select(mine)
+    return {name: old[name][at] for name, at in chosen.items() if name in old}, lookup
 
 
 def _with_representatives(scene: Scene) -> Scene:

@@ -199,10 +199,10 @@ def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray
     else:
         changed = means is not None
     if means is not None:
-        part = replace(part, means=np.ascontiguousarray(means, np.float32))
+        part = part.with_arrays(means=np.ascontiguousarray(means, np.float32))
     if shapes or changed:  # own motion was learned for the old centres
-        part = replace(part, dynamics=None, canonical_means=None)
-    return matrix, replace(part, **shapes, **looks) if shapes or looks or changed else None
+        part = replace(part, dynamics=None)
+    return matrix, part.with_arrays(**shapes, **looks) if shapes or looks or changed else None
 
 
 def _given_shapes(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
@@ -276,7 +276,7 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
             result = _moved(result, still, back)
         new = result.means.copy()
         new[outside] = means[outside] @ back[:3, :3].T + back[:3, 3]
-        result, changed = replace(result, means=new), True
+        result, changed = result.with_arrays(means=new), True
     return matrix, result if changed else None
 
 
@@ -292,18 +292,17 @@ def _copy_numbers(rows: np.ndarray) -> np.ndarray:
 
 def _moved(part: Scene, chosen: np.ndarray, matrix: np.ndarray) -> Scene:
     """Transform some points by an affine map. chosen [k]"""
-    arrays = {}
+    old, arrays = part.arrays(), {}
     for name, values in edited_gaussians.placed(part, chosen, matrix).items():
-        whole = getattr(part, name)
-        whole = np.ones(len(part.means), np.float32) if whole is None else whole.copy()
+        whole = old[name].copy() if name in old else np.ones(len(part.means), np.float32)
         whole[chosen] = values
         arrays[name] = whole
-    if part.residual_rows is not None and part.residual_offsets is not None and part.residual_quats is not None:
-        at = np.isin(part.residual_rows, chosen)
-        offsets, quats = part.residual_offsets.copy(), part.residual_quats.copy()
+    if part.residuals is not None:
+        at = np.isin(part.residuals.rows, chosen)
+        offsets, quats = part.residuals.offsets.copy(), part.residuals.quats.copy()
         offsets[at], quats[at] = edited_gaussians.turned_residuals(offsets[at], quats[at], matrix[:3, :3])
         arrays |= {"residual_offsets": offsets, "residual_quats": quats}
-    return replace(part, **arrays)
+    return part.with_arrays(**arrays)
 
 
 def _consecutive(rows: np.ndarray) -> bool:
@@ -312,31 +311,33 @@ def _consecutive(rows: np.ndarray) -> bool:
 
 def _selected(scene: Scene, rows: np.ndarray) -> Scene:
     """Scene of the given rows of another, which may repeat."""
-    names = [name for name in (*_PER_POINT, "shading_rest") if getattr(scene, name) is not None]
+    old = scene.arrays()
     chosen = slice(rows[0], rows[0] + len(rows)) if _consecutive(rows) else rows  # a slice does not copy
-    arrays = {name: getattr(scene, name)[chosen] for name in names}
-    if scene.residual_rows is not None:
-        place = np.minimum(np.searchsorted(scene.residual_rows, rows), max(len(scene.residual_rows) - 1, 0))
-        bending = np.flatnonzero(scene.residual_rows[place] == rows) if len(scene.residual_rows) else rows[:0]
+    arrays = {name: old[name][chosen] for name in (*_PER_POINT, "shading_rest") if name in old}
+    if scene.residuals is not None:
+        known = scene.residuals.rows
+        place = np.minimum(np.searchsorted(known, rows), max(len(known) - 1, 0))
+        bending = np.flatnonzero(known[place] == rows) if len(known) else rows[:0]
         arrays["residual_rows"] = bending.astype(np.int32)
         for name in _RESIDUALS:
-            arrays[name] = getattr(scene, name)[place[bending]]
-    return replace(scene, **arrays)
+            arrays[name] = old[name][place[bending]]
+    return scene.with_arrays(**arrays)
 
 
 def _appended(scene: Scene, parts: Sequence[Scene]) -> Scene:
     """Scene with the points of ``parts`` appended."""
-    every, arrays = [scene, *parts], {}
+    every: list[dict[str, np.ndarray]] = [one.arrays() for one in (scene, *parts)]
+    arrays: dict[str, np.ndarray | None] = {}
     for name in _PER_POINT:
-        columns = [getattr(one, name) for one in every]
-        arrays[name] = None if any(column is None for column in columns) else np.concatenate(columns)
-    if any(one.shading_rest is not None for one in every):
-        rests = (np.ones(len(one.means), np.float32) if one.shading_rest is None else one.shading_rest for one in every)
-        arrays["shading_rest"] = np.concatenate(list(rests))
-    if scene.residual_rows is not None:
-        starts = np.cumsum([0, *(len(one.means) for one in every)])
-        shifted = (one.residual_rows + start for one, start in zip(every, starts, strict=False))
+        whole = all(name in one for one in every)
+        arrays[name] = np.concatenate([one[name] for one in every]) if whole else None
+    if any("shading_rest" in one for one in every):
+        rests = [one.get("shading_rest", np.ones(len(one["means"]), np.float32)) for one in every]
+        arrays["shading_rest"] = np.concatenate(rests)
+    if scene.residuals is not None:
+        starts = np.cumsum([0, *(len(one["means"]) for one in every)])
+        shifted = (one["residual_rows"] + start for one, start in zip(every, starts, strict=False))
         arrays["residual_rows"] = np.concatenate(list(shifted)).astype(np.int32)
         for name in _RESIDUALS:
-            arrays[name] = np.concatenate([getattr(one, name) for one in every])
-    return replace(scene, **arrays)
+            arrays[name] = np.concatenate([one[name] for one in every])
+    return scene.with_arrays(**arrays)

@@ -72,7 +72,7 @@ def measure(scene: Scene, tau: float, rounds: int, clock: str = "wall") -> tuple
     rows = _of_groups(scene, groups, tau, rounds, clock) if groups else []
     if scene.dynamics is None:
         absent.append("dynamics of single Gaussians (mode standard): the scene holds none; a `field` run has them")
-    elif not (scene.dynamics != 0).any():
+    elif not (scene.dynamics.rates != 0).any():
         absent.append("dynamics of single Gaussians (mode standard): all Gaussians of the scene rest")
     else:
         rows += _of_points(scene, tau, rounds, clock)
@@ -216,7 +216,7 @@ def _point_errors(state: _State, truth: Poses, tau: float, steps: int) -> tuple[
 def _of_points(scene: Scene, tau: float, rounds: int, clock: str) -> list[Row]:
     """Return rows for single Gaussians with their own dynamics: TRACE's integrator and ours."""
     assert scene.dynamics is not None
-    moving = scene.dynamics[(scene.dynamics != 0).any(-1)].astype(np.float64)
+    moving = scene.dynamics.rates[(scene.dynamics.rates != 0).any(-1)].astype(np.float64)
     v, w, a, eps = np.split(moving, 4, axis=-1)
     fine_quats, fine = np.empty((len(moving), 4)), np.empty((len(moving), 3))
     for start in range(0, len(moving), POINTS_AT_ONCE):

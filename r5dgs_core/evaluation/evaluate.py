@@ -184,7 +184,7 @@ def draw(
     start = time.perf_counter()
     frame = move(t)
     moved = time.perf_counter()
-    classified = scene.identities is not None and scene.classifier_weight is not None
+    classified = scene.identities is not None and scene.classifier is not None
     output = scene_renderer.render_frame(
         scene, frame, camera, backend=backend, features=scene.identities if classified else None
     )
@@ -216,12 +216,12 @@ def classify(scene: Scene, features: np.ndarray) -> np.ndarray:
 
     Source: Gaussian Grouping (Ye et al. 2024), section 3.2.
     """
-    if scene.classifier_weight is None or scene.classifier_bias is None:
+    if scene.classifier is None:
         raise ValueError("the scene has no classifier")
     classes = np.array([item.id for item in scene.objects if item.id >= 0], np.int32)
-    if scene.classifier_weight.shape[0] != len(classes):
-        raise ValueError(f"expected {len(classes)} rows in classifier_weight, got {scene.classifier_weight.shape[0]}")
-    logits = features @ scene.classifier_weight.T.astype(np.float32) + scene.classifier_bias.astype(np.float32)
+    if scene.classifier.weight.shape[0] != len(classes):
+        raise ValueError(f"expected {len(classes)} rows in classifier_weight, got {scene.classifier.weight.shape[0]}")
+    logits = features @ scene.classifier.weight.T.astype(np.float32) + scene.classifier.bias.astype(np.float32)
     return classes[logits.argmax(axis=-1)]
 
 

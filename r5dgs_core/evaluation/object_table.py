@@ -122,13 +122,13 @@ def confidences(scene: Scene) -> dict[int, float]:
     Returns:
         Probability by object id, for objects with members; empty if the scene stores no encodings or no classifier.
     """
-    if scene.identities is None or scene.classifier_weight is None or scene.classifier_bias is None:
+    if scene.identities is None or scene.classifier is None:
         return {}
     opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
     found = {}
     for k, item in enumerate(item for item in scene.objects if item.id >= 0):
         rows = slice(item.start, item.start + item.count)
-        answers = scene.identities[rows].astype(np.float64) @ scene.classifier_weight.T + scene.classifier_bias
+        answers = scene.identities[rows].astype(np.float64) @ scene.classifier.weight.T + scene.classifier.bias
         answers -= answers.max(axis=1, keepdims=True, initial=-np.inf)
         shares = np.exp(answers)
         total = float(opacities[rows].sum())

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..motion import models, rotations
 from ..scene import scene
-from ..scene.scene import MotionGroup, Scene, SceneObject
+from ..scene.scene import Classifier, Dynamics, MotionGroup, Residuals, Scene, SceneObject
 from .foreign_run import Foreign, State
 
 CHUNK = 16384  # rows per evaluation at all knots; bounds the memory
@@ -103,21 +103,21 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
             background_sh, provenance.
     """
     splats = foreign.splats
-    labels, weight, bias = classify(foreign)
+    labels, classifier = classify(foreign)
     order = np.argsort(labels, kind="stable")
     means, quats, log_scales = splats.means, splats.quats, splats.log_scales
     if motion is not None:
         means, quats, log_scales = motion.bind.means, motion.bind.quats, motion.bind.log_scales
     ranks = np.argsort(order)
     moved = None if motion is None or len(motion.rows) == 0 else np.argsort(ranks[motion.rows])
-    residuals = {}
+    residuals = None
     if motion is not None and moved is not None:
-        residuals = {
-            "residual_rows": ranks[motion.rows][moved].astype(np.int32),
-            "residual_offsets": motion.offsets[moved],
-            "residual_quats": motion.turns[moved],
-            "residual_log_scales": motion.growths[moved],
-        }
+        residuals = Residuals(
+            rows=ranks[motion.rows][moved].astype(np.int32),
+            offsets=motion.offsets[moved],
+            quats=motion.turns[moved],
+            log_scales=motion.growths[moved],
+        )
     identities = splats.identities
     if identities is not None and identities.shape[1] != scene.IDENTITY_DIM:
         identities = None
@@ -136,31 +136,30 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
         groups=(group,),
         t_max=float(times[-1]),
         identities=None if identities is None else identities[order].astype(np.float16),
-        classifier_weight=weight,
-        classifier_bias=bias,
-        dynamics=None if motion is None or motion.dynamics is None else motion.dynamics[order],
+        classifier=classifier,
+        residuals=residuals,
+        dynamics=None if motion is None or motion.dynamics is None else Dynamics(motion.dynamics[order]),
         near_plane=foreign.near_plane,
         harmonics_turn=False,
-        **residuals,
         **rest,
     )
 
 
-def classify(foreign: Foreign) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+def classify(foreign: Foreign) -> tuple[np.ndarray, Classifier | None]:
     """Assign each Gaussian to the class with its highest score, and reduce the classifier to the classes that occur.
 
     Returns:
-        Object ids [N] int32, all 0 without a classifier; weight [M + 1, 16] and bias [M + 1] float32 or None.
+        Object ids [N] int32, all 0 without a classifier; and the classifier of the M + 1 classes, or None.
 
     Source: Gaussian Grouping, whose class 0 is the unmasked background.
     """
     identities = foreign.splats.identities
     if foreign.classifier is None or identities is None:
-        return np.zeros(len(foreign.splats.means), np.int32), None, None
+        return np.zeros(len(foreign.splats.means), np.int32), None
     weight, bias = foreign.classifier
     labels = (identities @ weight.T + bias).argmax(-1).astype(np.int32)
     present = np.union1d(labels, [0])
-    return labels, weight[present].astype(np.float32), bias[present].astype(np.float32)
+    return labels, Classifier(weight[present].astype(np.float32), bias[present].astype(np.float32))
 
 
 def _objects(labels: np.ndarray) -> tuple[SceneObject, ...]:

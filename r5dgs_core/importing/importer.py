@@ -134,10 +134,8 @@ def _among_cameras(scene: Scene, folder: Path) -> Scene:
         np.spacing(np.float32(np.abs(origin).max())),
     )
     return dataclasses.replace(
-        scene,
-        means=(scene.means.astype(np.float64) - origin).astype(np.float32),
+        scene.with_arrays(means=(scene.means.astype(np.float64) - origin).astype(np.float32), origin=origin),
         cameras=tuple(cameras.moved(camera, -origin) for camera in scene.cameras),
-        origin=origin,
     )
 
 

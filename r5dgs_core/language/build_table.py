@@ -192,13 +192,14 @@ def _assembled(
         pooling="mean" if encoder.card.sees else "max",
     )
     return replace(
-        scene,
-        embeddings=embeddings,
+        scene.with_arrays(
+            embeddings=embeddings,
+            vocabulary_embeddings=words,
+            canonical_embeddings=_packed(encoder_base.embed_phrases(encoder, encoder_base.CANONICAL)),
+            view_embeddings=views,
+        ),
         vocabulary=vocabulary,
-        vocabulary_embeddings=words,
         lookup=table,
-        canonical_embeddings=_packed(encoder_base.embed_phrases(encoder, encoder_base.CANONICAL)),
-        view_embeddings=views,
     )
 
 

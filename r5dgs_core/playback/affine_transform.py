@@ -144,12 +144,12 @@ def _bent(scene: Scene, start: int, splats: Splats, bend: Bend) -> Splats:
 
 def _relight(scene: Scene, start: int, factor: np.ndarray | None, turn: np.ndarray, bend: Bend) -> None:
     """Write shading factors of deviating Gaussians, then rotated by ``turn``. factor [n, 1], turn [3, 3]"""
-    if factor is None or scene.shading is None or scene.light_direction is None:
+    if factor is None or scene.shading is None:
         return
-    light = np.asarray(scene.light_direction, np.float64)
+    light = np.asarray(scene.shading.light, np.float64)
     turns = turn @ rotations.quats_to_rotmats(bend.turns)
     factor[bend.rows - start, 0] = posing.lit(
-        posing.rest_factors(scene)[bend.rows], scene.shading[bend.rows], light, turns
+        posing.rest_factors(scene)[bend.rows], scene.shading.vectors[bend.rows], light, turns
     )
 
 
@@ -226,7 +226,7 @@ def map_shapes(
 
 def shading_factors(scene: Scene, rows: slice, rotation: np.ndarray) -> np.ndarray | None:
     """Colour factors of rows rotated since the bind state, or None without shading. [3, 3] -> [n, 1]"""
-    if scene.shading is None or scene.light_direction is None:
+    if scene.shading is None:
         return None
-    light = np.asarray(scene.light_direction, np.float64)
-    return posing.lit(posing.rest_factors(scene)[rows], scene.shading[rows], light, rotation)[:, None]
+    light = np.asarray(scene.shading.light, np.float64)
+    return posing.lit(posing.rest_factors(scene)[rows], scene.shading.vectors[rows], light, rotation)[:, None]

@@ -150,7 +150,7 @@ def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
     if source == "representative":
         rows, weights = (np.array([group.anchor_index]), np.ones(1)) if group.anchor_index >= 0 else (rows, weights)
     arms = scene.means[rows].astype(np.float64) - group.pivot
-    states = scene.dynamics[rows].astype(np.float64)
+    states = scene.dynamics.rates[rows].astype(np.float64)
     radius = max(float(np.quantile(np.linalg.norm(arms, axis=-1), 0.98)), 1e-9 * scene.extent)
     if not states.any():
         return MotionModel(radius=radius)

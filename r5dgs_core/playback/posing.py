@@ -24,7 +24,6 @@ class Poser:
         self._scene = scene
         self._runs = runs(scene.motion_ids)
         self.pivots = np.array([group.pivot for group in scene.groups], np.float64).reshape(-1, 3)
-        self._shaded = scene.shading is not None and scene.light_direction is not None
         self._rest = rest_factors(scene)
         self._arms: np.ndarray | None = None
         self._still: tuple[np.ndarray, np.ndarray] | None = None
@@ -90,9 +89,9 @@ class Poser:
 
     def shading(self, group_quats: np.ndarray) -> np.ndarray | None:
         """Colour factor of each Gaussian with each group rotated, or None without shading. [G, 4] -> [N] float32"""
-        vectors, light = self._scene.shading, self._scene.light_direction
-        if not self._shaded or vectors is None or light is None:
+        if self._scene.shading is None:
             return None
+        vectors, light = self._scene.shading.vectors, self._scene.shading.light
         result = np.maximum(self._rest, 0)
         change = (rotations.rotate(rotations.conjugate(group_quats), light) - light).astype(np.float32)
         for start, stop, g in self._runs:
@@ -108,9 +107,9 @@ class Poser:
             rows: Rows of the Gaussians. [R]
             turns: Their rotations since t_max, unit wxyz, by column. [4, R]
         """
-        vectors, light = self._scene.shading, self._scene.light_direction
-        if factors is None or vectors is None or light is None:
+        if factors is None or self._scene.shading is None:
             return
+        vectors, light = self._scene.shading.vectors, self._scene.shading.light
         lit = self._rest[rows] + (
             vectors[rows].T * quaternion_columns.direction_changes(turns, light.astype(turns.dtype))
         ).sum(0)
@@ -134,7 +133,7 @@ class Poser:
 
 def rest_factors(scene: Scene) -> np.ndarray:
     """Colour factor of each Gaussian in the bind state, before clamping at 0. [N] float32"""
-    rest = scene.shading_rest
+    rest = None if scene.shading is None else scene.shading.rest
     return np.ones(len(scene.means), np.float32) if rest is None else rest
 
 

@@ -31,12 +31,11 @@ class Residuals:
     """
 
     def __init__(self, scene: Scene):
-        parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
-        rows = scene.residual_rows
-        there = rows is not None and len(rows) > 0 and all(part is not None for part in parts)
-        self.rows = np.asarray(rows, np.int64) if there and rows is not None else np.zeros(0, np.int64)
+        found = scene.residuals
+        self.rows = np.zeros(0, np.int64) if found is None else np.asarray(found.rows, np.int64)
+        parts = () if found is None else (found.offsets, found.quats, found.log_scales)
         # [C, S, R]: the values of one knot are contiguous.
-        self._parts = [np.ascontiguousarray(part.transpose(2, 1, 0)) for part in parts if there and part is not None]
+        self._parts = [np.ascontiguousarray(part.transpose(2, 1, 0)) for part in parts]
         self.runs = runs(scene.motion_ids[self.rows])
         self.bind_quats = np.ascontiguousarray(scene.quats[self.rows].T)
         self._times, self._t_max = scene.track_times, scene.t_max
@@ -86,9 +85,9 @@ def unexplained(scene: Scene) -> np.ndarray:
     Their root mean square offset over the knots exceeds `UNEXPLAINED` radii of their group. In a pinned group any
     residual suffices.
     """
-    rows, offsets = scene.residual_rows, scene.residual_offsets
-    if rows is None or offsets is None or len(rows) == 0:
+    if scene.residuals is None or len(scene.residuals.rows) == 0:
         return np.zeros(0, np.int64)
+    rows, offsets = scene.residuals.rows, scene.residuals.offsets
     limits = np.array([0.0 if g.role == "pinned" else UNEXPLAINED * g.model.radius for g in scene.groups])
     away = np.sqrt(np.einsum("rsc,rsc->r", offsets, offsets, dtype=np.float64) / offsets.shape[1])
     return rows[away > limits[scene.motion_ids[rows]]].astype(np.int64)
@@ -107,7 +106,7 @@ class OwnMotion:
         chosen = np.arange(len(scene.means)) if rows is None else rows
         tolerance = TOLERANCE * scene.extent
         self._propagator = twist_propagation.Propagator(
-            scene.dynamics[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE
+            scene.dynamics.rates[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE
         )
         moving = self._propagator.rows
         # If only some rows move on their own, resting ones are listed too, so that their group does not move them.
@@ -141,17 +140,17 @@ class Literal:
     """
 
     def __init__(self, scene: Scene, anchored: bool = False):
-        assert scene.dynamics is not None and scene.canonical_means is not None
+        assert scene.dynamics is not None and scene.dynamics.canonical_means is not None
         anchors = np.array([g.anchor_index if g.role == "body" else -1 for g in scene.groups])
         loose = np.flatnonzero(np.isin(scene.motion_ids, [g.id for g in scene.groups if g.role != "body"]))
         if anchored and len(loose):
             anchors[[g.role != "body" for g in scene.groups]] = group_dynamics.representative(scene, loose)
         self._moving = np.flatnonzero(anchors >= 0)
         self._anchors = anchors[self._moving]
-        v, w, a, e = np.split(scene.dynamics[self._anchors].astype(np.float64), 4, axis=-1)
+        v, w, a, e = np.split(scene.dynamics.rates[self._anchors].astype(np.float64), 4, axis=-1)
         step = point_dynamics.TRACE_STEP * point_dynamics.time_unit(float(scene.track_times[0]), scene.t_max)
         self._path = rk2_cache.SteppedPath(np.zeros_like(v), v, w, a, e, step)
-        canonical = scene.canonical_means.astype(np.float64)
+        canonical = scene.dynamics.canonical_means.astype(np.float64)
         self._offsets = np.ones((len(canonical), 4))
         self._offsets[:, :3] = canonical - canonical[np.maximum(anchors, 0)[scene.motion_ids]]
         self._count = len(scene.groups)

@@ -39,7 +39,7 @@ def info(scene: Scene) -> dict[str, Any]:
         **({"origin": scene.origin.tolist()} if scene.origin.any() else {}),
         "identities": scene.identities is not None,
         "shading": scene.shading is not None,
-        "residuals": 0 if scene.residual_rows is None else len(scene.residual_rows),
+        "residuals": 0 if scene.residuals is None else len(scene.residuals.rows),
         "modes": list(scene_player.modes(scene)),
         "vocabulary": len(scene.vocabulary),
         "lookup": None if scene.lookup is None else f"{scene.lookup.encoder.kind} {scene.lookup.encoder.name}",

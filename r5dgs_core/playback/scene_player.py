@@ -87,7 +87,7 @@ def available(scene: Scene, mode: str) -> bool:
     """Return True if a scene has data for a mode. Raises ValueError if the mode is unknown."""
     base, variant = split(mode)
     if base == "rigid_paper":
-        return scene.dynamics is not None and scene.canonical_means is not None
+        return scene.dynamics is not None and scene.dynamics.canonical_means is not None
     return scene.dynamics is not None or (base == "rigid" and variant == "fitted")
 
 

@@ -75,7 +75,7 @@ class Gathered:
 
 def gather(scenes: Sequence[Scene]) -> Gathered:
     """Concatenate the Gaussians of scenes. A single scene is not copied."""
-    lit = [scene.shading is not None and scene.light_direction is not None for scene in scenes]
+    lit = any(scene.shading is not None for scene in scenes)
     bases = max((scene.sh.shape[1] for scene in scenes), default=1)
 
     def stacked(arrays: list[np.ndarray], shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
@@ -85,10 +85,7 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
         return sh if sh.shape[1] == bases else np.pad(sh, ((0, 0), (0, bases - sh.shape[1]), (0, 0)))
 
     def vectors(scene: Scene) -> np.ndarray:
-        return scene.shading if scene.shading is not None else np.zeros((len(scene.means), 3), np.float32)
-
-    def rest(scene: Scene, shaded: bool) -> np.ndarray:
-        return scene_player.rest_factors(scene) if shaded else np.ones(len(scene.means), np.float32)
+        return scene.shading.vectors if scene.shading is not None else np.zeros((len(scene.means), 3), np.float32)
 
     return Gathered(
         means=stacked([scene.means for scene in scenes], (3,)),
@@ -98,11 +95,10 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
         object_ids=stacked([scene.object_ids for scene in scenes], (), np.int32),
         sh=stacked([padded(scene.sh) for scene in scenes], (bases, 3)),
         starts=(0, *(int(stop) for stop in np.cumsum([len(scene.means) for scene in scenes]))),
-        shading=stacked([vectors(scene) for scene in scenes], (3,)) if any(lit) else None,
-        shading_rest=stacked([rest(*pair) for pair in zip(scenes, lit, strict=True)], ()) if any(lit) else None,
+        shading=stacked([vectors(scene) for scene in scenes], (3,)) if lit else None,
+        shading_rest=stacked([scene_player.rest_factors(scene) for scene in scenes], ()) if lit else None,
         lights=tuple(
-            np.asarray(scene.light_direction, np.float64) if shaded else None
-            for scene, shaded in zip(scenes, lit, strict=True)
+            None if scene.shading is None else np.asarray(scene.shading.light, np.float64) for scene in scenes
         ),
         residuals=tuple(functools.cache(functools.partial(Residuals, scene)) for scene in scenes),
         harmonics_turn=tuple(scene.harmonics_turn for scene in scenes),

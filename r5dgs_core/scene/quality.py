@@ -59,7 +59,7 @@ def of(scene: Scene, path: Path | None = None) -> Quality:
     squares = [count * group.rigid_rms**2 for count, group in zip(counts, scene.groups, strict=False)]
     measured = any(group.rigid_max > 0 for group in scene.groups)
     rms = float(np.sqrt(sum(squares) / max(counts.sum(), 1))) / scene.extent if measured else None
-    bending = 0 if scene.residual_rows is None else len(scene.residual_rows)
+    bending = 0 if scene.residuals is None else len(scene.residuals.rows)
     return Quality(_psnr(splits, "val"), _psnr(splits, "test"), rms, bending)
 
 

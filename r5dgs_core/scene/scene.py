@@ -7,7 +7,9 @@ d_g(t_max) = 0. A residual changes a Gaussian in the bind state before its group
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,6 +106,83 @@ class MotionGroup:
 
 
 @dataclass(frozen=True)
+class Classifier:
+    """Linear classifier of identity encodings; row k is the k-th object with id >= 0 of `Scene.objects`.
+
+    Attributes:
+        weight: [M + 1, 16] float32
+        bias: [M + 1] float32
+    """
+
+    weight: np.ndarray
+    bias: np.ndarray
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Observed motion of Gaussians that their group does not explain.
+
+    Attributes:
+        rows: The Gaussians, increasing. [R] int32
+        offsets: Offsets added to their centres at the knots, bind frame. [R, S, 3] float32
+        quats: Rotations applied to those of the bind state at the knots (turn q), unit wxyz. [R, S, 4] float32
+        log_scales: Offsets added to their log scales at the knots. [R, S, 3] float32
+    """
+
+    rows: np.ndarray
+    offsets: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Own motion of each Gaussian past t_max.
+
+    Attributes:
+        rates: Velocity of the centre, angular velocity and the rates of both, about the centre at t_max, for mode
+            "standard". [N, 12] float32
+        canonical_means: Centres in the canonical state, for mode "rigid_paper", world. [N, 3] float32 or None
+    """
+
+    rates: np.ndarray
+    canonical_means: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Change of colours as groups rotate in fixed light, by a factor max(rest + (R^T light - light) . vector, 0).
+
+    Attributes:
+        vectors: Gradient of the factor as the group rotates by R. [N, 3] float32
+        light: Light direction, unit, world. [3] float64
+        rest: The factor in the bind state, below 0 for a Gaussian unlit at t_max; None if it is 1 for all. [N] float32
+    """
+
+    vectors: np.ndarray
+    light: np.ndarray
+    rest: np.ndarray | None = None
+
+
+# Groups of arrays in `Scene`: class, and the names of its arrays in a file by attribute.
+GROUPS: dict[str, tuple[type, dict[str, str]]] = {
+    "classifier": (Classifier, {"weight": "classifier_weight", "bias": "classifier_bias"}),
+    "residuals": (
+        Residuals,
+        {
+            "rows": "residual_rows",
+            "offsets": "residual_offsets",
+            "quats": "residual_quats",
+            "log_scales": "residual_log_scales",
+        },
+    ),
+    "dynamics": (Dynamics, {"rates": "dynamics", "canonical_means": "canonical_means"}),
+    "shading": (Shading, {"vectors": "shading", "light": "light_direction", "rest": "shading_rest"}),
+}
+_GROUP_OF = {name: group for group, (_, names) in GROUPS.items() for name in names.values()}
+
+
+@dataclass(frozen=True)
 class Scene:
     """A baked scene, with all data for playback, Blender and export.
 
@@ -128,22 +207,10 @@ class Scene:
         cameras: The data set's distinct cameras.
         background_sh: Spherical harmonics of the sky by world viewing direction, 3DGS basis. [Kb, 3]
         identities: Identity encodings. [N, 16] float16 or None
-        classifier_weight: Linear classifier of identities; row k is the k-th object with id >= 0 of ``objects``.
-            [M + 1, 16] float32 or None
-        classifier_bias: Its bias, in the same order. [M + 1] float32 or None
-        residual_rows: Gaussians whose observed motion their group does not explain, increasing. [R] int32 or None
-        residual_offsets: Offsets added to their centres at the knots, bind frame. [R, S, 3] float32 or None
-        residual_quats: Rotations applied to those of the bind state at the knots (turn q), unit wxyz. [R, S, 4] float32
-            or None
-        residual_log_scales: Offsets added to their log scales at the knots. [R, S, 3] float32 or None
-        dynamics: Own motion of each Gaussian past t_max, for mode "standard": velocity of its centre, angular velocity
-            and the rates of both, about its centre at t_max. [N, 12] float32 or None
-        canonical_means: Centres in the canonical state, for mode "rigid_paper", world. [N, 3] float32 or None
-        shading: Gradient g of the colour factor max(rest + (R^T l - l) . g, 0) as the group rotates by R. [N, 3]
-            float32 or None
-        shading_rest: The factor in the bind state, below 0 for a Gaussian unlit at t_max; None if it is 1 for all. [N]
-            float32 or None
-        light_direction: l above, unit, world. [3]
+        classifier: Classifier of the identities, or None.
+        residuals: Motion of single Gaussians in the observed time, or None.
+        dynamics: Motion of single Gaussians past t_max, or None.
+        shading: Change of colours with rotation, or None.
         embeddings: One unit row per object of ``objects``, zero if it has none. [M, D] or None
         vocabulary: Words with stored embeddings.
         vocabulary_embeddings: One unit row per word. [W, D] or None
@@ -178,17 +245,10 @@ class Scene:
     cameras: tuple[Camera, ...]
     background_sh: np.ndarray
     identities: np.ndarray | None = None
-    classifier_weight: np.ndarray | None = None
-    classifier_bias: np.ndarray | None = None
-    residual_rows: np.ndarray | None = None
-    residual_offsets: np.ndarray | None = None
-    residual_quats: np.ndarray | None = None
-    residual_log_scales: np.ndarray | None = None
-    dynamics: np.ndarray | None = None
-    canonical_means: np.ndarray | None = None
-    shading: np.ndarray | None = None
-    shading_rest: np.ndarray | None = None
-    light_direction: np.ndarray | None = None
+    classifier: Classifier | None = None
+    residuals: Residuals | None = None
+    dynamics: Dynamics | None = None
+    shading: Shading | None = None
     embeddings: np.ndarray | None = None
     vocabulary: tuple[str, ...] = ()
     vocabulary_embeddings: np.ndarray | None = None
@@ -209,9 +269,38 @@ class Scene:
         low, high = np.quantile(self.means.astype(np.float64), [0.01, 0.99], axis=0)
         return float(max(np.linalg.norm(high - low), 1e-30))
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by their names in a file, with ``light_direction`` and ``origin``, without missing ones."""
+        found = {name: getattr(self, name) for name in (*DTYPES, "origin") if name not in _GROUP_OF}
+        for group, (_, names) in GROUPS.items():
+            part = getattr(self, group)
+            found |= {name: getattr(part, attribute, None) for attribute, name in names.items()}
+        return {name: array for name, array in found.items() if array is not None}
+
+    def with_arrays(self, **changes: np.ndarray | None) -> Scene:
+        """Return the scene with other arrays, by their names in a file; None removes an optional array."""
+        unknown = changes.keys() - {*DTYPES, "light_direction", "origin"}
+        if unknown:
+            raise TypeError(f"expected names of arrays, got {', '.join(sorted(unknown))}")
+        touched = {_GROUP_OF.get(name, name) for name in changes}
+        fields = grouped(self.arrays() | changes)
+        return dataclasses.replace(self, **{name: fields[name] for name in touched})
+
     def object(self, object_id: int) -> SceneObject:
         """Return the object with this id. Raises KeyError if there is none."""
         for candidate in self.objects:
             if candidate.id == object_id:
                 return candidate
         raise KeyError(object_id)
+
+
+def grouped(arrays: Mapping[str, np.ndarray | None]) -> dict[str, Any]:
+    """Return fields of `Scene` from arrays by their names in a file.
+
+    A group is None if it has no array. `validation.check` reports an array without the others of its group.
+    """
+    fields: dict[str, Any] = {name: array for name, array in arrays.items() if name not in _GROUP_OF}
+    for group, (kind, names) in GROUPS.items():
+        members = {attribute: arrays.get(name) for attribute, name in names.items()}
+        fields[group] = None if all(member is None for member in members.values()) else kind(**members)
+    return fields

@@ -19,7 +19,7 @@ import numpy as np
 from .. import atomic_files, errors, findings, strict_json
 from . import array_shapes, format_features, scene_json, validation
 from .archive import Archive, Header, most_content
-from .scene import DTYPES, EMBEDDINGS, Scene
+from .scene import DTYPES, EMBEDDINGS, Scene, grouped
 from .stored_embeddings import Meanings
 
 FORMAT = "r5dgs scene"
@@ -136,17 +136,17 @@ def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int
     """Write the zip; returns False if it compresses so well that readers would reject it as a zip bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
         still = _TRACKS if len(scene.track_times) == 1 else ()  # every pose is then the identity
-        arrays = [name for name in DTYPES if getattr(scene, name) is not None and name not in still]
+        arrays = {name: array for name, array in scene.arrays().items() if name in DTYPES and name not in still}
         head = {
             "format": FORMAT,
             "format_version": format_features.version(scene),
-            "arrays": arrays,
+            "arrays": [name for name in DTYPES if name in arrays],
             **format_features.dump(scene),
         }
         text = scene_json.dump(scene, head)
         _add(archive, JSON_MEMBER, text, compression)
-        for name in arrays:
-            array, dtype = getattr(scene, name), DTYPES[name]
+        for name in head["arrays"]:
+            array, dtype = arrays[name], DTYPES[name]
             buffer = io.BytesIO()
             stored = np.ascontiguousarray(array, dtype) if exact else _encode(name, np.ascontiguousarray(array, dtype))
             np.lib.format.write_array(buffer, stored, version=(1, 0), allow_pickle=False)
@@ -241,7 +241,9 @@ def _read_zip(archive: Archive, guard: findings.Guard) -> Scene:
         arrays["track_poses"] = findings.attempt(
             guard, lambda: np.tile([1.0, 0, 0, 0, 0, 0, 0], (len(fields["groups"]), 1, 1))
         )
-    return Scene(**arrays, **fields)  # type: ignore[arg-type]
+    if not headers.keys() & {"shading", "shading_rest"}:
+        fields["light_direction"] = None  # a light without shading has no effect
+    return Scene(**grouped(arrays | fields))
 
 
 def _read_json(archive: Archive, guard: findings.Guard = findings.STRICT) -> scene_json.Row:

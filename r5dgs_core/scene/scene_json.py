@@ -19,7 +19,7 @@ from .scene import NEAR_PLANE, MotionGroup, Scene, SceneObject
 
 def dump(scene: Scene, head: dict[str, Any]) -> bytes:
     """JSON member as UTF-8, with the entries of ``head`` first."""
-    light = scene.light_direction
+    light = None if scene.shading is None else scene.shading.light
     tree = {
         **head,
         "generator": f"r5dgs {__version__}",

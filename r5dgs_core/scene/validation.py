@@ -5,6 +5,7 @@ Reading and writing apply the same checks.
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -16,7 +17,7 @@ from .. import errors, findings
 from . import array_shapes, cameras
 from .lookup_table import Table
 from .row_runs import runs
-from .scene import DTYPES, EMBEDDINGS, ROLES, MotionGroup, Scene
+from .scene import DTYPES, EMBEDDINGS, GROUPS, ROLES, MotionGroup, Scene
 
 _fail = array_shapes.fail
 _UNIT_TOLERANCE = 1e-3
@@ -66,7 +67,6 @@ _MODEL_LIMITS = {
 _MOST_ID = np.iinfo(np.int32).max
 _CONVERTED = ("background_sh", "identities", *EMBEDDINGS)  # any float dtype in memory; converted on writing
 _DTYPES = {name: dtype for name, dtype in DTYPES.items() if name not in _CONVERTED} | {"origin": np.float64}
-_ARRAYS = (*DTYPES, "light_direction", "origin")
 
 
 def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> None:
@@ -78,7 +78,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
         guard: Context manager entered around each array, rule, object, motion group and camera, for callers that
             collect all faults.
     """
-    given = {name: array for name in _ARRAYS if (array := getattr(scene, name)) is not None}
+    given = scene.arrays()
     for name, array in given.items():
         with guard():
             if not isinstance(array, np.ndarray) and array is not findings.UNREAD:
@@ -95,6 +95,7 @@ def check(scene: Scene, place: str, guard: findings.Guard = findings.STRICT) -> 
             if name in arrays:
                 check_range(name, arrays[name], place)
     check_meanings({name: arrays.get(name) for name in EMBEDDINGS}, scene.lookup, place, guard)
+    _check_groups(given, place, guard)
     for check_part in (_check_ids, _check_residuals, _check_units, _check_times, _check_objects):
         check_part(scene, place, guard)
     object_ids = findings.attempt(guard, lambda: {item.id for item in scene.objects})
@@ -115,10 +116,18 @@ def _listed(values: Sequence[Any]) -> Sequence[Any]:
     return () if values is findings.UNREAD else values
 
 
+def _check_groups(arrays: Mapping[str, Any], place: str, guard: findings.Guard) -> None:
+    """Raise `SceneFileError` if an array is present without the others that its group requires."""
+    for kind, names in GROUPS.values():
+        required = [names[field.name] for field in dataclasses.fields(kind) if field.default is dataclasses.MISSING]
+        present = next((name for name in names.values() if name in arrays), None)
+        for name in required:
+            with guard():
+                if present is not None and name not in arrays:
+                    _fail(place, name, f"an array beside {present!r}", "none")
+
+
 def _check_ids(scene: Scene, place: str, guard: findings.Guard) -> None:
-    with guard():
-        if (scene.classifier_weight is None) != (scene.classifier_bias is None):
-            _fail(place, "classifier_weight", "'classifier_bias' beside it", "one without the other")
     with guard():
         groups = len(scene.groups)
         stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
@@ -190,45 +199,33 @@ def _check_range(
 
 
 def _check_residuals(scene: Scene, place: str, guard: findings.Guard) -> None:
-    rows = scene.residual_rows
-    parts = (scene.residual_offsets, scene.residual_quats, scene.residual_log_scales)
+    if scene.residuals is None:
+        return
+    rows, count = scene.residuals.rows, len(scene.means)
     with guard():
-        if any((part is None) != (rows is None) for part in parts):
-            _fail(place, "residual_rows", "all four members residual_*, or none of them", "some of them")
-    with guard():
-        if scene.canonical_means is not None and scene.dynamics is None:
-            _fail(place, "dynamics", "an array beside 'canonical_means'", "none")
-    with guard():
-        count = len(scene.means)
-        if rows is not None and len(rows) and (rows[0] < 0 or rows[-1] >= count or (rows[1:] <= rows[:-1]).any()):
+        if len(rows) and (rows[0] < 0 or rows[-1] >= count or (rows[1:] <= rows[:-1]).any()):
             _fail(place, "residual_rows", f"increasing rows below {count}", "others")
-    for name in ("residual_offsets", "residual_log_scales"):
+    for name in ("offsets", "log_scales"):
         with guard():
-            array = getattr(scene, name)
-            if array is not None and (array[:, -1] != 0).any():
-                _fail(place, name, "zero at t_max (residuals are relative to the bind state)", "something else")
+            if (getattr(scene.residuals, name)[:, -1] != 0).any():
+                wanted = "zero at t_max (residuals are relative to the bind state)"
+                _fail(place, f"residual_{name}", wanted, "something else")
 
 
 def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
+    arrays = scene.arrays()
     for name in ("quats", "track_poses", "residual_quats"):
         with guard():
-            array = getattr(scene, name)
-            if array is None:
+            if name not in arrays:
                 continue
-            norms = np.linalg.norm(array[..., :4].reshape(-1, 4).astype(np.float64), axis=-1)
+            norms = np.linalg.norm(arrays[name][..., :4].reshape(-1, 4).astype(np.float64), axis=-1)
             off = np.flatnonzero(np.abs(norms - 1) > _UNIT_TOLERANCE)
             if len(off):
                 _fail(place, name, "unit quaternions wxyz", f"norm {norms[off[0]]:.6g} in row {off[0]}")
-    light = scene.light_direction
     with guard():
+        light = None if scene.shading is None else scene.shading.light
         if light is not None and abs(np.linalg.norm(light) - 1) > _UNIT_TOLERANCE:
             _fail(place, "light_direction", "a unit vector", light)
-    with guard():
-        if scene.shading_rest is not None and scene.shading is None:
-            _fail(place, "shading", "an array beside 'shading_rest'", "none")
-    with guard():
-        if scene.shading is not None and light is None:
-            _fail(place, "light_direction", "a unit vector beside 'shading'", "none")
 
 
 def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 
@@ -129,7 +128,7 @@ def _aggregated(distance: float, source: str) -> np.ndarray:
     wrong = rng.permutation(_MEMBERS)[: _MEMBERS // 10]
     speeds[wrong] += rng.normal(size=(len(wrong), 3)) + 1.0
     states = np.concatenate([speeds, spins, np.zeros((_MEMBERS, 6))], axis=-1).astype(np.float32)
-    scene = dataclasses.replace(scene, dynamics=states)
+    scene = scene.with_arrays(dynamics=states)
     model = group_dynamics.models_of(scene, source)[1]
     return np.concatenate([model.velocity, model.angular_velocity])
 

@@ -145,7 +145,7 @@ def _isolated(value: float) -> float:
         broken = _wild(_wild(scene, g, "velocity", value), g, "angular_velocity", value)
         poses = scene.track_poses.copy()
         poses[g, :-1, 1:] = value
-        broken = dataclasses.replace(broken, track_poses=poses)
+        broken = broken.with_arrays(track_poses=poses)
         others = scene.motion_ids != g
         for t, expected in sound.items():
             frame = scene_player.frame(broken, t)
@@ -166,9 +166,9 @@ def _singles(value: float) -> tuple[float, float]:
     sound = scene_player.frame(scene, 2.0, "standard")
     for g in range(1, len(scene.groups)):
         mine = scene.motion_ids == g
-        bad, still = (np.where(mine[:, None], np.float32(x), scene.dynamics) for x in (value, 0.0))
+        bad, still = (np.where(mine[:, None], np.float32(x), scene.dynamics.rates) for x in (value, 0.0))
         frame, expected = (
-            scene_player.frame(dataclasses.replace(scene, dynamics=states), 2.0, "standard") for states in (bad, still)
+            scene_player.frame(scene.with_arrays(dynamics=states), 2.0, "standard") for states in (bad, still)
         )
         count += different(frame.means, expected.means) + different(frame.quats, expected.quats)
         away = max(away, largest(frame.means[~mine].astype(np.float64) - sound.means[~mine]) / scene.extent)
@@ -197,8 +197,8 @@ def _huge(rate: float, mode: str) -> float:
     scene = scene_of([body() + [k, 0, 0] for k in range(len(fast))], [MotionModel()] * len(fast), singles=True)
     groups = [dataclasses.replace(g, model=m) for g, m in zip(scene.groups[1:], fast, strict=True)]
     assert scene.dynamics is not None
-    states = np.full_like(scene.dynamics, rate)
-    scene = dataclasses.replace(scene, groups=(scene.groups[0], *groups), dynamics=states)
+    states = np.full_like(scene.dynamics.rates, rate)
+    scene = dataclasses.replace(scene.with_arrays(dynamics=states), groups=(scene.groups[0], *groups))
     with np.errstate(all="ignore"):
         frame = scene_player.frame(scene, T_MAX + 1, mode)
     return float((~np.isfinite(frame.means)).sum() + (~np.isfinite(frame.quats)).sum())

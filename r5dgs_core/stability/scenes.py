@@ -8,7 +8,7 @@ import numpy as np
 
 from ..motion import models, rotations, se3
 from ..motion.models import MotionModel
-from ..scene.scene import MotionGroup, Scene, SceneObject
+from ..scene.scene import Dynamics, MotionGroup, Scene, SceneObject
 from .cases import body, model_of
 
 T_MAX = 0.75
@@ -112,8 +112,7 @@ def scene_of(
         world_convention="blender",
         cameras=(),
         background_sh=np.zeros((1, 3), np.float32),
-        dynamics=members if singles else None,
-        canonical_means=means.copy() if singles else None,
+        dynamics=Dynamics(members, means.copy()) if singles else None,
     )
 
 

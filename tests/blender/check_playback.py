@@ -77,7 +77,7 @@ def position_error(collection, scene, modules, t: float) -> float:
     """Largest distance between a point as Blender evaluates it and playback, as a fraction of the scene's size."""
     set_time(collection, t)
     # Anchors carry the rigid part of the motion; what bends beside it is not played in Blender yet.
-    rigid = dataclasses.replace(scene, residual_rows=None)
+    rigid = dataclasses.replace(scene, residuals=None)
     expected = modules["scene_player"].frame(rigid, t).means.astype(np.float64)
     world = modules["cameras"].WORLD_TO_BLENDER[scene.world_convention]
     depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -28,7 +28,7 @@ def tracks() -> Scene:
 def still() -> Scene:
     """Nothing moves: the file has no tracks."""
     scene = make_scene(n=40, objects=0, sh_degree=1, shading=False, identities=False)
-    return dataclasses.replace(scene, track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
+    return scene.with_arrays(track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
 
 
 def field() -> Scene:
@@ -41,14 +41,15 @@ def field() -> Scene:
     swinging = models.MotionModel("translation", velocity=[0.1, 0, 0], acceleration=[0.2, 0, 0], frequency=3.0)
     groups = (*scene.groups[:2], dataclasses.replace(scene.groups[2], model=swinging, seen=(0.1, T_MAX)))
     return dataclasses.replace(
-        scene,
+        scene.with_arrays(
+            residual_rows=rows,
+            residual_offsets=(0.05 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
+            residual_quats=turns.astype(np.float32),
+            residual_log_scales=(0.1 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
+            dynamics=(0.1 * rng.normal(size=(len(scene.means), 12))).astype(np.float32),
+            canonical_means=(scene.means + np.float32(0.1)).astype(np.float32),
+        ),
         groups=(*groups, *scene.groups[3:]),
-        residual_rows=rows,
-        residual_offsets=(0.05 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
-        residual_quats=turns.astype(np.float32),
-        residual_log_scales=(0.1 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
-        dynamics=(0.1 * rng.normal(size=(len(scene.means), 12))).astype(np.float32),
-        canonical_means=(scene.means + np.float32(0.1)).astype(np.float32),
         near_plane=0.04,
         harmonics_turn=False,
     )
@@ -63,15 +64,16 @@ def words() -> Scene:
     seen, said = View("orbit_0.30", 0.21, 0.25, (13.0, 26.0, 43.0, 65.0)), View("a mug", 0.3)
     views = tuple((seen, said) if item.id > 0 else () for item in scene.objects)
     return dataclasses.replace(
-        scene,
-        classifier_weight=rng.normal(size=(rows - 1, 16)).astype(np.float32),
-        classifier_bias=rng.normal(size=rows - 1).astype(np.float32),
-        shading_rest=rng.uniform(0.8, 1.2, len(scene.means)).astype(np.float32),
-        embeddings=unit[:rows, 0].astype(np.float32),
+        scene.with_arrays(
+            classifier_weight=rng.normal(size=(rows - 1, 16)).astype(np.float32),
+            classifier_bias=rng.normal(size=rows - 1).astype(np.float32),
+            shading_rest=rng.uniform(0.8, 1.2, len(scene.means)).astype(np.float32),
+            embeddings=unit[:rows, 0].astype(np.float32),
+            vocabulary_embeddings=unit[rows : rows + 2, 0].astype(np.float32),
+            canonical_embeddings=unit[rows + 2 :, 0].astype(np.float32),
+            view_embeddings=unit[:rows].astype(np.float32),
+        ),
         vocabulary=("mug", "tasse à café"),
-        vocabulary_embeddings=unit[rows : rows + 2, 0].astype(np.float32),
-        canonical_embeddings=unit[rows + 2 :, 0].astype(np.float32),
-        view_embeddings=unit[:rows].astype(np.float32),
         lookup=Table(
             EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}", "a photo of a {}"), 10.0),
             ("object",),

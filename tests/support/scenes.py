@@ -6,7 +6,7 @@ import numpy as np
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import cameras
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject, Shading
 
 T_MAX = 0.75
 TIMES = np.array([0.0, 0.05, 0.1, 0.17, 0.22, 0.3, 0.35, 0.4, 0.5, 0.55, 0.62, 0.68, T_MAX])
@@ -134,8 +134,9 @@ def make_scene(
         cameras=(orbit_camera(0.3), orbit_camera(1.4)),
         background_sh=np.array([[0.9, 1.0, 1.2]], np.float32),
         identities=rng.normal(size=(n, 16)).astype(np.float16) if identities else None,
-        shading=(0.2 * rng.normal(size=(n, 3))).astype(np.float32) if shading else None,
-        light_direction=light / np.linalg.norm(light) if shading else None,
+        shading=Shading((0.2 * rng.normal(size=(n, 3))).astype(np.float32), light / np.linalg.norm(light))
+        if shading
+        else None,
         provenance={"generator": "tests/scenes.py", "seed": seed},
         needs=({"name": "tracks", "value": 0.5, "threshold": 0.01, "decision": "on", "reason": "bodies move"},),
     )

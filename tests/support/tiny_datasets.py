@@ -208,8 +208,7 @@ def breathing(scene: Scene, share: float) -> Scene:
     rows = np.flatnonzero(scene.object_ids == BALL)
     growth = 1 + share * np.sin(2 * np.pi * (T_MAX - OBSERVED) / 0.6)  # [S]
     arms = scene.means[rows].astype(np.float64) - CENTERS[BALL]
-    return dataclasses.replace(
-        scene,
+    return scene.with_arrays(
         residual_rows=rows.astype(np.int32),
         residual_offsets=(arms[:, None] * (growth - 1)[:, None]).astype(np.float32),
         residual_quats=np.tile(np.float32([1, 0, 0, 0]), (len(rows), len(OBSERVED), 1)),
@@ -220,7 +219,7 @@ def breathing(scene: Scene, share: float) -> Scene:
 def without(scene: Scene, object_id: int) -> Scene:
     """The scene with one object made invisible."""
     hidden = np.where(scene.object_ids == object_id, -30.0, scene.opacity_logits).astype(np.float32)
-    return dataclasses.replace(scene, opacity_logits=hidden)
+    return scene.with_arrays(opacity_logits=hidden)
 
 
 def orbit_camera(angle_rad: float, width: int, height: int) -> cameras.Camera:

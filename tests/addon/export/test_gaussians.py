@@ -182,10 +182,12 @@ def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path)
 def test_what_bends_is_exported_bent_in_exact_mode(blender, scene, tmp_path):
     rows, knots = np.array([120, 260], np.int32), len(scene.track_times)
     offsets = np.full((2, knots, 3), 0.5, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
-    bent = dataclasses.replace(
-        scene, residual_rows=rows, residual_offsets=offsets, residual_log_scales=0 * offsets,
+    bent = scene.with_arrays(
+        residual_rows=rows,
+        residual_offsets=offsets,
+        residual_log_scales=0 * offsets,
         residual_quats=np.tile(np.float32([1, 0, 0, 0]), (2, knots, 1)),
-    )  # fmt: skip
+    )
     scene_file.write(bent, tmp_path / "bent.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(tmp_path / "bent.r5dgs"))
     blender.context.scene.frame_set(13)

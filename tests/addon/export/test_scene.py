@@ -213,10 +213,12 @@ def test_a_root_that_was_moved_is_said(blender, loaded, tmp_path, capsys):
 def test_residuals_survive(blender, scene, tmp_path):
     rows, knots = np.array([120, 260], np.int32), len(scene.track_times)
     offsets = np.full((2, knots, 3), 0.05, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
-    bent = dataclasses.replace(
-        scene, residual_rows=rows, residual_offsets=offsets, residual_log_scales=0 * offsets,
+    bent = scene.with_arrays(
+        residual_rows=rows,
+        residual_offsets=offsets,
+        residual_log_scales=0 * offsets,
         residual_quats=np.tile(np.float32([1, 0, 0, 0]), (2, knots, 1)),
-    )  # fmt: skip
+    )
     scene_file.write(bent, tmp_path / "bent.r5dgs")
     motions.load(blender, tmp_path / "bent.r5dgs")
     save(blender, tmp_path / "again.r5dgs")
@@ -237,9 +239,7 @@ def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loade
 
 @pytest.mark.parametrize("observed", [1, 4], ids=["still scene", "scene that begins late"])
 def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, scene, tmp_path, capfd, observed):
-    late = dataclasses.replace(
-        scene, track_times=scene.track_times[-observed:], track_poses=scene.track_poses[:, -observed:]
-    )
+    late = scene.with_arrays(track_times=scene.track_times[-observed:], track_poses=scene.track_poses[:, -observed:])
     if observed == 1:
         still = [dataclasses.replace(group, model=models.STATIC) for group in late.groups]
         late = dataclasses.replace(late, groups=tuple(still))

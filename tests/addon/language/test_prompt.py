@@ -264,7 +264,7 @@ def meaningful(blender, tmp_path):
     axes = np.eye(len(bare.objects), 8, dtype=np.float32)
     row = [item.id for item in bare.objects].index(4)
     rich = dataclasses.replace(
-        bare, embeddings=axes, vocabulary=("sour thing",), vocabulary_embeddings=axes[row : row + 1]
+        bare.with_arrays(embeddings=axes, vocabulary_embeddings=axes[row : row + 1]), vocabulary=("sour thing",)
     )
     path = scene_file.write(rich, tmp_path / "meaningful.r5dgs")
     blender.ops.r5dgs.load_scene(filepath=str(path))

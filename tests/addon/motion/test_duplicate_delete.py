@@ -1,7 +1,5 @@
 """Objects are copied, removed and given other motions as a whole; other data is kept."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -170,8 +168,8 @@ def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others
     motion_ids[np.flatnonzero(scene.object_ids == 1)[-5:]] = 3  # of the mug, moving with the car
     order = np.lexsort((motion_ids, scene.object_ids))
     fields = ("means", "quats", "log_scales", "opacity_logits", "sh", "identities", "shading", "object_ids")
-    arrays = {field: getattr(scene, field)[order] for field in fields}
-    scene = dataclasses.replace(scene, **arrays, motion_ids=motion_ids[order])
+    arrays = {field: scene.arrays()[field][order] for field in fields}
+    scene = scene.with_arrays(**arrays, motion_ids=motion_ids[order])
     path = scene_file.write(scene, tmp_path / "fringe.r5dgs")
     motions.load(blender, path)
     blender.ops.r5dgs.select_by_prompt(text=name)

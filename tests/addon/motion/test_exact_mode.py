@@ -1,6 +1,5 @@
 """Exact Mode plays residual motion and leaves no traces when disabled."""
 
-import dataclasses
 import importlib
 
 import numpy as np
@@ -19,9 +18,9 @@ TIMES = (0.0, 0.0437, 0.2, 0.3333, 0.61, tiny_datasets.T_MAX - 1e-4, tiny_datase
 def scene_path(tmp_path):
     bending = tiny_datasets.breathing(tiny_datasets.make_truth(), 0.3)
     rng = np.random.default_rng(3)
-    quats = rng.normal(scale=0.2, size=bending.residual_quats.shape) + [1.0, 0, 0, 0]
+    quats = rng.normal(scale=0.2, size=bending.residuals.quats.shape) + [1.0, 0, 0, 0]
     quats[:, -1] = [1.0, 0, 0, 0]
-    turned = dataclasses.replace(bending, residual_quats=rotations.normalize(quats).astype(np.float32))
+    turned = bending.with_arrays(residual_quats=rotations.normalize(quats).astype(np.float32))
     return scene_file.write(turned, tmp_path / "bending.r5dgs")
 
 
@@ -158,7 +157,7 @@ def test_deleted_points_leave_the_others_where_they_belong(blender, scene, loade
 def bending(loaded, scene):
     """The cloud that bends."""
     every = (o for o in loaded.all_objects if o.r5dgs.role == "CLOUD")
-    return next(o for o in every if o.r5dgs.start <= scene.residual_rows[0] < o.r5dgs.start + o.r5dgs.count)
+    return next(o for o in every if o.r5dgs.start <= scene.residuals.rows[0] < o.r5dgs.start + o.r5dgs.count)
 
 
 def seen(bpy, cloud):

@@ -23,7 +23,7 @@ TEXT = "(5000000.125, -125000000, 3)"
 @pytest.fixture
 def scene_path(tmp_path):
     made = scenes.make_scene(n=300, objects=3, seed=4, world_convention="colmap")
-    return scene_file.write(dataclasses.replace(made, origin=ORIGIN), tmp_path / "scene.r5dgs")
+    return scene_file.write(made.with_arrays(origin=ORIGIN), tmp_path / "scene.r5dgs")
 
 
 @pytest.fixture
@@ -125,12 +125,13 @@ def test_an_edited_scene_keeps_the_origin(blender, loaded, scene_path, tmp_path)
 
 def shrunk(scene, factor):
     """A still scene in another unit."""
-    still = dataclasses.replace(scene, track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
+    still = scene.with_arrays(track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
     small = [dataclasses.replace(g, pivot=factor * g.pivot, model=models.STATIC, follows=None) for g in still.groups]
     return dataclasses.replace(
-        still,
-        means=(factor * still.means).astype(np.float32),
-        log_scales=(still.log_scales + np.log(factor)).astype(np.float32),
+        still.with_arrays(
+            means=(factor * still.means).astype(np.float32),
+            log_scales=(still.log_scales + np.log(factor)).astype(np.float32),
+        ),
         groups=tuple(small),
     )
 

@@ -230,13 +230,12 @@ def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_wher
     assert copy.groups[group.id].seen == group.seen
     # The offset between the frames comes from the times at which the ball was seen, so that early ones do not count.
     truth = datasets.read(data.root).ground_truth
-    moved = dataclasses.replace(
-        scene,
+    moved = scene.with_arrays(
         track_poses=np.where(
             (np.arange(len(scene.groups)) == group.id)[:, None, None] & (scene.track_times < group.seen[0])[:, None],
             [1.0, 0, 0, 0, 5, 5, 5],
             scene.track_poses,
-        ),
+        )
     )
     found, expected = evaluate.object_errors(moved, truth), evaluate.object_errors(scene, truth)
     # Not to the last digit: 3 x 0.15 lies a rounding before the knot at 0.45, and takes 1e-16 of the pose before it.

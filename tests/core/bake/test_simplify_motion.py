@@ -68,7 +68,7 @@ def with_noise(scene, turn=0.0, shift=0.0):
     poses[BRICK, :, :4] = rotations.multiply(poses[BRICK, :, :4], rotations.conjugate(poses[BRICK, -1, :4]))
     poses[BRICK, :, 4:] += shift * draw.standard_normal((len(TIMES), 3))
     poses[BRICK, :, 4:] -= poses[BRICK, -1, 4:]
-    return dataclasses.replace(scene, track_poses=poses)
+    return scene.with_arrays(track_poses=poses)
 
 
 def test_what_rests_rests_and_what_turns_or_slides_slowly_goes_on_so(given):
@@ -105,7 +105,7 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     poses[BRICK, :, :4] = rotations.rotvecs_to_quats(turns)
     vectors[truth.motion_ids == BRICK, 1] = 30.0  # a turn of 0.01 rad darkens by a third
     light = np.array([1.0, 0, 0])
-    carrier = dataclasses.replace(truth, track_poses=poses, shading=vectors, light_direction=light)
+    carrier = truth.with_arrays(track_poses=poses, shading=vectors, light_direction=light)
     scene, rows = simplified(carrier, data, shown=carrier)
     row = rows["rotation"]
     assert row["decision"] == "on" and "serves colours" in row["reason"] and "dB" in row["reason"]
@@ -134,7 +134,7 @@ def test_another_bind_state_shows_the_same_and_followers_follow(given):
     poses = np.concatenate([truth.track_poses, truth.track_poses[:1]])
     poses[BRICK, :-1, 4] += 0.003  # all poses but the last: it is the bind state that is off
     poses[3, :, 4:] = poses[BRICK, :, 4:] * [1, 1, 0]
-    scene = dataclasses.replace(truth, groups=(*truth.groups, shadow), track_poses=poses)
+    scene = dataclasses.replace(truth.with_arrays(track_poses=poses), groups=(*truth.groups, shadow))
     calm = poses.copy()
     calm[BRICK, -1, 4] += 0.003
     rebound = simplify_motion._rebound(scene, simplify_motion._followed(scene, calm))

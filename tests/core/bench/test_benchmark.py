@@ -1,7 +1,6 @@
 """A benchmark trains what is not trained, measures what is not measured, and goes on over what fails."""
 
 import contextlib
-import dataclasses
 import json
 import shutil
 import signal
@@ -122,7 +121,7 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
     def with_dynamics(run, dataset):
         scene = plain(run, dataset)
         still = np.zeros((len(scene.means), 12), np.float32)
-        return dataclasses.replace(scene, dynamics=still, canonical_means=scene.means)
+        return scene.with_arrays(dynamics=still, canonical_means=scene.means)
 
     monkeypatch.setattr(bake, "bake", with_dynamics)
     result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
@@ -335,7 +334,7 @@ def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch
 
 
 def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
-    still = dataclasses.replace(baked, dynamics=np.zeros((len(baked.means), 12), np.float32))
+    still = baked.with_arrays(dynamics=np.zeros((len(baked.means), 12), np.float32))
     drawn, frame = [], scene_player.frame
 
     def watch(scene, t, mode="rigid"):

@@ -567,7 +567,9 @@ def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
     groups = [dataclasses.replace(g, role="ghost" if g.id in (1, 2) else g.role) for g in scene.groups]
     means = scene.means.copy()
     means[3] = np.nan
-    broken = dataclasses.replace(scene, means=means, quats=3 * scene.quats, groups=tuple(groups), frames_per_unit=-1.0)
+    broken = dataclasses.replace(
+        scene.with_arrays(means=means, quats=3 * scene.quats), groups=tuple(groups), frames_per_unit=-1.0
+    )
     monkeypatch.setattr(scene_file.validation, "check", lambda *_: None)
     path = scene_file.write(broken, tmp_path / "s.r5dgs", exact=True)
     monkeypatch.undo()

@@ -138,8 +138,7 @@ def test_training_gives_the_same_pictures_in_any_world(tiny, tmp_path, scale, sh
 def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_in(baked, tiny, tmp_path, caplog):
     data = made(tmp_path / "data", 1.0, 0.2 * FAR)
     older = dataclasses.replace(
-        baked,
-        means=(baked.means.astype(np.float64) + 0.2 * FAR).astype(np.float32),
+        baked.with_arrays(means=(baked.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
         groups=tuple(dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR) for group in baked.groups),
         cameras=tuple(cameras.moved(camera, 0.2 * FAR) for camera in baked.cameras),
     )
@@ -156,10 +155,10 @@ def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_i
 
 def test_scenes_near_the_origin_are_read_without_a_warning(baked, tmp_path, caplog):
     scene_file.read(scene_file.write(baked, tmp_path / "near.r5dgs"))
-    scene_file.read(scene_file.write(dataclasses.replace(baked, origin=FAR), tmp_path / "far.r5dgs"))
+    scene_file.read(scene_file.write(baked.with_arrays(origin=FAR), tmp_path / "far.r5dgs"))
     assert not caplog.records
 
 
 def test_info_prints_an_origin_where_there_is_one(baked):
     assert "origin" not in scene_info.info(baked)
-    assert scene_info.info(dataclasses.replace(baked, origin=FAR))["origin"] == FAR.tolist()
+    assert scene_info.info(baked.with_arrays(origin=FAR))["origin"] == FAR.tolist()

@@ -74,7 +74,7 @@ def edit(scene, pieces, table=None):
 
 def assert_same(found, wanted, names=MATCHING):
     for name in names:
-        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name), err_msg=name)
+        np.testing.assert_array_equal(found.arrays()[name], wanted.arrays()[name], err_msg=name)
 
 
 def rich_scene(**options):
@@ -91,15 +91,23 @@ def rich_scene(**options):
     views = tuple((View("obs0", 0.1 * row, 0.5, (0, 0, 9, 9)),) for row in range(len(scene.objects)))
     card, limits = EncoderCard("clip", "tiny", "ab" * 32, 8, ("{}",)), tuple(map(float, range(len(views))))
     return dataclasses.replace(
-        scene,
-        residual_rows=rows.astype(np.int32), residual_offsets=offsets, residual_log_scales=growths,
-        residual_quats=turns.astype(np.float32),
-        dynamics=random.normal(size=(300, 12)).astype(np.float32), canonical_means=scene.means + np.float32(0.1),
-        classifier_weight=random.normal(size=(named, 16)).astype(np.float32),
-        classifier_bias=random.normal(size=named).astype(np.float32),
-        embeddings=units, vocabulary=("mug",), vocabulary_embeddings=units[:1], canonical_embeddings=units[:1],
-        view_embeddings=units[:, None], lookup=Table(card, ("object",), views, limits, 0.1, "mean"),
-    )  # fmt: skip
+        scene.with_arrays(
+            residual_rows=rows.astype(np.int32),
+            residual_offsets=offsets,
+            residual_log_scales=growths,
+            residual_quats=turns.astype(np.float32),
+            dynamics=random.normal(size=(300, 12)).astype(np.float32),
+            canonical_means=scene.means + np.float32(0.1),
+            classifier_weight=random.normal(size=(named, 16)).astype(np.float32),
+            classifier_bias=random.normal(size=named).astype(np.float32),
+            embeddings=units,
+            vocabulary_embeddings=units[:1],
+            canonical_embeddings=units[:1],
+            view_embeddings=units[:, None],
+        ),
+        vocabulary=("mug",),
+        lookup=Table(card, ("object",), views, limits, 0.1, "mean"),
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 5e-7])
@@ -119,12 +127,12 @@ def test_deleted_objects_are_gone_with_all_that_is_theirs():
     assert [group.object_id for group in result.groups] == [0, 1, 3, 1]
     assert result.groups[3].follows == 1 and notes == []
     keep = scene.object_ids != 2
-    assert_same(result, dataclasses.replace(scene, **{n: getattr(scene, n)[keep] for n in MATCHING}), MATCHING[:6])
-    np.testing.assert_array_equal(result.dynamics, scene.dynamics[keep])
+    assert_same(result, scene.with_arrays(**{n: scene.arrays()[n][keep] for n in MATCHING}), MATCHING[:6])
+    np.testing.assert_array_equal(result.dynamics.rates, scene.dynamics.rates[keep])
     np.testing.assert_array_equal(result.embeddings, scene.embeddings[[0, 1, 2, 4]])
     np.testing.assert_array_equal(result.view_embeddings, scene.view_embeddings[[0, 1, 2, 4]])
     assert result.lookup.thresholds == (0, 1, 2, 4) and result.lookup.views[3] == scene.lookup.views[4]
-    np.testing.assert_array_equal(result.classifier_weight, scene.classifier_weight[[0, 1, 3]])
+    np.testing.assert_array_equal(result.classifier.weight, scene.classifier.weight[[0, 1, 3]])
     for t in (0.1, 0.6, 0.95):
         np.testing.assert_array_equal(scene_player.frame(result, t).means, scene_player.frame(scene, t).means[keep])
 
@@ -149,13 +157,12 @@ def test_what_was_put_elsewhere_within_its_motion_moves_on_with_it(matrix):
     assert {name.split()[0] for name in notes} == {"'dynamics'", "'canonical_means'"}
     np.testing.assert_array_equal(result.track_poses, scene.track_poses)
     assert result.groups[1].model == scene.groups[1].model
-    base = dataclasses.replace(scene, residual_rows=None, residual_offsets=None, residual_quats=None,
-                               residual_log_scales=None)  # fmt: skip
+    base = dataclasses.replace(scene, residuals=None)
     for t in (0.0, 0.31, 0.75, 0.9):
         maps = played(scene, 1, [t])[0] @ matrix
         wanted = base.means[rows] @ maps[:3, :3].T + maps[:3, 3]
         bent = np.zeros(len(rows), bool)
-        bent[scene.residual_rows] = True
+        bent[scene.residuals.rows] = True
         straight = ~bent[rows]
         np.testing.assert_allclose(scene_player.frame(result, t).means[rows][straight], wanted[straight], atol=2e-5)
 
@@ -182,7 +189,7 @@ def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
     assert turned.kind == model.kind
     np.testing.assert_allclose(turned.velocity, linear @ model.velocity)
     np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
-    rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residual_rows)
+    rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residuals.rows)
     for t in (0.0, 0.31, 0.75, 0.99):
         wanted = scene_player.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
         np.testing.assert_allclose(scene_player.frame(result, t).means[rows], wanted, atol=2e-5)
@@ -215,7 +222,7 @@ def test_new_curves_become_a_track_and_the_nearest_model():
     result, notes = edit(scene, pieces)
     assert not [note for note in notes if "model" in note]
     rows = scene.object_ids == 2
-    bent = np.isin(np.flatnonzero(rows), scene.residual_rows)
+    bent = np.isin(np.flatnonzero(rows), scene.residuals.rows)
     for k in (0, 5, len(t) - 1):
         wanted = scene.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
         np.testing.assert_allclose(scene_player.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
@@ -273,7 +280,7 @@ def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_f
     np.testing.assert_array_equal(result.embeddings[-1], scene.embeddings[-1])
     assert result.lookup.thresholds[-1] == scene.lookup.thresholds[-1]
     rows, old = result.object_ids == 9, scene.object_ids == 3
-    straight = ~np.isin(np.flatnonzero(old), scene.residual_rows)
+    straight = ~np.isin(np.flatnonzero(old), scene.residuals.rows)
     for t in (0.2, 0.9):
         np.testing.assert_allclose(
             scene_player.frame(result, t).means[rows],

@@ -19,8 +19,7 @@ def scene():
     made, random = scenes.make_scene(n=300, objects=3, sh_degree=2, seed=3), np.random.default_rng(1)
     fade = (made.t_max - made.track_times)[None, :, None]
     offsets, turns, growths = (random.normal(size=(60, 1, 3)) * fade for _ in range(3))
-    return dataclasses.replace(
-        made,
+    return made.with_arrays(
         residual_rows=np.arange(0, 300, 5, dtype=np.int32),
         residual_offsets=offsets.astype(np.float32),
         residual_quats=rotations.rotvecs_to_quats(turns).astype(np.float32),
@@ -116,7 +115,7 @@ def test_points_flattened_onto_a_plane_are_no_affine_map(scene):
 
 
 def test_a_turned_plane_of_points_turns_its_shapes(scene):
-    flat = dataclasses.replace(scene, means=scene.means * np.array([1, 1, 0], np.float32))
+    flat = scene.with_arrays(means=scene.means * np.array([1, 1, 0], np.float32))
     matrix = some_map()
     _, (place,) = point_edits.extend(flat, [PointEdit(ROWS, mapped(flat.means[ROWS], matrix))])
     np.testing.assert_allclose(place.matrix, matrix, atol=1e-5)
@@ -148,8 +147,8 @@ def test_deleted_points_leave_the_numbers_of_the_others(scene):
     extended, (place,) = point_edits.extend(scene, [PointEdit(rows, scene.means[rows])])
     part = slice(place.start, place.start + place.count)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids"):
-        np.testing.assert_array_equal(getattr(extended, name)[part], getattr(scene, name)[rows], err_msg=name)
-        np.testing.assert_array_equal(getattr(extended, name)[:300], getattr(scene, name), err_msg=name)
+        np.testing.assert_array_equal(extended.arrays()[name][part], scene.arrays()[name][rows], err_msg=name)
+        np.testing.assert_array_equal(extended.arrays()[name][:300], scene.arrays()[name], err_msg=name)
 
 
 def test_given_shapes_and_colours_are_used_as_given(scene, rng):

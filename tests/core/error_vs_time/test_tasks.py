@@ -62,7 +62,7 @@ def field(scene):
     """The same scene with dynamics of its Gaussians."""
     rng = np.random.default_rng(0)
     dynamics = np.where(scene.motion_ids[:, None] > 0, rng.normal(scale=0.3, size=(len(scene.means), 12)), 0)
-    return dataclasses.replace(scene, dynamics=dynamics.astype(np.float32), canonical_means=scene.means)
+    return scene.with_arrays(dynamics=dynamics.astype(np.float32), canonical_means=scene.means)
 
 
 @pytest.fixture(scope="module")

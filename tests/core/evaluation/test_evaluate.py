@@ -77,7 +77,7 @@ def test_a_wrong_spin_is_a_rotation_error_of_that_many_degrees(scene, data):
 def test_swapped_names_cost_the_same_id_score_only(scene, data):
     swapped = np.array([0, 2, 1, 3])
     ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
-    result = evaluate.evaluate(dataclasses.replace(scene, object_ids=ids), data, splits=("val",), backend=BACKEND)
+    result = evaluate.evaluate(scene.with_arrays(object_ids=ids), data, splits=("val",), backend=BACKEND)
     values = result["splits"]["val"]["rigid"]
     assert values["miou_matched"] == 1.0
     assert values["miou"] < 0.5
@@ -119,13 +119,13 @@ def test_the_classifier_decides_the_id_map_where_there_is_one(scene):
     weight = np.zeros((len(classes), 16), np.float32)
     weight[:, : len(classes)] = np.eye(len(classes))
     bias = np.array([0.05, 0, 0, 0], np.float32)
-    coded = dataclasses.replace(scene, identities=codes, classifier_weight=weight, classifier_bias=bias)
+    coded = scene.with_arrays(identities=codes, classifier_weight=weight, classifier_bias=bias)
     camera = scenes.orbit_camera(0.5, pictures.WIDTH, pictures.HEIGHT)
     by_votes = evaluate.render(scene, camera, 0.9, backend=BACKEND).ids
     by_codes = evaluate.render(coded, camera, 0.9, backend=BACKEND).ids
     assert set(np.unique(by_codes)) == {0, 1, 2, 3}
     assert (by_votes == by_codes).mean() > 0.9
-    turned = dataclasses.replace(coded, classifier_weight=np.roll(weight, 1, axis=0), classifier_bias=np.roll(bias, 1))
+    turned = coded.with_arrays(classifier_weight=np.roll(weight, 1, axis=0), classifier_bias=np.roll(bias, 1))
     again = evaluate.render(turned, camera, 0.9, backend=BACKEND).ids
     np.testing.assert_array_equal(again, (by_codes + 1) % 4)
 
@@ -135,11 +135,11 @@ def test_transparent_pixels_are_compared_on_the_background_of_the_training(scene
     for path in (tmp_path / "clear" / "val").iterdir():
         images.write_png(path, np.zeros((pictures.HEIGHT, pictures.WIDTH, 4), np.uint8))
     clear = dataset.read(tmp_path / "clear")
-    empty = dataclasses.replace(scene, opacity_logits=np.full_like(scene.opacity_logits, -20))
+    empty = scene.with_arrays(opacity_logits=np.full_like(scene.opacity_logits, -20))
     for name, level in (("white", 1.0), ("black", 0.0)):
         sky = np.full((1, 3), (level - 0.5) / 0.28209479177387814, np.float32)
         provenance = {"config": {"train": {"background": name}}}
-        shown = dataclasses.replace(empty, background_sh=sky, provenance=provenance)
+        shown = dataclasses.replace(empty.with_arrays(background_sh=sky), provenance=provenance)
         result = evaluate.evaluate(shown, clear, splits=("val",), backend=BACKEND)
         assert result["splits"]["val"]["rigid"]["psnr"] == 100.0
 
@@ -204,7 +204,7 @@ def test_the_images_past_t_max_are_counted(scene, result):
 def test_the_table_says_what_its_overlap_is(scene, data):
     swapped = np.array([0, 2, 1, 3])
     ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
-    wrong = evaluate.evaluate(dataclasses.replace(scene, object_ids=ids), data, backend=BACKEND)
+    wrong = evaluate.evaluate(scene.with_arrays(object_ids=ids), data, backend=BACKEND)
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(evaluation_table.make(wrong))
     text = " ".join(console.export_text().split())

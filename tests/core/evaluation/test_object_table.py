@@ -50,8 +50,8 @@ def test_confidence_is_the_mean_probability_of_the_label_by_opacity(scene):
     codes[rows, [classes.index(i) for i in scene.object_ids[rows]]] = 1
     weight = np.zeros((len(classes), 16), np.float32)
     weight[:, : len(classes)] = 3 * np.eye(len(classes))
-    coded = dataclasses.replace(
-        scene, identities=codes, classifier_weight=weight, classifier_bias=np.zeros(len(classes), np.float32)
+    coded = scene.with_arrays(
+        identities=codes, classifier_weight=weight, classifier_bias=np.zeros(len(classes), np.float32)
     )
     sure = np.exp(3) / (np.exp(3) + len(classes) - 1)
     assert object_table.confidences(coded) == pytest.approx(dict.fromkeys(classes, sure))
@@ -61,13 +61,13 @@ def test_confidence_is_the_mean_probability_of_the_label_by_opacity(scene):
     opacities = 1 / (1 + np.exp(-scene.opacity_logits[mine].astype(np.float64)))
     share = opacities[0] / opacities.sum()
     other = 1 / (np.exp(3) + len(classes) - 1)
-    found = object_table.confidences(dataclasses.replace(coded, identities=wrong))
+    found = object_table.confidences(coded.with_arrays(identities=wrong))
     assert found[2] == pytest.approx((1 - share) * sure + share * other) and found[1] == pytest.approx(sure)
 
 
 def test_without_encodings_there_is_no_confidence(scene):
-    assert object_table.confidences(dataclasses.replace(scene, identities=None)) == {}
-    rows = object_table.measure(dataclasses.replace(scene, identities=None), object_table.own_views(scene)[:1])
+    assert object_table.confidences(scene.with_arrays(identities=None)) == {}
+    rows = object_table.measure(scene.with_arrays(identities=None), object_table.own_views(scene)[:1])
     assert all(row.confidence is None for row in rows)
     assert "stores no identity encodings" in " ".join(shown(scene, rows).split())
 
@@ -78,8 +78,8 @@ def test_strays_move_with_another_object_than_they_show(scene):
     mine = np.flatnonzero(scene.object_ids == 2)
     floor = np.flatnonzero((scene.object_ids == 0) & (scene.motion_ids == 0))
     ids[mine[:4]], ids[mine[4:6]], ids[floor[:3]] = 1, 0, 3
-    assert object_table.strays(dataclasses.replace(scene, motion_ids=ids)) == {0: 3, 2: 6}
-    still = dataclasses.replace(scene, groups=scene.groups[:1], motion_ids=np.zeros_like(ids))
+    assert object_table.strays(scene.with_arrays(motion_ids=ids)) == {0: 3, 2: 6}
+    still = dataclasses.replace(scene.with_arrays(motion_ids=np.zeros_like(ids)), groups=scene.groups[:1])
     assert object_table.strays(still) == {}  # nothing has a group of its own: all rest, as they should
 
 
@@ -92,7 +92,7 @@ def test_motion_is_told_in_the_words_of_the_sidebar(scene):
         poses = scene.track_poses.copy()
         poses[1] = [1, 0, 0, 0, 0, 0, 0]
         poses[1, 0, 4] = share * scene_summary.STILL * group.model.radius
-        noisy = dataclasses.replace(scene, track_poses=poses)
+        noisy = scene.with_arrays(track_poses=poses)
         assert scene_summary.motion_of(noisy, [group]) == word
 
 

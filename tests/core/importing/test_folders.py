@@ -242,12 +242,12 @@ def test_principal_axes_draw_what_any_quaternion_draws():
 
 def test_what_hardly_moves_is_left_out_and_what_is_kept_is_exact(deformed):
     every = importer.import_run(deformed, importer.Options(knots=5, still=0.0))
-    assert len(every.residual_rows) == foreign.COUNT
+    assert len(every.residuals.rows) == foreign.COUNT
     some = importer.import_run(deformed, importer.Options(knots=5, still=0.1))
-    assert 0 < len(some.residual_rows) < foreign.COUNT
-    np.testing.assert_array_equal(some.residual_offsets, every.residual_offsets[some.residual_rows])
-    left_out = np.setdiff1d(np.arange(foreign.COUNT), some.residual_rows)
-    assert np.linalg.norm(every.residual_offsets[left_out], axis=-1).max() < 0.1 * every.extent * 1.1
+    assert 0 < len(some.residuals.rows) < foreign.COUNT
+    np.testing.assert_array_equal(some.residuals.offsets, every.residuals.offsets[some.residuals.rows])
+    left_out = np.setdiff1d(np.arange(foreign.COUNT), some.residuals.rows)
+    assert np.linalg.norm(every.residuals.offsets[left_out], axis=-1).max() < 0.1 * every.extent * 1.1
 
 
 def test_rows_are_sampled_the_same_in_chunks(deformed, monkeypatch):
@@ -255,8 +255,8 @@ def test_rows_are_sampled_the_same_in_chunks(deformed, monkeypatch):
     monkeypatch.setattr(assembly, "CHUNK", 7)
     told = []
     parts = importer.import_run(deformed, importer.Options(knots=3), lambda *count: told.append(count))
-    np.testing.assert_array_equal(parts.residual_rows, whole.residual_rows)
-    np.testing.assert_allclose(parts.residual_offsets, whole.residual_offsets, atol=1e-6)
+    np.testing.assert_array_equal(parts.residuals.rows, whole.residuals.rows)
+    np.testing.assert_allclose(parts.residuals.offsets, whole.residuals.offsets, atol=1e-6)
     np.testing.assert_allclose(parts.means, whole.means, atol=1e-6)
     assert told == [(7, 24), (14, 24), (21, 24), (24, 24)]
 

@@ -58,7 +58,7 @@ def test_gaussian_splatting_stands_still(tmp_path):
     cloud = foreign.cloud()
     foreign.write_common(tmp_path / "run", cloud, 7000, "white_background=True, source_path='nowhere'")
     scene = imported(tmp_path / "run", tmp_path)
-    assert scene.residual_rows is None and scene.dynamics is None
+    assert scene.residuals is None and scene.dynamics is None
     assert [item.name for item in scene.objects] == ["background"]
     assert scene.world_convention == "colmap"
     assert len(scene.cameras) == 1  # the second entry is the same camera
@@ -85,8 +85,8 @@ def test_gaussian_grouping_gives_objects_by_its_classifier(tmp_path):
     np.testing.assert_allclose(scene.identities, cloud.identities.numpy()[order], rtol=1e-3, atol=1e-3)
     present = np.union1d(labels, [0])
     assert [item.name for item in scene.objects] == ["background", *(f"object {k}" for k in present if k > 0)]
-    np.testing.assert_allclose(scene.classifier_weight, weight[present, :, 0, 0], atol=1e-7)
-    again = (scene.identities.astype(np.float32) @ scene.classifier_weight.T + scene.classifier_bias).argmax(1)
+    np.testing.assert_allclose(scene.classifier.weight, weight[present, :, 0, 0], atol=1e-7)
+    again = (scene.identities.astype(np.float32) @ scene.classifier.weight.T + scene.classifier.bias).argmax(1)
     assert (present[again] == scene.object_ids).mean() > 0.9  # identities are kept as float16
     sorted_rule = foreign.resting(cloud)
     assert_drawn(scene, 0.0, Drawn(sorted_rule.means[order], sorted_rule.covariances[order]), tolerance=1e-6)
@@ -250,8 +250,8 @@ def test_freegave_keeps_what_hardly_moves_as_at_time_zero(tmp_path):
     for name, weights in {"deform": deform, "vel": velocity, "code_field": codes}.items():
         foreign.write_weights(folder / f"{name}.pth", weights)
     scene = imported(tmp_path / "run", tmp_path, knots=4)
-    assert scene.residual_rows is None or len(scene.residual_rows) == 0
-    assert (scene.dynamics == 0).all()
+    assert scene.residuals is None or len(scene.residuals.rows) == 0
+    assert (scene.dynamics.rates == 0).all()
     code, _ = code_and_shares(codes, cloud)
     moved, turn, growth = foreign.deform(deform, 6, 8, cloud.means, 0.0, code)
     assert_drawn(scene, 0.4, foreign.twisted(cloud, moved, turn, growth, None, 0.0))

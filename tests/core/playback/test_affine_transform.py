@@ -129,9 +129,14 @@ def test_what_bends_is_bent_as_the_renderer_bends_it(t, turns_harmonics):
     turns = rotations.rotvecs_to_quats(0.5 * random.normal(size=offsets.shape)).astype(np.float32)
     offsets[:, -1], growths[:, -1], turns[:, -1] = 0, 0, (1, 0, 0, 0)
     scene = dataclasses.replace(
-        scene, residual_rows=rows.astype(np.int32), residual_offsets=offsets, residual_quats=turns,
-        residual_log_scales=growths, harmonics_turn=turns_harmonics,
-    )  # fmt: skip
+        scene.with_arrays(
+            residual_rows=rows.astype(np.int32),
+            residual_offsets=offsets,
+            residual_quats=turns,
+            residual_log_scales=growths,
+        ),
+        harmonics_turn=turns_harmonics,
+    )
     matrix, start, count = matrix_of(0.6 * TURN), 60, 120
     bend = affine_transform.bend_of(residuals.Residuals(scene), t, start, count)
     assert (bend is None) == (t == 0.75)

@@ -26,7 +26,7 @@ def rigid_dynamics(scene: Scene, twist: np.ndarray = TWIST) -> Scene:
             v, w, a, e = twist
             own_v, own_a = se3.recentre(w, v, e, a, scene.means[rows] - group.pivot)
             dynamics[rows] = np.concatenate([own_v, w + 0 * own_v, own_a, e + 0 * own_v], -1)
-    return dataclasses.replace(scene, dynamics=dynamics, canonical_means=scene.means.copy())
+    return scene.with_arrays(dynamics=dynamics, canonical_means=scene.means.copy())
 
 
 def only(scene: Scene, group: int, source: str) -> models.MotionModel:
@@ -61,20 +61,20 @@ def test_the_fitted_source_is_what_the_scene_holds(scene):
 def test_where_the_world_has_its_origin_does_not_matter(source):
     base = make_scene(300)
     means = np.round(base.means * 512) / 512  # float32 holds these far from the origin, too
-    near = rigid_dynamics(dataclasses.replace(base, means=means.astype(np.float32)))
-    noise = np.random.default_rng(0).normal(scale=0.05, size=near.dynamics.shape)
-    near = dataclasses.replace(near, dynamics=near.dynamics + noise * (near.dynamics != 0))
+    near = rigid_dynamics(base.with_arrays(means=means.astype(np.float32)))
+    noise = np.random.default_rng(0).normal(scale=0.05, size=near.dynamics.rates.shape)
+    near = near.with_arrays(dynamics=near.dynamics.rates + noise * (near.dynamics.rates != 0))
     shift = np.array([8192.0, -8192.0, 4096.0])
     groups = tuple(dataclasses.replace(g, pivot=g.pivot + shift) for g in near.groups)
-    far = dataclasses.replace(near, means=(means + shift).astype(np.float32), groups=groups)
+    far = dataclasses.replace(near.with_arrays(means=(means + shift).astype(np.float32)), groups=groups)
     np.testing.assert_allclose(rates(only(far, 1, source)), rates(only(near, 1, source)), rtol=0, atol=1e-9)
 
 
 def test_the_representative_speaks_for_all(scene):
     row = scene.groups[1].anchor_index
-    dynamics = scene.dynamics.copy()
+    dynamics = scene.dynamics.rates.copy()
     dynamics[row] = 0.0
-    changed = dataclasses.replace(scene, dynamics=dynamics)
+    changed = scene.with_arrays(dynamics=dynamics)
     assert only(changed, 1, "representative").is_static
     np.testing.assert_allclose(rates(only(changed, 1, "median")), TWIST, atol=1e-6)
 
@@ -83,31 +83,31 @@ def test_the_representative_speaks_for_all(scene):
 def test_faint_members_do_not_vote_and_a_few_bad_ones_do_not_matter(scene, source):
     members, rng = np.flatnonzero(scene.motion_ids == 1), np.random.default_rng(3)
     faint, bad = members[: len(members) // 2], members[-len(members) // 10 :]
-    dynamics, logits = scene.dynamics.copy(), np.full(len(scene.means), 3.0, np.float32)
+    dynamics, logits = scene.dynamics.rates.copy(), np.full(len(scene.means), 3.0, np.float32)
     dynamics[faint] += rng.normal(scale=5.0, size=(len(faint), 12))
     logits[faint] = -3.0
-    wrong = dataclasses.replace(scene, dynamics=dynamics, opacity_logits=logits)
+    wrong = scene.with_arrays(dynamics=dynamics, opacity_logits=logits)
     np.testing.assert_allclose(rates(only(wrong, 1, source)), TWIST, atol=2e-5 if source == "kabsch" else 1e-6)
     dynamics[bad] += rng.normal(scale=5.0, size=(len(bad), 12))
-    wrong = dataclasses.replace(wrong, dynamics=dynamics)
+    wrong = wrong.with_arrays(dynamics=dynamics)
     np.testing.assert_allclose(rates(only(wrong, 1, source)), TWIST, atol=2e-2)
 
 
 def test_where_all_are_faint_all_vote(scene):
-    faint = dataclasses.replace(scene, opacity_logits=np.full(len(scene.means), -4.0, np.float32))
+    faint = scene.with_arrays(opacity_logits=np.full(len(scene.means), -4.0, np.float32))
     np.testing.assert_allclose(rates(only(faint, 1, "median")), TWIST, atol=1e-6)
 
 
 @pytest.mark.parametrize(("source", "right"), [("median", False), ("least_squares", True), ("kabsch", True)])
 def test_spins_that_training_cannot_see_do_not_mislead_fits_to_what_it_sees(scene, source, right):
     """Members that move like the body but do not spin themselves: only v + w x r is seen in training."""
-    dynamics = np.asarray(scene.dynamics, np.float64).copy()
+    dynamics = np.asarray(scene.dynamics.rates, np.float64).copy()
     for group in scene.groups:
         rows = np.flatnonzero(scene.motion_ids == group.id)
         v, w, a, _ = np.split(dynamics[rows], 4, axis=-1)
         dynamics[rows, 6:9] = a + rotations.cross(w, v)  # what the twist adds to the acceleration
     dynamics[:, 3:6], dynamics[:, 9:] = 0.0, 0.0
-    model = only(dataclasses.replace(scene, dynamics=dynamics), 1, source)
+    model = only(scene.with_arrays(dynamics=dynamics), 1, source)
     error = np.abs(rates(model)[:2] - TWIST[:2]).max()
     assert error < 0.05 if right else error > 0.5
 
@@ -117,7 +117,7 @@ def test_a_line_of_members_takes_the_spin_about_itself_from_them(scene, source):
     members = np.flatnonzero(scene.motion_ids == 1)
     means = scene.means.copy()
     means[members] = scene.groups[1].pivot + np.linspace(-0.25, 0.25, len(members))[:, None] * [1.0, 0, 0]
-    line = rigid_dynamics(dataclasses.replace(scene, means=means))
+    line = rigid_dynamics(scene.with_arrays(means=means))
     np.testing.assert_allclose(rates(only(line, 1, source)), TWIST, atol=2e-2)
 
 
@@ -128,7 +128,7 @@ def test_groups_of_one_and_two_members_have_a_motion(scene, source, count):
     ids = scene.motion_ids.copy()
     ids[members[count:]] = 0
     groups = tuple(dataclasses.replace(g, anchor_index=int(members[0])) if g.id == 1 else g for g in scene.groups)
-    model = only(dataclasses.replace(scene, motion_ids=ids, groups=groups), 1, source)
+    model = only(dataclasses.replace(scene.with_arrays(motion_ids=ids), groups=groups), 1, source)
     assert np.isfinite(rates(model)).all()
     quats, displacement = models.evaluate(model, 0.2)
     pivot = scene.groups[1].pivot
@@ -141,7 +141,7 @@ def test_groups_of_one_and_two_members_have_a_motion(scene, source, count):
 def test_kabsch_carries_members_where_their_own_dynamics_bring_them(scene):
     rng = np.random.default_rng(5)
     noise = rng.normal(scale=[0.1] * 3 + [0.8] * 3 + [0.1] * 3 + [0.8] * 3, size=(len(scene.means), 12))
-    rough = dataclasses.replace(scene, dynamics=scene.dynamics + noise * (scene.dynamics != 0))
+    rough = scene.with_arrays(dynamics=scene.dynamics.rates + noise * (scene.dynamics.rates != 0))
     t = T_MAX * (1 + group_dynamics.HORIZON)
     goal = scene_player.frame(rough, t, "standard").means
     body = scene.motion_ids == 1

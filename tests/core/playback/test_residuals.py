@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -22,8 +20,7 @@ def bending() -> Scene:
     rows = np.arange(0, 90, 3, dtype=np.int32)
     fade = (T_MAX - TIMES)[None, :, None]
     turns = rotations.rotvecs_to_quats(rng.normal(size=(len(rows), 1, 3)) * fade)
-    return dataclasses.replace(
-        scene,
+    return scene.with_arrays(
         residual_rows=rows,
         residual_offsets=(rng.normal(size=(len(rows), 1, 3)) * fade).astype(np.float32),
         residual_quats=turns.astype(np.float32),
@@ -43,20 +40,20 @@ def twisting(scene: Scene) -> Scene:
         v, a = se3.recentre(w, v, e, a, scene.means[rows].astype(float))
         tile = np.ones((len(rows), 1))
         dynamics[rows] = np.concatenate([v, tile * w, a, tile * e], -1)
-    return dataclasses.replace(scene, dynamics=dynamics, canonical_means=scene.means.copy())
+    return scene.with_arrays(dynamics=dynamics, canonical_means=scene.means.copy())
 
 
 @pytest.mark.parametrize("k", [0, 3, 7])
 def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
     frame, i = scene_player.frame(bending, float(TIMES[k])), 11
-    row = int(bending.residual_rows[i])
+    row = int(bending.residuals.rows[i])
     group = bending.groups[int(bending.motion_ids[row])]
     q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
-    bent = bending.means[row] + bending.residual_offsets[i, k]
+    bent = bending.means[row] + bending.residuals.offsets[i, k]
     np.testing.assert_allclose(frame.means[row], group.pivot + rotations.rotate(q, bent - group.pivot) + d, atol=1e-5)
-    turned = rotations.multiply(bending.residual_quats[i, k].astype(float), bending.quats[row].astype(float))
+    turned = rotations.multiply(bending.residuals.quats[i, k].astype(float), bending.quats[row].astype(float))
     assert rotations.angle_between(rotations.multiply(q, turned), frame.quats[row].astype(float)) < 1e-4
-    np.testing.assert_allclose(frame.log_scales[row], bending.log_scales[row] + bending.residual_log_scales[i, k])
+    np.testing.assert_allclose(frame.log_scales[row], bending.log_scales[row] + bending.residuals.log_scales[i, k])
 
 
 def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
@@ -69,9 +66,9 @@ def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
 
 
 def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
-    flipped = bending.residual_quats.copy()
+    flipped = bending.residuals.quats.copy()
     flipped[:, ::2] *= -1
-    other = dataclasses.replace(bending, residual_quats=flipped)
+    other = bending.with_arrays(residual_quats=flipped)
     for t in (0.02, 0.13, 0.5):
         a, b = scene_player.frame(bending, t).quats, scene_player.frame(other, t).quats
         assert rotations.angle_between(a.astype(float), b.astype(float)).max() < 1e-3
@@ -93,9 +90,9 @@ def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
     np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
     body = scene.motion_ids == 1
     turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
-    canonical = scene.canonical_means.astype(float)
+    canonical = scene.dynamics.canonical_means.astype(float)
     canonical[body] = rotations.rotate(turn, canonical[body])
-    turned = dataclasses.replace(scene, canonical_means=canonical.astype(np.float32))
+    turned = scene.with_arrays(canonical_means=canonical.astype(np.float32))
     off = scene_player.frame(turned, 1.0, "rigid_paper").means.astype(float)
     after, before = off[body], scene.means[body].astype(float)
     pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
@@ -113,7 +110,7 @@ def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
     assert mode in scene_player.modes(scene)
     frame, rigid = scene_player.frame(scene, T_MAX, mode), scene_player.frame(scene, 0.2)
     for name in ("means", "quats"):
-        np.testing.assert_array_equal(getattr(frame, name), getattr(scene, name))
+        np.testing.assert_array_equal(getattr(frame, name), scene.arrays()[name])
         np.testing.assert_array_equal(getattr(scene_player.frame(scene, 0.2, mode), name), getattr(rigid, name))
     np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
 
@@ -147,16 +144,16 @@ def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
     offsets = np.zeros((len(rows), len(TIMES), 3), np.float32)
     offsets[:, :-1, 0] = size
     quats = np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), len(TIMES), 1))
-    return dataclasses.replace(
-        scene, residual_rows=rows, residual_offsets=offsets, residual_quats=quats, residual_log_scales=0 * offsets
+    return scene.with_arrays(
+        residual_rows=rows, residual_offsets=offsets, residual_quats=quats, residual_log_scales=0 * offsets
     )
 
 
 @pytest.mark.parametrize("variant", ["", "/least_squares"])
 def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
-    dynamics = twisted.dynamics + (twisted.dynamics != 0) * np.float32(0.2)
+    dynamics = twisted.dynamics.rates + (twisted.dynamics.rates != 0) * np.float32(0.2)
     dynamics[np.flatnonzero(twisted.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
-    scene = dataclasses.replace(twisted, dynamics=dynamics)
+    scene = twisted.with_arrays(dynamics=dynamics)
     rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
     everyone = np.arange(len(scene.means), dtype=np.int32)
     some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
@@ -175,11 +172,11 @@ def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, v
 
 def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
     """Where f_def is a translation, offsets in the canonical state are those at t_max."""
-    dynamics = twisted.dynamics.copy()
+    dynamics = twisted.dynamics.rates.copy()
     dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
     dynamics[:, 9:] *= 0.1
     moved = twisted.means + np.float32(0.3) * (twisted.motion_ids[:, None] == 1)
-    scene = dataclasses.replace(twisted, dynamics=dynamics, canonical_means=moved.astype(np.float32))
+    scene = twisted.with_arrays(dynamics=dynamics, canonical_means=moved.astype(np.float32))
     literal, rigid = (scene_player.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
     np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
     np.testing.assert_allclose(literal.quats, rigid.quats, atol=1e-4)
@@ -187,9 +184,9 @@ def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
 
 def test_an_anchored_background_goes_with_its_representative(twisted):
     still = twisted.motion_ids == 0
-    dynamics = twisted.dynamics.copy()
+    dynamics = twisted.dynamics.rates.copy()
     dynamics[still, :3] = [0.3, 0.0, -0.1]
-    scene = dataclasses.replace(twisted, dynamics=dynamics)
+    scene = twisted.with_arrays(dynamics=dynamics)
     pinned, anchored = (scene_player.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
     np.testing.assert_array_equal(pinned.means[still], scene.means[still])
     moved = 0.25 * np.array([0.3, 0.0, -0.1])
@@ -199,7 +196,7 @@ def test_an_anchored_background_goes_with_its_representative(twisted):
 
 
 def test_modes_without_canonical_places_lack_the_literal_form():
-    scene = dataclasses.replace(twisting(make_scene(60)), canonical_means=None)
+    scene = twisting(make_scene(60)).with_arrays(canonical_means=None)
     assert {scene_player.split(mode)[0] for mode in scene_player.modes(scene)} == {"rigid", "hybrid", "standard"}
 
 
@@ -213,8 +210,8 @@ def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
     exact = scene_file.read(scene_file.write(scene, tmp_path / "exact.r5dgs", exact=True))
     small = scene_file.read(scene_file.write(scene, tmp_path / "small.r5dgs"))
     for name in ("residual_rows", "residual_offsets", "residual_log_scales", "dynamics", "canonical_means"):
-        np.testing.assert_array_equal(getattr(exact, name), getattr(scene, name))
-        np.testing.assert_allclose(getattr(small, name), getattr(scene, name), atol=2e-3)
+        np.testing.assert_array_equal(exact.arrays()[name], scene.arrays()[name])
+        np.testing.assert_allclose(small.arrays()[name], scene.arrays()[name], atol=2e-3)
     assert scene_info.info(small)["modes"] == list(scene_player.modes(scene))
     assert scene_info.info(small)["residuals"] == 30
 
@@ -222,12 +219,12 @@ def test_residuals_and_dynamics_survive_the_file(bending, tmp_path):
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"residual_quats": None}, "all four"),
+        ({"residual_quats": None}, "residual_quats: expected an array beside"),
         ({"residual_rows": np.arange(30, dtype=np.int32)[::-1].copy()}, "increasing rows"),
         ({"residual_offsets": np.ones((30, len(TIMES), 3), np.float32)}, "zero at t_max"),
-        ({"canonical_means": np.zeros((90, 3), np.float32)}, "dynamics"),
+        ({"canonical_means": np.zeros((90, 3), np.float32)}, "dynamics: expected an array beside"),
     ],
 )
 def test_inconsistent_residuals_are_not_written(bending, tmp_path, change, named):
     with pytest.raises(errors.SceneFileError, match=named):
-        scene_file.write(dataclasses.replace(bending, **change), tmp_path / "bad.r5dgs")
+        scene_file.write(bending.with_arrays(**change), tmp_path / "bad.r5dgs")

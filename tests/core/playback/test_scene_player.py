@@ -84,7 +84,7 @@ def test_slopes_are_exact_for_parabolas_on_uneven_times():
 def test_signs_in_the_file_do_not_matter(scene):
     flipped = scene.track_poses.copy()
     flipped[:, ::2, :4] *= -1
-    other = dataclasses.replace(scene, track_poses=flipped)
+    other = scene.with_arrays(track_poses=flipped)
     for t in (0.13, 0.5, 0.74):
         for a, b in zip(scene_player.group_poses(scene, t), scene_player.group_poses(other, t), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-14)
@@ -123,10 +123,10 @@ def test_shading_follows_the_light_in_the_objects_frame(scene):
     frame = scene_player.frame(scene, 1.1)
     row = int(np.flatnonzero(scene.motion_ids == 1)[0])
     rotmat = rotations.quats_to_rotmats(frame.group_quats[1])
-    light = scene.light_direction
-    expected = 1 + (rotmat.T @ light - light) @ scene.shading[row]
+    light = scene.shading.light
+    expected = 1 + (rotmat.T @ light - light) @ scene.shading.vectors[row]
     assert frame.shading_factor[row] == pytest.approx(max(expected, 0), rel=1e-5)
-    dark = dataclasses.replace(scene, shading=scene.shading * 1e4)
+    dark = scene.with_arrays(shading=scene.shading.vectors * 1e4)
     assert scene_player.frame(dark, 1.1).shading_factor.min() == 0
     assert scene_player.frame(make_scene(shading=False), 1.1).shading_factor is None
 
@@ -144,7 +144,7 @@ def test_scenes_without_gaussians_objects_or_motion_play():
     still = make_scene(n=30, objects=0)
     np.testing.assert_array_equal(scene_player.frame(still, 5.0).means, still.means)
     base = make_scene()
-    single = dataclasses.replace(base, track_times=base.track_times[-1:], track_poses=base.track_poses[:, -1:])
+    single = base.with_arrays(track_times=base.track_times[-1:], track_poses=base.track_poses[:, -1:])
     np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.means)
 
 
@@ -154,7 +154,7 @@ def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
     """Where the origin is the body's own place, to single precision of the body's size."""
     away = np.array([1.0, -1.0, 0.5]) * shift
     groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
-    moved = dataclasses.replace(scene, means=(scene.means + away).astype(np.float32), groups=groups)
+    moved = dataclasses.replace(scene.with_arrays(means=(scene.means + away).astype(np.float32)), groups=groups)
     player = scene_player.Player(moved)
     _, displacements = player.group_poses(t)
     for start, stop, g in row_runs.runs(moved.motion_ids):

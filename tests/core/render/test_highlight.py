@@ -25,8 +25,8 @@ def rows_of(scene, object_id):
     """The scene with nothing but one object's Gaussians."""
     kept = scene.object_ids == object_id
     arrays = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "shading")
-    cut = {name: getattr(scene, name)[kept] for name in arrays}
-    return dataclasses.replace(scene, **cut, identities=None)
+    cut = {name: scene.arrays()[name][kept] for name in arrays}
+    return scene.with_arrays(**cut, identities=None)
 
 
 @pytest.mark.parametrize("t", [0.2, LATER])
@@ -64,8 +64,7 @@ def test_what_is_not_asked_for_is_gray_and_dim(scene):
 def test_an_object_is_alone_even_where_others_hide_it(scene):
     toward = scene.means[scene.object_ids == 1].mean(0) - CAMERA.center
     behind = [item for item in scene.objects if item.id == 1]
-    wall = dataclasses.replace(
-        scene,
+    wall = scene.with_arrays(
         means=np.where((scene.object_ids == 3)[:, None], CAMERA.center + 0.5 * toward, scene.means).astype(np.float32),
         log_scales=np.where((scene.object_ids == 3)[:, None], 0.0, scene.log_scales).astype(np.float32),
     )
@@ -112,7 +111,7 @@ def test_candidates_are_cameras_at_times(scene):
 def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
     scene = scenes.make_scene(n=400, objects=3, seed=2, world_convention=convention)
     turn = cameras.WORLD_TO_BLENDER[convention].T
-    turned = dataclasses.replace(scene, means=(scene.means @ turn.T).astype(np.float32), cameras=())
+    turned = dataclasses.replace(scene.with_arrays(means=(scene.means @ turn.T).astype(np.float32)), cameras=())
     camera = viewpoints.overview(turned)
     pixels, depth = cameras.project(camera, turned.means[turned.object_ids > 0].astype(np.float64))
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)

@@ -89,7 +89,7 @@ def test_where_almost_all_moves_everything_is_drawn(scene, made):
 
 def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
     scene = scenes.make_scene(n=900, seed=3)
-    flat = dataclasses.replace(scene, means=scene.means * np.array([1, 1, 0], np.float32))
+    flat = scene.with_arrays(means=scene.means * np.array([1, 1, 0], np.float32))
     above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
     instances = group_instances(flat, 1.0)
     instances = [Instance(one.start, one.count, np.eye(4)) for one in instances]
@@ -120,8 +120,8 @@ def test_a_bad_instance_is_numbered_as_the_caller_does(scene):
 def pair():
     """Two scenes of other degrees, one with shading and a light, one without; and where the second one's world lies."""
     lit = scenes.make_scene(n=500, sh_degree=1, seed=3)
-    plain = dataclasses.replace(scenes.make_scene(n=400, sh_degree=0, seed=8), shading=None, light_direction=None)
-    assert lit.shading is not None and lit.light_direction is not None
+    plain = scenes.make_scene(n=400, sh_degree=0, seed=8, shading=False)
+    assert lit.shading is not None and lit.shading is not None
     return lit, plain, matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 0.7)
 
 
@@ -171,7 +171,7 @@ def test_a_tint_is_that_of_the_harmonics(degree):
     tint, c0 = np.array([0.3, 1.5, 0.0]), 0.28209479177387814
     sh = tint * scene.sh.astype(np.float64)
     sh[:, 0] = (tint * (0.5 + c0 * scene.sh[:, 0]) - 0.5) / c0
-    painted = dataclasses.replace(scene, sh=sh.astype(np.float32))
+    painted = scene.with_arrays(sh=sh.astype(np.float32))
     n = len(scene.means)
     one = incremental_renderer.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
     other = incremental_renderer.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
@@ -205,7 +205,7 @@ def test_another_tint_or_near_limit_is_another_picture(pair):
 def test_a_sky_turns_with_its_world(pair):
     lit, _, world = pair
     sky = np.random.default_rng(0).normal(scale=0.3, size=(9, 3)).astype(np.float32)
-    scene = dataclasses.replace(lit, background_sh=sky)
+    scene = lit.with_arrays(background_sh=sky)
     rigid = matrix((0.9, 0.2, -0.3, 0.1), (0.5, -0.3, 0.2), 1.0)
     eye = dataclasses.replace(CAMERA, T_cam_world=CAMERA.T_cam_world @ rigid)
     found = incremental_renderer.Stage(scene).render([], CAMERA, sky=incremental_renderer.Sky(0, rigid))
@@ -243,8 +243,7 @@ def bending(request):
     rows = np.arange(0, 600, 3, dtype=np.int32)
     fade = (scenes.T_MAX - scenes.TIMES)[None, :, None]
     offsets, turns, growths = (size * rng.normal(size=(len(rows), 1, 3)) * fade for size in (0.3, 2.0, 0.5))
-    return dataclasses.replace(
-        scene,
+    return scene.with_arrays(
         residual_rows=rows,
         residual_offsets=offsets.astype(np.float32),
         residual_quats=rotations.rotvecs_to_quats(turns).astype(np.float32),

@@ -13,8 +13,7 @@ from tests.support import scenes
 def scene():
     made = scenes.make_scene(n=120, objects=2, seed=2)
     still = tuple(dataclasses.replace(group, rigid_rms=0.0, rigid_max=0.0) for group in made.groups)
-    return dataclasses.replace(made, groups=still, residual_rows=None, residual_offsets=None, residual_quats=None,
-                               residual_log_scales=None)  # fmt: skip
+    return dataclasses.replace(made, groups=still, residuals=None)
 
 
 @pytest.fixture

@@ -167,13 +167,14 @@ def rich():
     mean = vectors.mean(1)
     norms = np.linalg.norm(mean, axis=-1, keepdims=True)
     return dataclasses.replace(
-        scene,
-        embeddings=np.divide(mean, norms, out=np.zeros_like(mean), where=norms > 0),
+        scene.with_arrays(
+            embeddings=np.divide(mean, norms, out=np.zeros_like(mean), where=norms > 0),
+            vocabulary_embeddings=np.eye(4, dtype=np.float32)[:2],
+            canonical_embeddings=np.eye(4, dtype=np.float32)[3:],
+            view_embeddings=vectors,
+        ),
         vocabulary=("mug", "fruit"),
-        vocabulary_embeddings=np.eye(4, dtype=np.float32)[:2],
         lookup=table,
-        canonical_embeddings=np.eye(4, dtype=np.float32)[3:],
-        view_embeddings=vectors,
     )
 
 

@@ -139,10 +139,8 @@ def test_stored_embeddings_answer_words_that_no_name_has(scene):
     row = next(i for i, item in enumerate(scene.objects) if item.id == LEMON)
     near = 0.8 * axes[row] + 0.6 * axes[count]
     rich = dataclasses.replace(
-        scene,
-        embeddings=axes[:count],
+        scene.with_arrays(embeddings=axes[:count], vocabulary_embeddings=np.stack([near, axes[count + 1]])),
         vocabulary=("sour thing", "zeppelin"),
-        vocabulary_embeddings=np.stack([near, axes[count + 1]]),
     )
     (match,) = object_search.search(rich, "sour things")
     assert match.object_id == LEMON

@@ -100,7 +100,7 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     scene = bake.bake(whole)
     validation.check(scene, "scene")
     assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]
-    assert scene.provenance["discovered"] and scene.classifier_weight is None
+    assert scene.provenance["discovered"] and scene.classifier is None
     shadows = {group.id for group in scene.groups if group.role == "shadow"}
     bodies = ~np.isin(scene.motion_ids, list(shadows))
     np.testing.assert_array_equal(scene.object_ids[bodies], scene.motion_ids[bodies])
@@ -144,7 +144,7 @@ def test_a_field_without_masks_sorts_what_moves_in_the_end(unmasked, tmp_path, m
     scene = bake.bake(made)
     validation.check(scene, "scene")
     assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]
-    assert scene.provenance["discovered"] and scene.classifier_weight is None
+    assert scene.provenance["discovered"] and scene.classifier is None
     counts = {item.id: item.count for item in scene.objects}
     (labels,) = sorted_ones
     assert counts == {k: int((labels == k - 1).sum()) for k in range(3)}

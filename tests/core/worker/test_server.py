@@ -254,12 +254,13 @@ def test_what_is_known_of_the_error_comes_with_the_picture(path, tmp_path):
     offsets = np.full((*shape, 3), 0.1, np.float32)
     offsets[:, -1] = 0
     bent = dataclasses.replace(
-        scene,
+        scene.with_arrays(
+            residual_rows=rows,
+            residual_offsets=offsets,
+            residual_quats=np.tile(np.float32([1, 0, 0, 0]), (*shape, 1)),
+            residual_log_scales=np.zeros((*shape, 3), np.float32),
+        ),
         name="bent",
-        residual_rows=rows,
-        residual_offsets=offsets,
-        residual_quats=np.tile(np.float32([1, 0, 0, 0]), (*shape, 1)),
-        residual_log_scales=np.zeros((*shape, 3), np.float32),
     )
     other = scene_file.write(bent, tmp_path / "bent.r5dgs")
     loads = {"command": "load", "paths": [str(path), str(other)]}

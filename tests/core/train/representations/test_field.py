@@ -170,7 +170,7 @@ def test_the_baked_scene_is_valid_and_shows_what_was_trained(made, scene):
     trainer.restore(checkpoint.load(made.folder))
     assert scene.t_max == pytest.approx(0.7)
     assert {mode.partition("/")[0] for mode in scene_player.modes(scene)} == set(scene_player.MODES)
-    assert [g.role for g in scene.groups][:3] == ["pinned", "body", "body"] and scene.residual_rows is not None
+    assert [g.role for g in scene.groups][:3] == ["pinned", "body", "body"] and scene.residuals is not None
     pairs = zip(trainer.dataset.train, trainer.views, strict=True)
     for view, trained_view in [pair for pair in pairs if pair[0].t < scene.t_max][::5]:
         with torch.no_grad():

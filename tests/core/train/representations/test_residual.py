@@ -279,7 +279,7 @@ def test_what_breathes_is_found_and_what_is_rigid_keeps_no_residuals(breathing):
     assert tensors["residual.gains"][BALL - 1] > 0.5 > tensors["residual.gains"][BRICK - 1]
     row = next(row for row in scene.needs if row["name"] == "residuals")
     assert row["decision"] == "on" and "ball (+" in row["reason"] and "1 of 2 objects are rigid" in row["reason"]
-    assert set(scene.motion_ids[scene.residual_rows].tolist()) == {BALL}
+    assert set(scene.motion_ids[scene.residuals.rows].tolist()) == {BALL}
     assert scene.groups[BRICK].rigid_rms == scene.groups[BRICK].rigid_max == 0
     assert 0.02 < scene.groups[BALL].rigid_rms < scene.groups[BALL].rigid_max < 1
 
@@ -304,10 +304,10 @@ def test_residuals_bring_the_images_of_what_breathes_closer(breathing):
 
 def test_the_ball_grows_and_shrinks_as_it_did(breathing):
     data, _, scene = breathing
-    rows = scene.residual_rows
+    rows = scene.residuals.rows
     arms = scene.means[rows] - scene.groups[BALL].pivot
     far = np.linalg.norm(arms, axis=1) > 0.2
-    sizes = [np.linalg.norm(arms[far] + scene.residual_offsets[far, s], axis=1).mean() for s in range(6)]
+    sizes = [np.linalg.norm(arms[far] + scene.residuals.offsets[far, s], axis=1).mean() for s in range(6)]
     true = 1 + 0.35 * np.sin(2 * np.pi * (tiny_datasets.T_MAX - tiny_datasets.OBSERVED) / 0.6)
     assert np.corrcoef(sizes, true)[0, 1] > 0.9
 
@@ -335,7 +335,7 @@ def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathin
 def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     _, done, scene = breathing
     plain = bake.run_bake(done.folder, tmp_path / "plain.r5dgs", None, ["needs.residuals=off"])
-    assert plain.residual_rows is None and plain.groups[BALL].rigid_max == 0
+    assert plain.residuals is None and plain.groups[BALL].rigid_max == 0
     assert np.array_equal(plain.means, scene.means)
     row = next(row for row in plain.needs if row["name"] == "residuals")
     assert row["decision"] == "off" and row["reason"].startswith("set off by you")
