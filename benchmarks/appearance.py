@@ -138,7 +138,7 @@ class Sight:
 
     def __init__(self, scene: Scene, views: Sequence[datasets.View]):
         self.scene = scene
-        self.directions = np.zeros((len(views), len(scene.means), 3), np.float32)  # zero where a view has not
+        self.directions = np.zeros((len(views), len(scene.gaussians.means), 3), np.float32)  # zero where a view has not
         player = scene_player.Player(scene)
         for k, view in enumerate(views):
             frame = player.frame(view.t)
@@ -180,9 +180,9 @@ def visibility(scene: Scene, frame: scene_player.Frame, camera: Camera) -> np.nd
 
 def resting(scene: Scene) -> np.ndarray:
     """Gaussians of groups that neither move themselves nor follow one that does. [N] bool"""
-    still = np.array([g.model.is_static and not np.any(scene.track_poses[g.id, :, 1:]) for g in scene.groups])
+    still = np.array([g.model.is_static and not np.any(scene.tracks.poses[g.id, :, 1:]) for g in scene.groups])
     follow = np.array([True if g.follows is None else still[g.follows] for g in scene.groups])
-    return (still & follow)[scene.motion_ids]
+    return (still & follow)[scene.gaussians.motion_ids]
 
 
 def kinds(scene: Scene, sight: Sight, picture: Picture) -> np.ndarray:

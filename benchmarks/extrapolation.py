@@ -36,7 +36,7 @@ def refitted(scene: Scene, name: str) -> Scene:
     names = (name, pose_task.STEADY[name]) if name in pose_task.STEADY else (name,)
     groups = []
     for group in scene.groups:
-        if group.role == "body" and np.any(scene.track_poses[group.id][:, 1:] != 0):
+        if group.role == "body" and np.any(scene.tracks.poses[group.id][:, 1:] != 0):
             group = dataclasses.replace(group, model=pose_task.fit_group(scene, group, names).model)
         groups.append(group)
     return dataclasses.replace(scene, groups=tuple(groups))

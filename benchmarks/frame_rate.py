@@ -29,7 +29,7 @@ from r5dgs_core.render import incremental_renderer, scene_renderer
 from r5dgs_core.render.scene_renderer import Instance
 from r5dgs_core.scene import row_runs
 from r5dgs_core.scene.cameras import Camera
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject, Shading
+from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
 
 PLAIN = ("fps", "ms_frame", "ms_motion", "ms_colors", "ms_raster")
 COLUMNS = ("kind", "share", "threads", "sh_degree", "sky_degree", *PLAIN, "fps_stage", "ms_stage")
@@ -86,17 +86,18 @@ def make_scene(
     fade = 0.6 / (1 + np.arange(16))[:, None]
     return Scene(
         name="benchmark",
-        means=means.astype(np.float32),
-        quats=rotations.normalize(random.normal(size=(count, 4))).astype(np.float32),
-        log_scales=np.log(scales).astype(np.float32),
-        opacity_logits=np.log(1 / random.uniform(0.01, 0.9, count) - 1).astype(np.float32),
-        sh=(fade * random.normal(size=(count, 16, 3)))[:, : (sh_degree + 1) ** 2].astype(np.float32),
-        object_ids=ids,
-        motion_ids=ids,
-        track_times=times,
-        track_poses=np.stack(poses),
+        gaussians=Gaussians(
+            means=means.astype(np.float32),
+            quats=rotations.normalize(random.normal(size=(count, 4))).astype(np.float32),
+            log_scales=np.log(scales).astype(np.float32),
+            opacity_logits=np.log(1 / random.uniform(0.01, 0.9, count) - 1).astype(np.float32),
+            sh=(fade * random.normal(size=(count, 16, 3)))[:, : (sh_degree + 1) ** 2].astype(np.float32),
+            object_ids=ids,
+            motion_ids=ids,
+        ),
         objects=tuple(objects),
         groups=tuple(groups),
+        tracks=Tracks(times=times, poses=np.stack(poses)),
         t_max=T_MAX,
         frames_per_unit=60.0,
         world_convention="blender",
@@ -124,7 +125,7 @@ def instances_at(scene: Scene, t: float) -> list[Instance]:
     quats, displacements = scene_player.group_poses(scene, t)
     turns = rotations.quats_to_rotmats(quats)
     found = []
-    for start, stop, g in row_runs.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         matrix, pivot = np.eye(4), scene.groups[g].pivot
         matrix[:3, :3], matrix[:3, 3] = turns[g], pivot + displacements[g] - turns[g] @ pivot
         found.append(Instance(start, stop - start, matrix))

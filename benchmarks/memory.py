@@ -162,7 +162,7 @@ def measure(data: Path, folder: Path, gaussians: int, steps: int, overrides: lis
 
     done = run.train(data, folder / "run", settings, progress=watch)
     scene = bake.run_bake(done.folder, folder / "scene.r5dgs")
-    phases.mark("bake", len(scene.means))
+    phases.mark("bake", len(scene.gaussians.means))
     size = (done.folder / checkpoint.CHECKPOINT_FILE).stat().st_size / 2**20
     print(f"checkpoint {size:.0f} MB, {len(datasets.read(data).train)} training images")
     return phases.rows

@@ -30,7 +30,7 @@ import torch
 from r5dgs_core.model import deformation, trd
 from r5dgs_core.motion import models, point_dynamics, rotations, se3
 from r5dgs_core.playback import group_dynamics, scene_player
-from r5dgs_core.scene.scene import Dynamics, MotionGroup, Scene, SceneObject, Shading
+from r5dgs_core.scene.scene import Dynamics, Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
 
 T_MAX = 0.75
 KNOTS = 16
@@ -67,17 +67,18 @@ def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int 
     ]
     return Scene(
         name=f"{bodies} bodies",
-        means=means,
-        quats=rotations.normalize(rng.normal(size=(count, 4))).astype(np.float32),
-        log_scales=np.full((count, 3), -4.0, np.float32),
-        opacity_logits=np.full(count, 3.0, np.float32),
-        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
-        object_ids=ids,
-        motion_ids=ids,
-        track_times=times,
-        track_poses=np.stack(poses),
+        gaussians=Gaussians(
+            means=means,
+            quats=rotations.normalize(rng.normal(size=(count, 4))).astype(np.float32),
+            log_scales=np.full((count, 3), -4.0, np.float32),
+            opacity_logits=np.full(count, 3.0, np.float32),
+            sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+            object_ids=ids,
+            motion_ids=ids,
+        ),
         objects=(SceneObject(0, "background", (), "", (0.5, 0.5, 0.5), 0, 0), *objects),
         groups=tuple(groups),
+        tracks=Tracks(times=times, poses=np.stack(poses)),
         t_max=T_MAX,
         frames_per_unit=60.0,
         world_convention="blender",
@@ -90,11 +91,11 @@ def make_scene(count: int, bodies: int, kind: str = "ballistic_spin", seed: int 
 
 def bending(scene: Scene) -> Scene:
     """The scene with residuals of all Gaussians."""
-    shape, rng = (len(scene.means), len(scene.track_times), 3), np.random.default_rng(1)
-    fade = (T_MAX - scene.track_times)[:, None]
+    shape, rng = (len(scene.gaussians.means), len(scene.tracks.times), 3), np.random.default_rng(1)
+    fade = (T_MAX - scene.tracks.times)[:, None]
     turns = rotations.rotvecs_to_quats(rng.normal(scale=0.3, size=shape) * fade)
     return scene.with_arrays(
-        residual_rows=np.arange(len(scene.means), dtype=np.int32),
+        residual_rows=np.arange(len(scene.gaussians.means), dtype=np.int32),
         residual_offsets=(rng.normal(scale=0.05, size=shape) * fade).astype(np.float32),
         residual_quats=turns.astype(np.float32),
         residual_log_scales=(rng.normal(scale=0.1, size=shape) * fade).astype(np.float32),
@@ -108,7 +109,7 @@ class Networks:
         generator = torch.Generator().manual_seed(0)
         self.field = deformation.DeformationField(deformation.SHAPES[size], generator)
         self.trd = trd.TRD(trd.SHAPES[size], generator)
-        self.means = torch.from_numpy(scene.means)
+        self.means = torch.from_numpy(scene.gaussians.means)
 
     def deform(self) -> torch.Tensor:
         """The deformation field at t_max."""

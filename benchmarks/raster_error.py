@@ -177,7 +177,7 @@ class Drawers:
         self.workload = workloads.make(name)
         means, quats, scales, opacities, channels = self.workload.inputs
         if self.workload.scene is not None:
-            sh = torch.from_numpy(self.workload.scene.sh)
+            sh = torch.from_numpy(self.workload.scene.gaussians.sh)
         else:
             sh = _harmonics(channels[:, :3])
         self.params = {

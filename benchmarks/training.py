@@ -34,7 +34,7 @@ def measure(data: Path, iterations: int, overrides: list[str]) -> dict[str, Any]
         scene = bake.bake(trained, dataset)
     result = evaluate.evaluate(scene, dataset)
     metrics = {split: modes["rigid"] for split, modes in result["splits"].items()}
-    return {"iterations": iterations, "seconds": seconds, "gaussians": len(scene.means), **metrics}
+    return {"iterations": iterations, "seconds": seconds, "gaussians": len(scene.gaussians.means), **metrics}
 
 
 def to_rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -111,7 +111,9 @@ class R5DGS_OT_load_scene(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         named = sum(entry.object_id > 0 for entry in collection.r5dgs.table)
-        self.report({"INFO"}, f"{path.name}: {plural.of(len(scene.means), 'Gaussian')}, {plural.of(named, 'object')}")
+        self.report(
+            {"INFO"}, f"{path.name}: {plural.of(len(scene.gaussians.means), 'Gaussian')}, {plural.of(named, 'object')}"
+        )
         if named == 0:
             self.report({"WARNING"}, f"{path.name} holds no objects, only a background; to get some, train with masks")
         too_fast = physics.too_fast(loaded_scenes.members(collection, "ANCHOR"))

@@ -58,7 +58,7 @@ class Range:
 
 def ranges(scene: Scene) -> list[Range]:
     """Split the scene's Gaussians into ranges of constant object id and motion id."""
-    pairs = np.stack([scene.object_ids, scene.motion_ids], axis=-1).astype(np.int64)
+    pairs = np.stack([scene.gaussians.object_ids, scene.gaussians.motion_ids], axis=-1).astype(np.int64)
     if len(pairs) == 0:
         return []
     starts = np.concatenate([[0], np.flatnonzero((np.diff(pairs, axis=0) != 0).any(-1)) + 1, [len(pairs)]])
@@ -102,11 +102,11 @@ def build(context: bpy.types.Context, scene: Scene, path: Path, options: Options
         SceneFileError: The scene has no Gaussians, or is too small for Blender's F-curves.
         ConfigError: The end of extrapolation is too many frames away.
     """
-    if len(scene.means) == 0:
+    if len(scene.gaussians.means) == 0:
         raise errors.SceneFileError(
             f"{path}: expected Gaussians, found none; bake a run that was trained, or choose another file"
         )
-    size = max(scene.extent, float(np.exp(scene.log_scales.max())))
+    size = max(scene.extent, float(np.exp(scene.gaussians.log_scales.max())))
     if size < SMALLEST:
         factor = 10.0 ** -math.floor(math.log10(size))
         raise errors.SceneFileError(
@@ -183,7 +183,7 @@ def _pivot(scene: Scene, part: Range) -> np.ndarray:
         return np.asarray(scene.groups[part.motion_id].pivot, np.float64)
     if part.object_id <= 0:
         return np.zeros(3)
-    return np.median(scene.means[part.start : part.start + part.count].astype(np.float64), axis=0)
+    return np.median(scene.gaussians.means[part.start : part.start + part.count].astype(np.float64), axis=0)
 
 
 def _anchor_key(part: Range) -> tuple[int, int]:
@@ -262,7 +262,7 @@ def _describe(
     state.scene_name = scene.name
     state.filepath = relink.relative_to(str(path.resolve()), bpy.data.filepath)  # also trusts the file
     state.seen_at = str(path.resolve())
-    state.gaussians = len(scene.means)
+    state.gaussians = len(scene.gaussians.means)
     state.root = root
     state.t_start, state.t_max, state.t_end = times.t_start, times.t_max, times.t_end
     state.frames_per_unit, state.frame_zero = times.frames_per_unit, times.frame_zero

@@ -124,7 +124,7 @@ def splats_of(
         matrix, names = turn @ one.matrix, [*names, one.object.name]
         for note in evaluated_points.of(one.object, depsgraph, one.collection.r5dgs.gaussians).notes:
             sources.note(note)
-        if scene is not None and one.object.r5dgs.start + one.object.r5dgs.count <= len(scene.means):
+        if scene is not None and one.object.r5dgs.start + one.object.r5dgs.count <= len(scene.gaussians.means):
             parts.append(_placed(scene, one, matrix, turn, sources))
         else:
             points = from_points(evaluated_points.evaluated(one.object, depsgraph), one.object.r5dgs.object_id)

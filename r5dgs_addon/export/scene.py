@@ -62,11 +62,11 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     source = scene_file.read(own)
     times = timeline.of_collection(collection)
     members, names = _members(collection)
-    if any(member.cloud.r5dgs.start + member.cloud.r5dgs.count > len(source.means) for member in members):
+    if any(member.cloud.r5dgs.start + member.cloud.r5dgs.count > len(source.gaussians.means) for member in members):
         raise errors.SceneFileError(
             f"{own}: expected the scene that '{collection.name}' was loaded from, found another one; load it again"
         )
-    when = np.concatenate([source.track_times, _later(times)])
+    when = np.concatenate([source.tracks.times, _later(times)])
     earlier = _earlier(context.scene, times)
     with frame_range.frame_kept(context.scene):
         before = []
@@ -75,7 +75,7 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
             before.append([back @ _matrix(member.cloud, depsgraph) for member in members])
         for number, t in enumerate(when):
             yield Step(number, len(when) + 2, f"frame {times.frame(t):.4g}")
-            _look(context, collection, members, times.frame(float(t)), bind=number == len(source.track_times) - 1)
+            _look(context, collection, members, times.frame(float(t)), bind=number == len(source.tracks.times) - 1)
     yield Step(len(when), len(when) + 2, "fitting motion to what was edited", slow=True)
     changed = [member for member in members if member.points.edit is not None]
     extended, places = point_edits.extend(source, [member.points.edit.points for member in changed])
@@ -84,7 +84,10 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     result, notes = edited_scene.edit(extended, pieces, when, _table(collection, source, members, names))
     notes += _lost_points(members, source, extended)
     yield Step(
-        len(when) + 1, len(when) + 2, f"packing {plural.of(len(result.means), 'Gaussian')} into {path.name}", slow=True
+        len(when) + 1,
+        len(when) + 2,
+        f"packing {plural.of(len(result.gaussians.means), 'Gaussian')} into {path.name}",
+        slow=True,
     )
     scene_file.write(result, path, exact=exact)
     lost = _moving_before(members, before, TOLERANCE * source.extent, source.extent)
@@ -96,7 +99,9 @@ def steps(context: bpy.types.Context, collection: bpy.types.Collection, path: Pa
     if not _rests(collection):
         notes.append("The root was moved; a scene file has no place for that, and what loads it gets a new root")
     named = sum(item.id > 0 for item in result.objects)
-    return Outcome(f"{path.name}: {plural.of(len(result.means), 'Gaussian')}, {plural.of(named, 'object')}", notes)
+    return Outcome(
+        f"{path.name}: {plural.of(len(result.gaussians.means), 'Gaussian')}, {plural.of(named, 'object')}", notes
+    )
 
 
 def _lost_points(members: list[_Member], source: Scene, extended: Scene) -> list[str]:
@@ -218,7 +223,7 @@ def _pieces(member: _Member, source: Scene, place: point_edits.Place | None) -> 
         place: Range of its points in ``source`` if they were edited.
     """
     cloud, anchor, matrices = member.cloud, member.anchor, np.array(member.matrices)
-    bind = matrices[len(source.track_times) - 1]
+    bind = matrices[len(source.tracks.times) - 1]
     start, count = cloud.r5dgs.start, cloud.r5dgs.count
     if place is not None:
         start, count, matrices = place.start, place.count, matrices @ place.matrix

@@ -54,7 +54,7 @@ class _File:
 
 def _read_file(path: Path) -> _File:
     scene = scene_file.read(path)
-    return _File(residuals.Residuals(scene), scene.means)
+    return _File(residuals.Residuals(scene), scene.gaussians.means)
 
 
 # Quoted: `typing` would keep the class, and thus this module, alive until after Blender's exit, which crashes.

@@ -111,11 +111,11 @@ def few(
 def reaches(scene: Scene) -> np.ndarray:
     """Largest distance of a member from the pivot of each motion group. [G] float64"""
     result = np.zeros(len(scene.groups))
-    for start, stop, g in row_runs.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         pivot = np.asarray(scene.groups[g].pivot, np.float64)
         squares = np.zeros(stop - start)
         for axis in range(3):  # one column at a time, because numpy is slow for rows of three
-            arms = scene.means[start:stop, axis] - pivot[axis]
+            arms = scene.gaussians.means[start:stop, axis] - pivot[axis]
             squares += arms * arms
         result[g] = max(result[g], math.sqrt(float(squares.max())))
     return result
@@ -123,7 +123,7 @@ def reaches(scene: Scene) -> np.ndarray:
 
 def _observed(scene: Scene, motion_id: int, allowed: float, radius: float) -> Curves:
     """One key per knot, which is exact, or fewer keys if they stay within the tolerance."""
-    times = np.asarray(scene.track_times, np.float64)
+    times = np.asarray(scene.tracks.times, np.float64)
     own = slice(motion_id, motion_id + 1)
     quats, displacements = (values[0] for values in scene_player.knots(scene, own))
     quat_slopes, displacement_slopes = (values[0] for values in scene_player.knot_slopes(scene, own))

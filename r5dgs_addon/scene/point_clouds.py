@@ -49,25 +49,25 @@ def fill(cloud: bpy.types.PointCloud, scene: Scene, rows: slice, extent: float, 
         extent: Extent of the scene.
         sh_degree: Highest degree of the coefficients to write, at most 3.
     """
-    sh = scene.sh[rows]
-    log_scales = scene.log_scales[rows]
-    opacities = 1.0 / (1.0 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
+    sh = scene.gaussians.sh[rows]
+    log_scales = scene.gaussians.log_scales[rows]
+    opacities = 1.0 / (1.0 + np.exp(-scene.gaussians.opacity_logits[rows].astype(np.float64)))
     base = np.concatenate([sh[:, 0], opacities[:, None]], axis=-1)
     shown = srgb_to_linear(0.5 + spherical_harmonics.C0 * sh[:, 0].astype(np.float64))
     radii = DISPLAY_SIGMAS * np.sqrt(opacities) * np.exp(log_scales.mean(-1))
     radii = np.minimum(radii, LARGEST_DISPLAY_RADIUS * extent)
     written = {
-        "position": _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.means[rows]),
+        "position": _write(cloud, "position", "FLOAT_VECTOR", "vector", scene.gaussians.means[rows]),
         "radius": _write(cloud, "radius", "FLOAT", "value", radii),
         "scale": _write(cloud, "scale", "FLOAT_VECTOR", "vector", np.exp(log_scales)),
-        "rotation": _write(cloud, "rotation", "QUATERNION", "value", scene.quats[rows]),
+        "rotation": _write(cloud, "rotation", "QUATERNION", "value", scene.gaussians.quats[rows]),
         "radiance:base": _write(cloud, "radiance:base", "FLOAT_COLOR", "color", base),
         ROW: _write(cloud, ROW, "INT", "value", np.arange(rows.start, rows.stop), np.int32),
     }
     for k, plane in enumerate(_planes(sh[:, 1 : (sh_degree + 1) ** 2])):
         written[f"{HARMONICS}{k}"] = _write(cloud, f"{HARMONICS}{k}", "FLOAT_VECTOR", "vector", plane)
     cloud[_FINGERPRINTS] = {name: fingerprint(values) for name, values in written.items()}
-    _write(cloud, "object_id", "INT", "value", scene.object_ids[rows], np.int32)
+    _write(cloud, "object_id", "INT", "value", scene.gaussians.object_ids[rows], np.int32)
     _write(cloud, DISPLAY_COLOR, "FLOAT_COLOR", "color", np.concatenate([shown, opacities[:, None]], axis=-1))
     compat.make_gaussian_splat(cloud)
     cloud.update_tag()  # otherwise 4.2 keeps a stale evaluated copy

@@ -34,7 +34,7 @@ class Times:
     @staticmethod
     def of(scene: Scene, frame_zero: float = 1.0, t_end: float | None = None) -> "Times":
         """Times of a scene; an end before t_max is clamped to t_max."""
-        start = float(scene.track_times[0])
+        start = float(scene.tracks.times[0])
         end = default_end(scene) if t_end is None else max(float(t_end), scene.t_max)
         return Times(start, float(scene.t_max), end, float(scene.frames_per_unit), float(frame_zero))
 
@@ -55,7 +55,7 @@ def of_collection(collection: bpy.types.Collection) -> Times:
 
 def default_end(scene: Scene) -> float:
     """Default end of extrapolation: a third of the observed span after t_max, and at least 1."""
-    start = float(scene.track_times[0])
+    start = float(scene.tracks.times[0])
     return max(scene.t_max + (scene.t_max - start) / 3, 1.0)
 
 

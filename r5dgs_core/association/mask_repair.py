@@ -102,10 +102,14 @@ def repair(
         progress=lambda done: progress({"event": "draw", "done": done, "total": len(views)}),
     )
     progress({"event": "prepare", "text": "associating segments"})
-    _, neighbours = KDTree(scene.means).query(scene.means, min(NEIGHBOURS + 1, len(scene.means)), workers=-1)
+    _, neighbours = KDTree(scene.gaussians.means).query(
+        scene.gaussians.means, min(NEIGHBOURS + 1, len(scene.gaussians.means)), workers=-1
+    )
     times = viewpoints.spread(np.unique([view.t for view in views]).tolist(), TIMES)
     result = associate.associate(
-        images, neighbours.reshape(len(scene.means), -1)[:, 1:], paths=render_segments.paths(scene, np.array(times))
+        images,
+        neighbours.reshape(len(scene.gaussians.means), -1)[:, 1:],
+        paths=render_segments.paths(scene, np.array(times)),
     )
     made = render_votes.mend(scene, views, incoming, images, result, backend=backend)
     mended = tuple(mask.astype(np.uint16) for mask in made)

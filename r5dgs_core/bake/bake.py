@@ -28,7 +28,7 @@ from ..motion import rotations
 from ..motion.models import MotionModel
 from ..playback import residuals, visibility
 from ..scene import scene_file, sh_color
-from ..scene.scene import NEAR_PLANE, MotionGroup, Scene, SceneObject, Shading
+from ..scene.scene import NEAR_PLANE, Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
 from ..train import checkpoint, checkpoint_content, observed_motion, probe, train_views
 from ..train.identity import label_cleanup, packed_masks
 from ..train.normalization import Normalization
@@ -96,17 +96,18 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     ]
     scene = Scene(
         name=dataset.name,
-        means=cloud.means[order].astype(np.float32),
-        quats=rotations.normalize(cloud.quats[order]).astype(np.float32),
-        log_scales=cloud.log_scales[order].astype(np.float32),
-        opacity_logits=cloud.opacity_logits[order].astype(np.float32),
-        sh=cloud.sh[order].astype(np.float32),
-        object_ids=cloud.object_ids[order],
-        motion_ids=cloud.motion_ids[order],
-        track_times=motion.times.astype(np.float64),
-        track_poses=bound.played,
+        gaussians=Gaussians(
+            means=cloud.means[order].astype(np.float32),
+            quats=rotations.normalize(cloud.quats[order]).astype(np.float32),
+            log_scales=cloud.log_scales[order].astype(np.float32),
+            opacity_logits=cloud.opacity_logits[order].astype(np.float32),
+            sh=cloud.sh[order].astype(np.float32),
+            object_ids=cloud.object_ids[order],
+            motion_ids=cloud.motion_ids[order],
+        ),
         objects=_objects(cloud.object_ids[order], tensors["object_ids"].numpy(), dataset),
         groups=tuple(rows),
+        tracks=Tracks(times=motion.times.astype(np.float64), poses=bound.played),
         t_max=float(motion.times[-1]),
         frames_per_unit=dataset.frames_per_unit,
         world_convention=dataset.world_convention,
@@ -136,7 +137,7 @@ def bake(run: checkpoint.Run, dataset: Dataset | None = None) -> Scene:
     scene = simplified.scene
     decisions = needs.decide(
         scene.groups,
-        scene.track_poses,
+        scene.tracks.poses,
         cloud.motion_ids,
         cloud.shading,
         light,
@@ -177,7 +178,7 @@ def _evidence(scene: Scene, dataset: Dataset, config: Config) -> image_evidence.
 
     A missing image is logged as a warning.
     """
-    if not np.any(scene.track_poses[..., 1:] != 0):
+    if not np.any(scene.tracks.poses[..., 1:] != 0):
         return None
     sampled = image_evidence.sample(dataset.train)
     try:

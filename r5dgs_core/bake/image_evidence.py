@@ -115,12 +115,12 @@ class ImageEvidence:
     def _octants(self, group: int) -> np.ndarray:
         """Return the patch of each Gaussian: its octant about the pivot; `PATCHES` in other groups. [N] int32"""
         scene = self._scene
-        octants = ((scene.means > scene.groups[group].pivot) @ np.array([1, 2, 4])).astype(np.int32)
-        return np.where(scene.motion_ids == group, octants, np.int32(PATCHES))
+        octants = ((scene.gaussians.means > scene.groups[group].pivot) @ np.array([1, 2, 4])).astype(np.int32)
+        return np.where(scene.gaussians.motion_ids == group, octants, np.int32(PATCHES))
 
     def glance(self, changes: np.ndarray) -> list[int]:
         """Return one view per cluster: the one with the largest change [S] at the knot nearest to its time."""
-        knots = np.abs(self._scene.track_times[:, None] - [view.t for view in self._views]).argmin(0)
+        knots = np.abs(self._scene.tracks.times[:, None] - [view.t for view in self._views]).argmin(0)
         clusters = range(int(self._clusters.max()) + 1)
         mine = (np.flatnonzero(self._clusters == cluster) for cluster in clusters)
         return [int(rows[np.argmax(changes[knots[rows]])]) for rows in mine]

@@ -109,7 +109,7 @@ def simplify(
     """
     wanted = wanted or NeedsSection()
     names = {item.id: item.name for item in scene.objects}
-    bodies = [g for g in scene.groups if g.role == "body" and np.any(scene.track_poses[g.id, :, 1:] != 0)]
+    bodies = [g for g in scene.groups if g.role == "body" and np.any(scene.tracks.poses[g.id, :, 1:] != 0)]
     parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
     dropped, losses = _unseen(scene, [part for part in parts if part.noise], evidence)
     bound = _rebound(scene, _with_parts(scene, dropped))
@@ -117,12 +117,12 @@ def simplify(
     fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]] = {}
     for g in bodies:
         mine = [part for part in parts if part.group == g.id]
-        future = _future(bound.track_poses[g.id], mine)
+        future = _future(bound.tracks.poses[g.id], mine)
         if np.any(future[:, 1:] != 0):
-            track_checks.warn_of_aliasing(names[g.object_id], scene.track_times, future)
+            track_checks.warn_of_aliasing(names[g.object_id], scene.tracks.times, future)
             fits[g.id] = _fit(bound, g.id, observed[g.id], future, mine)
         said = _said(fits[g.id][1] if g.id in fits else None)
-        travel = float(np.linalg.norm(bound.track_poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
+        travel = float(np.linalg.norm(bound.tracks.poses[g.id, :, 4:], axis=1).max()) / (2 * g.model.radius)
         found = [_row(part, part in dropped, losses.get(id(part)), said, travel) for part in mine]
         rows += [{"object": names[g.object_id], **row} for row in found]
     models = falling_bodies.share_gravity(fits, scene.world_convention)
@@ -140,14 +140,14 @@ def _parts(
     scene: Scene, group: int, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection
 ) -> list[_Part]:
     """Return the candidate simplifications of a body: of its turn, and of its path to a place or else a line."""
-    poses, weights = scene.track_poses[group], observed.astype(np.float64)
+    poses, weights = scene.tracks.poses[group], observed.astype(np.float64)
     weights = weights if weights.any() else np.ones(len(poses))
     mean = rotations.normalize(weights @ rotations.make_continuous(poses[:, :4]))
     upright = poses.copy()
     upright[:, :4] = mean
     turns = rotations.quats_to_rotvecs(rotations.multiply(poses[:, :4], rotations.conjugate(mean)))
     result = [_judged(scene, group, "rotation", upright, turns, weights, evidence, wanted.rotation == "on")]
-    tau = scene.track_times - scene.track_times[-1]
+    tau = scene.tracks.times - scene.tracks.times[-1]
     for name, degree in (("motion", 0), ("curved_path", 1)):
         columns = tau[:, None] ** np.arange(degree + 1)
         root = np.sqrt(weights)[:, None]
@@ -180,12 +180,12 @@ def _judged(
     elif spread > LARGEST * unit:
         change, allowed, seen, why = spread / unit / LARGEST, 1.0, False, "too large for noise"
     else:
-        after = scene.track_poses.copy()
+        after = scene.tracks.poses.copy()
         after[group] = poses
         largest = 2 * float(np.linalg.norm(dropped, axis=1).max()) / (unit if name != "rotation" else 2.0)
         free, seen = 3 * _independent(dropped[weights > 0]), True
         for rows in (evidence.glance(np.linalg.norm(dropped, axis=1)), None):
-            support = evidence.support(group, scene.track_poses, _followed(scene, after), largest, rows)
+            support = evidence.support(group, scene.tracks.poses, _followed(scene, after), largest, rows)
             change = max(support.sigmas, 0.0) / np.sqrt(free)
             allowed = float(np.sqrt(stats.f.ppf(1 - LEVEL, free, max(support.clusters - 1, 1))))
             if change > CLEARLY * allowed:
@@ -226,7 +226,7 @@ def _unseen(
 
 def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
     """Return the poses of all groups with some simplifications applied. [G, S, 7]"""
-    poses = scene.track_poses.copy()
+    poses = scene.tracks.poses.copy()
     for part in parts:
         columns = slice(0, 4) if part.name == "rotation" else slice(4, 7)
         poses[part.group, :, columns] = part.poses[:, columns]
@@ -235,20 +235,20 @@ def _with_parts(scene: Scene, parts: Sequence[_Part]) -> np.ndarray:
 
 def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
     """Update the poses of followers to the new poses of their leaders, in place, and return the poses. [G, S, 7]"""
-    change = poses[..., 4:] - scene.track_poses[..., 4:]
+    change = poses[..., 4:] - scene.tracks.poses[..., 4:]
     for g in scene.groups:
         if g.follows is not None and g.follow_matrix is not None:
-            poses[g.id, :, 4:] = scene.track_poses[g.id, :, 4:] + change[g.follows] @ g.follow_matrix.T
+            poses[g.id, :, 4:] = scene.tracks.poses[g.id, :, 4:] + change[g.follows] @ g.follow_matrix.T
     return poses
 
 
 def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
     """Return the scene with other poses [G, S, 7], in the bind state of each group's last pose."""
-    if np.array_equal(poses, scene.track_poses):
+    if np.array_equal(poses, scene.tracks.poses):
         return scene
     arrays = {name: array.copy() for name, array in scene.arrays().items() if name in _BOUND}
     if "shading" in arrays:
-        arrays.setdefault("shading_rest", np.ones(len(scene.means), np.float32))
+        arrays.setdefault("shading_rest", np.ones(len(scene.gaussians.means), np.float32))
     groups, poses = list(scene.groups), poses.copy()
     for g in scene.groups:
         track = poses[g.id]
@@ -260,7 +260,7 @@ def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
         track[:, 4:] -= d
         track[-1, :4] = rotations.identity()
         if np.any(q[1:] != 0) or np.any(d != 0):
-            _bind(scene, arrays, np.flatnonzero(scene.motion_ids == g.id), g.pivot, q, d)
+            _bind(scene, arrays, np.flatnonzero(scene.gaussians.motion_ids == g.id), g.pivot, q, d)
             groups[g.id] = dataclasses.replace(g, pivot=g.pivot + d)
     if scene.shading is not None and scene.shading.rest is None and (arrays["shading_rest"] == 1).all():
         del arrays["shading_rest"]
@@ -311,10 +311,10 @@ def _fit(
 
     The noise is at least that measured in the images.
     """
-    members = scene.motion_ids == group
-    opacities = 1 / (1 + np.exp(-scene.opacity_logits[members].astype(np.float64)))
-    body = free_top.inertia(scene.means[members][visibility.seen(opacities)].astype(np.float64))
-    track = shared_gravity.Track(scene.track_times, poses[:, :4], poses[:, 4:], observed.astype(np.float64))
+    members = scene.gaussians.motion_ids == group
+    opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[members].astype(np.float64)))
+    body = free_top.inertia(scene.gaussians.means[members][visibility.seen(opacities)].astype(np.float64))
+    track = shared_gravity.Track(scene.tracks.times, poses[:, :4], poses[:, 4:], observed.astype(np.float64))
     noise = {part.name == "rotation": part.spread / part.change for part in parts if part.seen and part.change > 0}
     fit = model_selection.fit(
         track.times,

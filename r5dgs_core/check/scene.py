@@ -28,7 +28,7 @@ def check(path: Path) -> list[Finding]:
         scene = scene_file.read(path, collect)
     if scene is None or collect.findings:  # warnings rely on valid numbers
         return collect.findings
-    if len(scene.means) == 0:
+    if len(scene.gaussians.means) == 0:
         collect.add("S02", f"{path}: expected Gaussians, found none")
     for item in scene.objects:
         if item.count == 0 and item.id > 0:
@@ -42,19 +42,19 @@ def check(path: Path) -> list[Finding]:
 
 
 def _check_gaussians(scene: Scene, path: Path, collect: Collector) -> None:
-    if len(scene.means) == 0:
+    if len(scene.gaussians.means) == 0:
         return
     with np.errstate(over="ignore"):
-        large = int((np.exp(scene.log_scales.astype(np.float64)).max(-1) > scene.extent).sum())
-        seen = float((1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64))) >= _SEEN).mean())
+        large = int((np.exp(scene.gaussians.log_scales.astype(np.float64)).max(-1) > scene.extent).sum())
+        seen = float((1 / (1 + np.exp(-scene.gaussians.opacity_logits.astype(np.float64))) >= _SEEN).mean())
     if large:
-        collect.add("S11", f"{path}: {large} of {len(scene.means)} Gaussians are larger than the scene")
+        collect.add("S11", f"{path}: {large} of {len(scene.gaussians.means)} Gaussians are larger than the scene")
     if seen < _FEW_SEEN:
         collect.add("S16", f"{path}: only {100 * seen:.1f} % of the Gaussians can be seen")
 
 
 def _check_motion(scene: Scene, path: Path, collect: Collector) -> None:
-    start = float(scene.track_times[0])
+    start = float(scene.tracks.times[0])
     end = max(scene.t_max + _AHEAD * (scene.t_max - start), 1.0)
     last = max(abs(t) * scene.frames_per_unit for t in (start, end))
     if last > LAST_FRAME:

@@ -130,11 +130,11 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
         )
         scene_file.write(scene, out)
         if progress_kind == "json":
-            progress({"event": "imported", "path": str(out), "gaussians": len(scene.means)})
+            progress({"event": "imported", "path": str(out), "gaussians": len(scene.gaussians.means)})
     if progress_kind != "json":
         count = sum(o.id > 0 for o in scene.objects)
         objects = "1 object" if count == 1 else f"{count} objects"
-        print(f"{out}: {len(scene.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
+        print(f"{out}: {len(scene.gaussians.means)} Gaussians, {objects}, t_max {scene.t_max:g}")
 
 
 @folder_lock.writes("json_path", "target")

@@ -28,7 +28,7 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
     """
     ordered = [(piece.object_id, cluster.id, piece.start, piece) for cluster in clusters for piece in cluster.pieces]
     ordered.sort(key=lambda entry: entry[:3])
-    last, kept, untouched = len(scene.track_times) - 1, [], True
+    last, kept, untouched = len(scene.tracks.times) - 1, [], True
     old = scene.arrays()
     names = ("means", "quats", "log_scales", "sh", "shading", "shading_rest")
     columns = {name: [old[name][:0]] for name in names if name in old}
@@ -71,8 +71,8 @@ def gather(scene: Scene, clusters: Sequence[Cluster]) -> tuple[np.ndarray, dict[
 def _displacement(scene: Scene, rows: slice, bind: np.ndarray) -> float:
     """Upper bound of the displacement of Gaussians under a map, including rotation and scaling of their extent."""
     linear = bind[:3, :3] - np.eye(3)
-    means = scene.means[rows].astype(np.float64)
-    size = float(np.exp(scene.log_scales[rows].max()))
+    means = scene.gaussians.means[rows].astype(np.float64)
+    size = float(np.exp(scene.gaussians.log_scales[rows].max()))
     moved = np.linalg.norm(means @ linear.T + bind[:3, 3], axis=-1).max()
     return float(moved + size * np.linalg.norm(linear))
 

@@ -221,7 +221,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
         pieces: Its remaining Gaussians.
         notes: List to which losses are appended.
     """
-    last = len(scene.track_times) - 1
+    last = len(scene.tracks.times) - 1
     pinned = scene.groups[0]
     still = Motion(rotations.identity(1), np.eye(3)[None], np.zeros((1, 3)))
     found: list[Cluster] = [Cluster([], pinned, still)]
@@ -243,7 +243,7 @@ def clusters(scene: Scene, pieces: Sequence[Piece], notes: list[str]) -> list[Cl
         else:
             found.append(Cluster([piece], source, motion))
     used = {cluster.source.id for cluster in found}
-    members = set(np.unique(scene.motion_ids).tolist())
+    members = set(np.unique(scene.gaussians.motion_ids).tolist())
     for group in scene.groups[1:]:  # groups that were already empty are kept
         if group.id not in used and group.id not in members:
             found.append(Cluster([], group, still))
@@ -266,8 +266,8 @@ def _apart(motion: Motion, other: Motion, reach: float) -> np.ndarray:
 
 def _reach(scene: Scene, piece: Piece, point: np.ndarray) -> float:
     """Largest distance of a piece's Gaussians from a point in the new bind state. [3]"""
-    bind = piece.matrices[len(scene.track_times) - 1]
-    means = scene.means[piece.start : piece.start + piece.count].astype(np.float64)
+    bind = piece.matrices[len(scene.tracks.times) - 1]
+    means = scene.gaussians.means[piece.start : piece.start + piece.count].astype(np.float64)
     return float(np.linalg.norm(means @ bind[:3, :3].T + bind[:3, 3] - point, axis=-1).max())
 
 
@@ -286,7 +286,7 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
     quats, moves = scene_player.knots(scene)
     known = np.concatenate([quats, moves], axis=-1)
     courses = [_course(scene, cluster, known) for cluster in found]
-    later = np.asarray(times[len(scene.track_times) :], np.float64) - scene.t_max
+    later = np.asarray(times[len(scene.tracks.times) :], np.float64) - scene.t_max
     groups: dict[int, tuple[MotionGroup, bool]] = {}
     for follows in (False, True):  # groups that follow another come last
         for cluster, course in zip(found, courses, strict=True):
@@ -315,9 +315,9 @@ def move(scene: Scene, found: Sequence[Cluster], times: np.ndarray, notes: list[
 
 def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
     """Motion of a cluster up to t_max, with the file's own poses [G, S, 7] if Blender shows the same."""
-    source, count = cluster.source, len(scene.track_times)
+    source, count = cluster.source, len(scene.tracks.times)
     if not cluster.pieces or cluster.id == 0:
-        return _Course(scene.track_poses[source.id], np.asarray(source.pivot, np.float64), np.eye(3))
+        return _Course(scene.tracks.poses[source.id], np.asarray(source.pivot, np.float64), np.eye(3))
     first = cluster.first
     allowed = max(piece.allowed for piece in cluster.pieces)
     parent = np.eye(3) if first.parent is None else first.parent
@@ -329,7 +329,7 @@ def _course(scene: Scene, cluster: Cluster, known: np.ndarray) -> _Course:
         before = np.concatenate(_turned(known[source.id, :, :4], known[source.id, :, 4:], parent), axis=-1)
     poses, observed = _track(cluster.motion, pivot, before, reach, allowed)
     if observed and (before == known[source.id]).all() and source.id:
-        poses = scene.track_poses[source.id].copy()  # signs included
+        poses = scene.tracks.poses[source.id].copy()  # signs included
     return _Course(poses, pivot, parent, reach, allowed, observed and bool((parent == np.eye(3)).all()))
 
 
@@ -337,9 +337,9 @@ def _pivot(scene: Scene, cluster: Cluster, allowed: float) -> np.ndarray:
     """Pivot at t_max, exactly the file's if it is the same within the tolerance."""
     first = cluster.first
     own = np.asarray(cluster.source.pivot, np.float64)
-    bind = first.matrices[len(scene.track_times) - 1]
+    bind = first.matrices[len(scene.tracks.times) - 1]
     if cluster.source.id == 0:
-        own = np.median(scene.means[first.start : first.start + first.count].astype(np.float64), axis=0)
+        own = np.median(scene.gaussians.means[first.start : first.start + first.count].astype(np.float64), axis=0)
     pivot = bind[:3, :3] @ own + bind[:3, 3] if first.pivot is None else np.asarray(first.pivot, np.float64)
     return own if np.linalg.norm(pivot - own) <= allowed else pivot
 
@@ -368,7 +368,7 @@ def _go_on(
         The group, and True if it moves as in the file, before and after t_max.
     """
     source, first = cluster.source, cluster.first
-    rows = slice(len(scene.track_times), None)
+    rows = slice(len(scene.tracks.times), None)
     quats, moves = cluster.motion.quats[rows], cluster.motion.moves(course.pivot)[rows]
     scale = float(abs(np.linalg.det(course.parent)) ** (1 / 3))
     known = {"pivot": course.pivot, "id": cluster.id, "seen": source.seen}

@@ -41,8 +41,8 @@ def edit(
     notes: list[str] = []
     pieces = [piece for piece in pieces if piece.count > 0]
     for piece in pieces:
-        if not 0 <= piece.start <= piece.start + piece.count <= len(scene.means):
-            raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.means)} Gaussians")
+        if not 0 <= piece.start <= piece.start + piece.count <= len(scene.gaussians.means):
+            raise ValueError(f"{piece.name}: its rows leave the scene's {len(scene.gaussians.means)} Gaussians")
     clusters = edited_motion.move(scene, edited_motion.clusters(scene, pieces, notes), times, notes)
     kept, arrays, untouched = edited_gaussians.gather(scene, clusters)
     objects = _objects(scene, table, arrays["object_ids"])
@@ -128,7 +128,7 @@ def _by_object(
     rows: dict[int, int] = {item.id: row for row, item in enumerate(scene.objects)}
     for item in objects:
         if item.id not in rows:
-            source = int(scene.object_ids[kept[item.start]]) if item.count else 0
+            source = int(scene.gaussians.object_ids[kept[item.start]]) if item.count else 0
             rows[item.id] = rows.get(source, rows[0])
     offset = sum(item.id < 0 for item in scene.objects)
     named = [rows[item.id] - offset for item in objects if item.id >= 0]
@@ -142,7 +142,7 @@ def _with_representatives(scene: Scene) -> Scene:
     """Choose a representative for each group that has lost its own."""
     groups = list(scene.groups)
     for number, group in enumerate(groups):
-        rows = np.flatnonzero(scene.motion_ids == number)
+        rows = np.flatnonzero(scene.gaussians.motion_ids == number)
         if group.anchor_index < 0 and len(rows):
             groups[number] = replace(group, anchor_index=group_dynamics.representative(scene, rows))
     return replace(scene, groups=tuple(groups))

@@ -79,7 +79,7 @@ def extend(scene: Scene, edits: Sequence[PointEdit]) -> tuple[Scene, list[Place]
     Raises:
         ValueError: A row is not in the scene, or an array has the wrong shape or contains values that are not finite.
     """
-    places, parts, filled = [], [], len(scene.means)
+    places, parts, filled = [], [], len(scene.gaussians.means)
     for edit in edits:
         part, place = apply(scene, edit)
         if part is not scene:
@@ -173,8 +173,8 @@ def _explained(matrix: np.ndarray, a: np.ndarray, b: np.ndarray, allowed: float)
 
 def _check(scene: Scene, edit: PointEdit) -> None:
     rows = np.asarray(edit.rows)
-    if rows.ndim != 1 or len(rows) and not (rows.min() >= 0 and rows.max() < len(scene.means)):
-        raise ValueError(f"points: expected rows of the scene's {len(scene.means)} Gaussians")
+    if rows.ndim != 1 or len(rows) and not (rows.min() >= 0 and rows.max() < len(scene.gaussians.means)):
+        raise ValueError(f"points: expected rows of the scene's {len(scene.gaussians.means)} Gaussians")
     for name, shape in (("means", (3,)), ("quats", (4,)), ("scales", (3,)), ("base", (4,)), ("sh", (-1, 3))):
         values = getattr(edit, name)
         if values is None:
@@ -190,7 +190,7 @@ def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray
     shapes = _given_shapes(part, edit)
     looks = _given_looks(part, edit)
     matrix, means = np.eye(4), edit.means
-    if means is not None and (means == part.means).all():
+    if means is not None and (means == part.gaussians.means).all():
         means = None
     if means is not None and not shapes:
         matrix, moved = _unmoved(part, rows, means)
@@ -208,15 +208,15 @@ def _edited(scene: Scene, rows: np.ndarray, edit: PointEdit) -> tuple[np.ndarray
 def _given_shapes(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
     """Rotations and log scales that differ from those of ``part``."""
     found = {}
-    if edit.quats is not None and not (edit.quats == part.quats).all():
+    if edit.quats is not None and not (edit.quats == part.gaussians.quats).all():
         length = np.linalg.norm(edit.quats, axis=-1, keepdims=True)
-        unit = np.where(length > 0, edit.quats / np.where(length > 0, length, 1), part.quats)
+        unit = np.where(length > 0, edit.quats / np.where(length > 0, length, 1), part.gaussians.quats)
         found["quats"] = unit.astype(np.float32)
     if edit.scales is not None:
-        same = np.isclose(edit.scales, np.exp(part.log_scales), rtol=SAME, atol=0)
+        same = np.isclose(edit.scales, np.exp(part.gaussians.log_scales), rtol=SAME, atol=0)
         if not same.all():
             given = np.log(np.maximum(edit.scales, 1e-30))
-            found["log_scales"] = np.where(same, part.log_scales, given).astype(np.float32)
+            found["log_scales"] = np.where(same, part.gaussians.log_scales, given).astype(np.float32)
     return found
 
 
@@ -225,20 +225,20 @@ def _given_looks(part: Scene, edit: PointEdit) -> dict[str, np.ndarray]:
     found = {}
     if edit.base is not None:
         opacity = edit.base[:, 3].astype(np.float64)
-        own = 1 / (1 + np.exp(-part.opacity_logits.astype(np.float64)))
+        own = 1 / (1 + np.exp(-part.gaussians.opacity_logits.astype(np.float64)))
         same = np.isclose(opacity, own, rtol=SAME, atol=1e-7)
         if not same.all():
             opacity = np.clip(opacity, 1e-7, 1 - 1e-7)
             given = np.log(opacity / (1 - opacity))
-            found["opacity_logits"] = np.where(same, part.opacity_logits, given).astype(np.float32)
-        if not (edit.base[:, :3] == part.sh[:, 0]).all():
-            found["sh"] = part.sh.copy()
+            found["opacity_logits"] = np.where(same, part.gaussians.opacity_logits, given).astype(np.float32)
+        if not (edit.base[:, :3] == part.gaussians.sh[:, 0]).all():
+            found["sh"] = part.gaussians.sh.copy()
             found["sh"][:, 0] = edit.base[:, :3]
     if edit.sh is not None:
-        bases = slice(1, min(1 + edit.sh.shape[1], part.sh.shape[1]))
+        bases = slice(1, min(1 + edit.sh.shape[1], part.gaussians.sh.shape[1]))
         given = edit.sh[:, : bases.stop - 1]
-        if not (given == part.sh[:, bases]).all():
-            found.setdefault("sh", part.sh.copy())[:, bases] = given
+        if not (given == part.gaussians.sh[:, bases]).all():
+            found.setdefault("sh", part.gaussians.sh.copy())[:, bases] = given
     return found
 
 
@@ -259,7 +259,7 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
     matrix, result, changed = np.eye(4), part, False
     for copy in range(copies.max(initial=-1) + 1):
         chosen = np.flatnonzero(copies == copy)
-        found = affine_between(part.means[chosen], means[chosen])
+        found = affine_between(part.gaussians.means[chosen], means[chosen])
         own, inside = (np.eye(4), np.zeros(len(chosen), bool)) if found is None else found
         if copy == 0:
             matrix, own = own, np.eye(4)
@@ -271,10 +271,10 @@ def _unmoved(part: Scene, rows: np.ndarray, means: np.ndarray) -> tuple[np.ndarr
         if not len(outside):
             continue
         back = np.linalg.inv(matrix)
-        still = outside[(means[outside] == part.means[outside]).all(-1)]
+        still = outside[(means[outside] == part.gaussians.means[outside]).all(-1)]
         if len(still) and found is not None:  # their shapes stay in place too
             result = _moved(result, still, back)
-        new = result.means.copy()
+        new = result.gaussians.means.copy()
         new[outside] = means[outside] @ back[:3, :3].T + back[:3, 3]
         result, changed = result.with_arrays(means=new), True
     return matrix, result if changed else None
@@ -294,7 +294,7 @@ def _moved(part: Scene, chosen: np.ndarray, matrix: np.ndarray) -> Scene:
     """Transform some points by an affine map. chosen [k]"""
     old, arrays = part.arrays(), {}
     for name, values in edited_gaussians.placed(part, chosen, matrix).items():
-        whole = old[name].copy() if name in old else np.ones(len(part.means), np.float32)
+        whole = old[name].copy() if name in old else np.ones(len(part.gaussians.means), np.float32)
         whole[chosen] = values
         arrays[name] = whole
     if part.residuals is not None:

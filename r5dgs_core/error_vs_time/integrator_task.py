@@ -164,9 +164,9 @@ def _of_groups(scene: Scene, groups: list[MotionGroup], tau: float, rounds: int,
 
 def _members(scene: Scene, groups: list[MotionGroup]) -> tuple[np.ndarray, np.ndarray]:
     """Return positions of the groups' Gaussians relative to their pivots [P, 3], and the group index of each [P]."""
-    rows = [np.flatnonzero(scene.motion_ids == group.id) for group in groups]
+    rows = [np.flatnonzero(scene.gaussians.motion_ids == group.id) for group in groups]
     pairs = zip(groups, rows, strict=True)
-    arms = [scene.means[some].astype(np.float64) - group.pivot for group, some in pairs]
+    arms = [scene.gaussians.means[some].astype(np.float64) - group.pivot for group, some in pairs]
     return np.concatenate(arms), np.repeat(np.arange(len(groups)), [len(some) for some in rows])
 
 

@@ -138,16 +138,16 @@ def fit_group(scene: Scene, group: MotionGroup, names: tuple[str, ...] | None) -
         group: A motion group of role "body".
         names: Motion models to choose from, of `MODELS`; all if None.
     """
-    track = scene.track_poses[group.id]
+    track = scene.tracks.poses[group.id]
     first, last = group.seen or (-np.inf, np.inf)
-    rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.motion_ids == group.id))
+    rows, weights = group_dynamics.voters(scene, np.flatnonzero(scene.gaussians.motion_ids == group.id))
     # Only a free top needs the inertia, so it is computed only if that model is a candidate.
     shape = None
     if names is None or names == (candidates.FREE_TOP.name,):
-        shape = free_top.inertia(scene.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
-    seen = (scene.track_times >= first - _SAME) & (scene.track_times <= last + _SAME)
+        shape = free_top.inertia(scene.gaussians.means[rows] - group.pivot, weights) + _LEAST_MOMENT * np.eye(3)
+    seen = (scene.tracks.times >= first - _SAME) & (scene.tracks.times <= last + _SAME)
     return model_selection.fit(
-        scene.track_times,
+        scene.tracks.times,
         track[:, :4],
         track[:, 4:],
         radius=group.model.radius,
@@ -186,13 +186,13 @@ def _member_motion(
     """Return the rigid motions that best fit the moved Gaussians of the bodies. [B, H, 4, 4]"""
     members = []
     for body in bodies:
-        own = (scene.object_ids == body.object_id) & (scene.motion_ids == body.group.id)
+        own = (scene.gaussians.object_ids == body.object_id) & (scene.gaussians.motion_ids == body.group.id)
         members.append(group_dynamics.voters(scene, np.flatnonzero(own)))
     result = np.empty((len(bodies), len(times), 4, 4))
     for k, t in enumerate(times):
         means = player.frame(float(t)).means.astype(np.float64)
         for i, (body, (rows, weights)) in enumerate(zip(bodies, members, strict=True)):
-            fit = rigid_fit.fit_rigid(scene.means[rows].astype(np.float64), means[rows], weights)
+            fit = rigid_fit.fit_rigid(scene.gaussians.means[rows].astype(np.float64), means[rows], weights)
             result[i, k] = ground_truth_poses.matrix(body.group.pivot, fit.quat, fit.displacement_at(body.group.pivot))
     return result
 

@@ -63,7 +63,7 @@ def measure(
     else:
         truths = []
         absent.append("raster: PSNR against true images needs a data set")
-    used = backends.choose(backend, scene_renderer.tensor(scene.means)).name
+    used = backends.choose(backend, scene_renderer.tensor(scene.gaussians.means)).name
     base = RasterSettings(near_plane=scene.near_plane)
 
     def draw(changes: dict[str, float]) -> list[np.ndarray]:

@@ -101,7 +101,7 @@ def measure(
     rows = report_rows.mark_front(rows)
     return {
         "scene": scene.name,
-        "gaussians": len(scene.means),
+        "gaussians": len(scene.gaussians.means),
         "groups": len(scene.groups),
         "t_max": scene.t_max,
         "horizon": {"tau": tau, "why": why},
@@ -125,7 +125,7 @@ def horizon(scene: Scene, dataset: Dataset | None) -> tuple[float, str]:
     last = [view.t for view in dataset.test] if dataset is not None else []
     if last and max(last) > scene.t_max:
         return float(max(last) - scene.t_max), "the last test time"
-    span = float(scene.track_times[-1] - scene.track_times[0])
+    span = float(scene.tracks.times[-1] - scene.tracks.times[0])
     return (SHARE * span, "a third of the observed time") if span > 0 else (1.0, "one unit of time")
 
 

@@ -115,7 +115,7 @@ def evaluate(
     result["train"] = {
         "seconds": given.get("seconds"),
         "iterations": given.get("iterations"),
-        "gaussians": given.get("gaussians", len(scene.means)),
+        "gaussians": given.get("gaussians", len(scene.gaussians.means)),
     }
     return result
 
@@ -184,9 +184,9 @@ def draw(
     start = time.perf_counter()
     frame = move(t)
     moved = time.perf_counter()
-    classified = scene.identities is not None and scene.classifier is not None
+    classified = scene.gaussians.identities is not None and scene.classifier is not None
     output = scene_renderer.render_frame(
-        scene, frame, camera, backend=backend, features=scene.identities if classified else None
+        scene, frame, camera, backend=backend, features=scene.gaussians.identities if classified else None
     )
     color = scene_renderer.to_numpy(output.color, np.float32)
     rendered = time.perf_counter()

@@ -66,7 +66,7 @@ def bodies(scene: Scene, ground_truth: GroundTruth, *, every: bool = False) -> t
         Bodies in the order of the ground truth; empty if no time of the ground truth was observed.
     """
     times = ground_truth.times
-    observed = (times <= scene.t_max + 1e-9) & (times >= scene.track_times[0] - 1e-9)
+    observed = (times <= scene.t_max + 1e-9) & (times >= scene.tracks.times[0] - 1e-9)
     if not observed.any():
         return ()
     if scene.provenance.get("discovered"):
@@ -138,12 +138,15 @@ def _body(scene: Scene, object_id: int) -> MotionGroup | None:
     candidates = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
     if not candidates:  # an object at rest may be a member of the pinned group
         pinned = scene.groups[0] if scene.groups else None
-        mine = scene.means[scene.object_ids == object_id]
+        mine = scene.gaussians.means[scene.gaussians.object_ids == object_id]
         if pinned is None or not len(mine):
             return None
         center = mine.mean(axis=0).astype(np.float64)
         return MotionGroup(pinned.id, object_id, "pinned", -1, center, pinned.model)
-    members = [int(((scene.object_ids == object_id) & (scene.motion_ids == group.id)).sum()) for group in candidates]
+    members = [
+        int(((scene.gaussians.object_ids == object_id) & (scene.gaussians.motion_ids == group.id)).sum())
+        for group in candidates
+    ]
     return candidates[int(np.argmax(members))]
 
 
@@ -151,7 +154,9 @@ def _size(scene: Scene, group: MotionGroup) -> float:
     """Return twice the radius of a group; for an object at rest, the radius that holds 90 % of its Gaussians."""
     if group.role == "body":
         return 2 * group.model.radius
-    distances = np.linalg.norm(scene.means[scene.object_ids == group.object_id] - group.pivot, axis=-1)
+    distances = np.linalg.norm(
+        scene.gaussians.means[scene.gaussians.object_ids == group.object_id] - group.pivot, axis=-1
+    )
     if not len(distances):
         return 2 * group.model.radius
     return 2 * max(float(np.quantile(distances, 0.9)), 1e-9 * scene.extent)

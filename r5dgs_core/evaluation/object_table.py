@@ -108,7 +108,7 @@ def measure(
 
 def own_views(scene: Scene) -> list[viewpoints.Standpoint]:
     """Return views of the scene's own cameras at distinct observed times, or overviews if it stores no cameras."""
-    first = float(scene.track_times[0])
+    first = float(scene.tracks.times[0])
     cameras = viewpoints.spread(scene.cameras, MOST_VIEWS) or [viewpoints.overview(scene)] * 3
     # Golden-ratio steps keep camera order and time order uncorrelated.
     shares = (0.5 + 0.6180339887 * np.arange(len(cameras))) % 1.0
@@ -122,13 +122,15 @@ def confidences(scene: Scene) -> dict[int, float]:
     Returns:
         Probability by object id, for objects with members; empty if the scene stores no encodings or no classifier.
     """
-    if scene.identities is None or scene.classifier is None:
+    if scene.gaussians.identities is None or scene.classifier is None:
         return {}
-    opacities = 1 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))
+    opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits.astype(np.float64)))
     found = {}
     for k, item in enumerate(item for item in scene.objects if item.id >= 0):
         rows = slice(item.start, item.start + item.count)
-        answers = scene.identities[rows].astype(np.float64) @ scene.classifier.weight.T + scene.classifier.bias
+        answers = (
+            scene.gaussians.identities[rows].astype(np.float64) @ scene.classifier.weight.T + scene.classifier.bias
+        )
         answers -= answers.max(axis=1, keepdims=True, initial=-np.inf)
         shares = np.exp(answers)
         total = float(opacities[rows].sum())
@@ -143,11 +145,11 @@ def strays(scene: Scene) -> dict[int, int]:
     A shadow is background that follows its caster, and counts as resting.
     """
     bodies = {group.id: group.object_id for group in scene.groups if group.role == "body"}
-    owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.motion_ids]
-    labels = np.maximum(scene.object_ids, 0)
+    owner = np.array([bodies.get(group.id, 0) for group in scene.groups])[scene.gaussians.motion_ids]
+    labels = np.maximum(scene.gaussians.object_ids, 0)
     # Objects without a group of their own rest with the background and are not strays.
     away = (owner != labels) & ((owner > 0) | np.isin(labels, list(bodies.values())))
-    ids, counts = np.unique(scene.object_ids[away], return_counts=True)
+    ids, counts = np.unique(scene.gaussians.object_ids[away], return_counts=True)
     return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
 
@@ -223,6 +225,6 @@ def _residual(scene: Scene, groups: Sequence[MotionGroup]) -> float | None:
     """Return the RMS share of the radius, weighted by members; None if all groups move rigidly."""
     if not any(group.rigid_max > 0 for group in groups):
         return None
-    counts = np.array([max(int((scene.motion_ids == group.id).sum()), 1) for group in groups])
+    counts = np.array([max(int((scene.gaussians.motion_ids == group.id).sum()), 1) for group in groups])
     squares = np.array([(group.rigid_rms / max(group.model.radius, 1e-9 * scene.extent)) ** 2 for group in groups])
     return float(np.sqrt(np.average(squares, weights=counts)))

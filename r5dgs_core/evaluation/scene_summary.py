@@ -35,7 +35,7 @@ def motion_of(scene: Scene, groups: Sequence[MotionGroup]) -> str:
 
 def _moved(scene: Scene, group: MotionGroup) -> float:
     """Return the largest displacement of a point at the group's radius in the observed time, world units."""
-    poses = scene.track_poses[group.id]
+    poses = scene.tracks.poses[group.id]
     chords = 2 * np.linalg.norm(poses[:, 1:4], axis=1)  # 2 sin(angle / 2)
     return float((np.linalg.norm(poses[:, 4:], axis=1) + chords * group.model.radius).max())
 
@@ -48,12 +48,12 @@ def summary(scene: Scene, path: Path | None = None) -> str:
         path: File of the scene; an evaluation beside it provides the quality.
     """
     objects = [item for item in scene.objects if item.id > 0]
-    first, fps = float(scene.track_times[0]), scene.frames_per_unit
+    first, fps = float(scene.tracks.times[0]), scene.frames_per_unit
     frames = round((scene.t_max - first) * fps) + 1
     moving = [(item.name, motion) for item in objects if (motion := observed_motion(scene, item.id)) is not None]
     count = "1 object" if len(objects) == 1 else f"{len(objects)} objects"
     lines = [
-        f"scene      {terminal.printable(scene.name)}: {len(scene.means)} Gaussians, {count}",
+        f"scene      {terminal.printable(scene.name)}: {len(scene.gaussians.means)} Gaussians, {count}",
         f"duration   {frames} frame{'s' * (frames != 1)}: scene time {first:g} to {scene.t_max:g}, then predicted",
         f"frames     {fps:g} per unit of scene time (per second if the data set's times are seconds)",
         f"extent     {scene.extent:.3g} world units",
@@ -79,7 +79,7 @@ def observed_motion(scene: Scene, object_id: int) -> str | None:
     groups = [group for group in scene.groups if group.object_id == object_id and group.role == "body"]
     if not groups or motion_of(scene, groups) in ("still", "pinned"):
         return None
-    poses = np.concatenate([scene.track_poses[group.id] for group in groups])
+    poses = np.concatenate([scene.tracks.poses[group.id] for group in groups])
     away = float(np.linalg.norm(poses[:, 4:], axis=1).max())
     sines = np.clip(np.linalg.norm(poses[:, 1:4], axis=1), 0, 1)
     degrees = float(np.degrees(2 * np.arcsin(sines)).max())

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..motion import models, rotations
 from ..scene import scene
-from ..scene.scene import Classifier, Dynamics, MotionGroup, Residuals, Scene, SceneObject
+from ..scene.scene import Classifier, Dynamics, Gaussians, MotionGroup, Residuals, Scene, SceneObject, Tracks
 from .foreign_run import Foreign, State
 
 CHUNK = 16384  # rows per evaluation at all knots; bounds the memory
@@ -123,19 +123,20 @@ def make_scene(foreign: Foreign, motion: Motion | None, times: np.ndarray, **res
         identities = None
     group = MotionGroup(0, 0, "pinned", 0 if len(order) else -1, np.zeros(3), models.STATIC)
     return Scene(
-        means=means[order].astype(np.float32),
-        quats=rotations.normalize(quats[order].astype(np.float64)).astype(np.float32),
-        log_scales=log_scales[order].astype(np.float32),
-        opacity_logits=splats.opacity_logits[order],
-        sh=splats.sh[order],
-        object_ids=labels[order],
-        motion_ids=np.zeros(len(order), np.int32),
-        track_times=times.astype(np.float64),
-        track_poses=np.tile([1.0, 0, 0, 0, 0, 0, 0], (1, len(times), 1)),
+        gaussians=Gaussians(
+            means=means[order].astype(np.float32),
+            quats=rotations.normalize(quats[order].astype(np.float64)).astype(np.float32),
+            log_scales=log_scales[order].astype(np.float32),
+            opacity_logits=splats.opacity_logits[order],
+            sh=splats.sh[order],
+            object_ids=labels[order],
+            motion_ids=np.zeros(len(order), np.int32),
+            identities=None if identities is None else identities[order].astype(np.float16),
+        ),
         objects=_objects(labels[order]),
         groups=(group,),
+        tracks=Tracks(times=times.astype(np.float64), poses=np.tile([1.0, 0, 0, 0, 0, 0, 0], (1, len(times), 1))),
         t_max=float(times[-1]),
-        identities=None if identities is None else identities[order].astype(np.float16),
         classifier=classifier,
         residuals=residuals,
         dynamics=None if motion is None or motion.dynamics is None else Dynamics(motion.dynamics[order]),

@@ -42,7 +42,7 @@ class Foreign:
         near_plane: Near plane of the run's renderer, depth.
         state: Function from rows and a time up to t_max to their state, or None for a static run.
         dynamics: Function from rows, their centres at t_max [n, 3], and t_max to the motion past it, as in
-            `Scene.dynamics` [n, 12]; None if the layout has none.
+            `Dynamics.rates` [n, 12]; None if the layout has none.
         t_max: Last time of the deformation, None if unknown.
         classifier: Weight [K, 16] and bias [K] of the identity classifier, or None.
     """

@@ -134,7 +134,7 @@ def _among_cameras(scene: Scene, folder: Path) -> Scene:
         np.spacing(np.float32(np.abs(origin).max())),
     )
     return dataclasses.replace(
-        scene.with_arrays(means=(scene.means.astype(np.float64) - origin).astype(np.float32), origin=origin),
+        scene.with_arrays(means=(scene.gaussians.means.astype(np.float64) - origin).astype(np.float32), origin=origin),
         cameras=tuple(cameras.moved(camera, -origin) for camera in scene.cameras),
     )
 

@@ -103,7 +103,7 @@ def crops(
 
 def _standpoints(scene: Scene) -> list[viewpoints.Standpoint]:
     some = viewpoints.spread(scene.cameras, _CAMERAS) or [viewpoints.overview(scene)]
-    times = np.unique(np.linspace(scene.track_times[0], scene.t_max, _TIMES))
+    times = np.unique(np.linspace(scene.tracks.times[0], scene.t_max, _TIMES))
     return [viewpoints.Standpoint(camera, float(t)) for t in times for camera in some]
 
 

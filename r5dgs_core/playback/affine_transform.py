@@ -100,8 +100,8 @@ def place(
     Raises:
         ValueError: The range exceeds the scene, or the matrix is singular or not finite.
     """
-    if not 0 <= start <= start + count <= len(scene.means):
-        raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.means)} Gaussians")
+    if not 0 <= start <= start + count <= len(scene.gaussians.means):
+        raise ValueError(f"rows {start}:{start + count} leave the scene's {len(scene.gaussians.means)} Gaussians")
     rows, turn = slice(start, start + count), nearest_rotation(affine(matrix)[0])
     if world is not None:
         turn = nearest_rotation(affine(world)[0]).T @ turn
@@ -116,15 +116,15 @@ def place(
 
 def bind_state(scene: Scene, rows: slice | np.ndarray) -> Splats:
     """Rows of a scene in the bind state, as stored in its file, without shading."""
-    identities = scene.identities
+    identities = scene.gaussians.identities
     return Splats(
-        scene.means[rows],
-        scene.quats[rows],
-        scene.log_scales[rows],
-        scene.opacity_logits[rows],
-        scene.sh[rows],
+        scene.gaussians.means[rows],
+        scene.gaussians.quats[rows],
+        scene.gaussians.log_scales[rows],
+        scene.gaussians.opacity_logits[rows],
+        scene.gaussians.sh[rows],
         None if identities is None else identities[rows].astype(np.float32),
-        scene.object_ids[rows],
+        scene.gaussians.object_ids[rows],
     )
 
 

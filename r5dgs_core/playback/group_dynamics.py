@@ -60,7 +60,7 @@ class GroupMotion:
     """
 
     def __init__(self, scene: Scene, source: str = "fitted"):
-        self._times, self._t_max = scene.track_times, scene.t_max
+        self._times, self._t_max = scene.tracks.times, scene.t_max
         self._scene, self._source = scene, source
         self._quats, self._displacements = knots(scene)
         self._slopes = (
@@ -119,7 +119,7 @@ def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.nda
     Returns:
         Quaternions [G, S, 4] and displacements [G, S, 3], float64.
     """
-    poses = np.asarray(scene.track_poses[groups], np.float64)
+    poses = np.asarray(scene.tracks.poses[groups], np.float64)
     quats = np.moveaxis(poses[..., :4], 1, 0)
     quats = rotations.make_continuous(quats[::-1])[::-1]
     quats = np.where(quats[-1:, :, :1] < 0, -quats, quats)
@@ -129,7 +129,7 @@ def knots(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.nda
 def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are opaque enough to represent a group, or all if none is, and their opacities. [n] each"""
     with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-scene.opacity_logits[rows].astype(np.float64)))
+        opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[rows].astype(np.float64)))
     seen = visibility.seen(opacities)
     return rows[seen], np.maximum(opacities[seen], 1e-12)
 
@@ -137,19 +137,19 @@ def voters(scene: Scene, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def representative(scene: Scene, rows: np.ndarray) -> int:
     """Row of the opaque Gaussian nearest to the centroid of the given ones, at least one."""
     rows, _ = voters(scene, rows)
-    points = scene.means[rows].astype(np.float64)
+    points = scene.gaussians.means[rows].astype(np.float64)
     return int(rows[np.argmin(((points - points.mean(0)) ** 2).sum(-1))])
 
 
 def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
     assert scene.dynamics is not None
-    rows = np.flatnonzero(scene.motion_ids == group.id)
+    rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)
     if group.role == "pinned" or group.follows is not None or len(rows) == 0:
         return STATIC
     rows, weights = voters(scene, rows)
     if source == "representative":
         rows, weights = (np.array([group.anchor_index]), np.ones(1)) if group.anchor_index >= 0 else (rows, weights)
-    arms = scene.means[rows].astype(np.float64) - group.pivot
+    arms = scene.gaussians.means[rows].astype(np.float64) - group.pivot
     states = scene.dynamics.rates[rows].astype(np.float64)
     radius = max(float(np.quantile(np.linalg.norm(arms, axis=-1), 0.98)), 1e-9 * scene.extent)
     if not states.any():
@@ -157,7 +157,7 @@ def _model_of(scene: Scene, group: MotionGroup, source: str) -> MotionModel:
     v, w, a, e = np.split(states, 4, axis=-1)
     about_pivot = np.concatenate([*se3.recentre(w, v, e, a, -arms), w, e], axis=-1)  # v, a, w, e
     twist = np.median(about_pivot, axis=0)
-    span = float(scene.track_times[-1] - scene.track_times[0]) * HORIZON or 1.0
+    span = float(scene.tracks.times[-1] - scene.tracks.times[0]) * HORIZON or 1.0
     if source in ("least_squares", "kabsch"):
         twist = _least_squares(arms, states, weights, twist, span)
     if source == "kabsch":

@@ -22,7 +22,7 @@ class Poser:
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self._runs = runs(scene.motion_ids)
+        self._runs = runs(scene.gaussians.motion_ids)
         self.pivots = np.array([group.pivot for group in scene.groups], np.float64).reshape(-1, 3)
         self._rest = rest_factors(scene)
         self._arms: np.ndarray | None = None
@@ -71,7 +71,7 @@ class Poser:
         for start, stop, g in self._runs:
             if maps[g].any():
                 moves = offsets[start:stop] @ maps[g]
-                moves += self._scene.means[start:stop]
+                moves += self._scene.gaussians.means[start:stop]
                 moves -= origin
                 result[start:stop] = moves
         return result
@@ -80,11 +80,11 @@ class Poser:
         """Gaussian rotations with each group rotated; the scene's own array if none is. [G, 4] -> [N, 4] float32"""
         turned = (group_quats[:, 1:] != 0).any(-1)
         if not turned.any():
-            return self._scene.quats
-        result = self._scene.quats.copy()
+            return self._scene.gaussians.quats
+        result = self._scene.gaussians.quats.copy()
         for start, stop, g in self._runs:
             if turned[g]:
-                turn_quats(self._scene.quats[start:stop], group_quats[g], result[start:stop])
+                turn_quats(self._scene.gaussians.quats[start:stop], group_quats[g], result[start:stop])
         return result
 
     def shading(self, group_quats: np.ndarray) -> np.ndarray | None:
@@ -119,22 +119,24 @@ class Poser:
     def arms(self) -> np.ndarray:
         """Positions relative to the pivots of their groups, with a fourth column of ones. [N, 4] float64"""
         if self._arms is None:
-            self._arms = np.ones((len(self._scene.means), 4))
-            np.subtract(self._scene.means, self.pivots[self._scene.motion_ids], out=self._arms[:, :3])
+            self._arms = np.ones((len(self._scene.gaussians.means), 4))
+            np.subtract(
+                self._scene.gaussians.means, self.pivots[self._scene.gaussians.motion_ids], out=self._arms[:, :3]
+            )
         return self._arms
 
     def _resting(self, origin: np.ndarray) -> np.ndarray:
         if not origin.any():
-            return self._scene.means
+            return self._scene.gaussians.means
         if self._still is None or not np.array_equal(self._still[0], origin):
-            self._still = origin.copy(), (self._scene.means.astype(np.float64) - origin).astype(np.float32)
+            self._still = origin.copy(), (self._scene.gaussians.means.astype(np.float64) - origin).astype(np.float32)
         return self._still[1]
 
 
 def rest_factors(scene: Scene) -> np.ndarray:
     """Colour factor of each Gaussian in the bind state, before clamping at 0. [N] float32"""
     rest = None if scene.shading is None else scene.shading.rest
-    return np.ones(len(scene.means), np.float32) if rest is None else rest
+    return np.ones(len(scene.gaussians.means), np.float32) if rest is None else rest
 
 
 def lit(rest: np.ndarray, shading: np.ndarray, light: np.ndarray, turns: np.ndarray) -> np.ndarray:

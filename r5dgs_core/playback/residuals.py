@@ -36,9 +36,9 @@ class Residuals:
         parts = () if found is None else (found.offsets, found.quats, found.log_scales)
         # [C, S, R]: the values of one knot are contiguous.
         self._parts = [np.ascontiguousarray(part.transpose(2, 1, 0)) for part in parts]
-        self.runs = runs(scene.motion_ids[self.rows])
-        self.bind_quats = np.ascontiguousarray(scene.quats[self.rows].T)
-        self._times, self._t_max = scene.track_times, scene.t_max
+        self.runs = runs(scene.gaussians.motion_ids[self.rows])
+        self.bind_quats = np.ascontiguousarray(scene.gaussians.quats[self.rows].T)
+        self._times, self._t_max = scene.tracks.times, scene.t_max
         self._interval: tuple[int, list[Cubic]] | None = None
 
     def at(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -90,7 +90,7 @@ def unexplained(scene: Scene) -> np.ndarray:
     rows, offsets = scene.residuals.rows, scene.residuals.offsets
     limits = np.array([0.0 if g.role == "pinned" else UNEXPLAINED * g.model.radius for g in scene.groups])
     away = np.sqrt(np.einsum("rsc,rsc->r", offsets, offsets, dtype=np.float64) / offsets.shape[1])
-    return rows[away > limits[scene.motion_ids[rows]]].astype(np.int64)
+    return rows[away > limits[scene.gaussians.motion_ids[rows]]].astype(np.int64)
 
 
 class OwnMotion:
@@ -103,7 +103,7 @@ class OwnMotion:
 
     def __init__(self, scene: Scene, rows: np.ndarray | None = None):
         assert scene.dynamics is not None
-        chosen = np.arange(len(scene.means)) if rows is None else rows
+        chosen = np.arange(len(scene.gaussians.means)) if rows is None else rows
         tolerance = TOLERANCE * scene.extent
         self._propagator = twist_propagation.Propagator(
             scene.dynamics.rates[chosen], tolerance, radius=tolerance / ANGLE_TOLERANCE
@@ -112,8 +112,8 @@ class OwnMotion:
         # If only some rows move on their own, resting ones are listed too, so that their group does not move them.
         self._resting = np.zeros(0, np.int64) if rows is None else np.setdiff1d(np.arange(len(chosen)), moving)
         self.rows = chosen[np.concatenate([moving, self._resting])]
-        self._means = np.ascontiguousarray(scene.means[self.rows].T, np.float64)
-        self._quats = np.ascontiguousarray(scene.quats[self.rows].T)
+        self._means = np.ascontiguousarray(scene.gaussians.means[self.rows].T, np.float64)
+        self._quats = np.ascontiguousarray(scene.gaussians.quats[self.rows].T)
 
     def at(self, tau: float, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means relative to the origin [3, R], quats [4, R] and rotations since t_max [4, R], by column."""
@@ -142,17 +142,17 @@ class Literal:
     def __init__(self, scene: Scene, anchored: bool = False):
         assert scene.dynamics is not None and scene.dynamics.canonical_means is not None
         anchors = np.array([g.anchor_index if g.role == "body" else -1 for g in scene.groups])
-        loose = np.flatnonzero(np.isin(scene.motion_ids, [g.id for g in scene.groups if g.role != "body"]))
+        loose = np.flatnonzero(np.isin(scene.gaussians.motion_ids, [g.id for g in scene.groups if g.role != "body"]))
         if anchored and len(loose):
             anchors[[g.role != "body" for g in scene.groups]] = group_dynamics.representative(scene, loose)
         self._moving = np.flatnonzero(anchors >= 0)
         self._anchors = anchors[self._moving]
         v, w, a, e = np.split(scene.dynamics.rates[self._anchors].astype(np.float64), 4, axis=-1)
-        step = point_dynamics.TRACE_STEP * point_dynamics.time_unit(float(scene.track_times[0]), scene.t_max)
+        step = point_dynamics.TRACE_STEP * point_dynamics.time_unit(float(scene.tracks.times[0]), scene.t_max)
         self._path = rk2_cache.SteppedPath(np.zeros_like(v), v, w, a, e, step)
         canonical = scene.dynamics.canonical_means.astype(np.float64)
         self._offsets = np.ones((len(canonical), 4))
-        self._offsets[:, :3] = canonical - canonical[np.maximum(anchors, 0)[scene.motion_ids]]
+        self._offsets[:, :3] = canonical - canonical[np.maximum(anchors, 0)[scene.gaussians.motion_ids]]
         self._count = len(scene.groups)
 
     def at(self, tau: float) -> tuple[np.ndarray, np.ndarray]:

@@ -14,8 +14,8 @@ def info(scene: Scene) -> dict[str, Any]:
     """Return the output of `r5dgs info --json` as JSON types."""
     return {
         "name": scene.name,
-        "gaussians": len(scene.means),
-        "sh_degree": int(np.sqrt(scene.sh.shape[1])) - 1,
+        "gaussians": len(scene.gaussians.means),
+        "sh_degree": int(np.sqrt(scene.gaussians.sh.shape[1])) - 1,
         "objects": [
             {"id": o.id, "name": o.name, "aliases": list(o.aliases), "gaussians": o.count} for o in scene.objects
         ],
@@ -24,20 +24,20 @@ def info(scene: Scene) -> dict[str, Any]:
                 "id": g.id,
                 "object": g.object_id,
                 "role": g.role,
-                "gaussians": int((scene.motion_ids == g.id).sum()),
+                "gaussians": int((scene.gaussians.motion_ids == g.id).sum()),
                 "model": g.model.kind if g.follows is None else f"follows {g.follows}",
                 "rigid_rms": g.rigid_rms,
             }
             for g in scene.groups
         ],
-        "times": [float(scene.track_times[0]), scene.t_max],
-        "knots": len(scene.track_times),
+        "times": [float(scene.tracks.times[0]), scene.t_max],
+        "knots": len(scene.tracks.times),
         "frames_per_unit": scene.frames_per_unit,
         "world_convention": scene.world_convention,
         "cameras": len(scene.cameras),
         "extent": scene.extent,
         **({"origin": scene.origin.tolist()} if scene.origin.any() else {}),
-        "identities": scene.identities is not None,
+        "identities": scene.gaussians.identities is not None,
         "shading": scene.shading is not None,
         "residuals": 0 if scene.residuals is None else len(scene.residuals.rows),
         "modes": list(scene_player.modes(scene)),

@@ -160,7 +160,7 @@ class Player:
             means = self._literal.means(poser, quats, displacements, center)
         else:
             means = poser.means(quats, displacements, center)
-        moved = _Moved(means, poser.quats(quats), scene.log_scales, poser.shading(quats))
+        moved = _Moved(means, poser.quats(quats), scene.gaussians.log_scales, poser.shading(quats))
         if not past:
             self._bend(moved, t, quats, displacements, center)
         elif self._own is not None:
@@ -170,11 +170,11 @@ class Player:
             means=moved.means,
             quats=moved.quats,
             log_scales=moved.log_scales,
-            opacity_logits=scene.opacity_logits,
-            sh=scene.sh,
+            opacity_logits=scene.gaussians.opacity_logits,
+            sh=scene.gaussians.sh,
             shading_factor=moved.shading,
-            object_ids=scene.object_ids,
-            motion_ids=scene.motion_ids,
+            object_ids=scene.gaussians.object_ids,
+            motion_ids=scene.gaussians.motion_ids,
             group_quats=quats,
             group_displacements=displacements,
             origin=center,
@@ -194,10 +194,10 @@ class Player:
         maps = self._poser.maps(quats, displacements, origin)
         for start, stop, g in self._residuals.runs:
             moved.means[rows[start:stop]] = arms[start:stop] @ maps[g]
-        carried = np.take(quats.T.astype(np.float32), scene.motion_ids[rows], axis=1)
+        carried = np.take(quats.T.astype(np.float32), scene.gaussians.motion_ids[rows], axis=1)
         since = quaternion_columns.multiply(carried, turns.astype(np.float32))
         moved.turn(rows, since, quaternion_columns.multiply(since, self._residuals.bind_quats), scene)
-        moved.log_scales = scene.log_scales.copy()
+        moved.log_scales = scene.gaussians.log_scales.copy()
         moved.log_scales[rows] += growths.T
         self._poser.relight(moved.shading, rows, since)
 
@@ -223,8 +223,8 @@ class _Moved:
 
     def turn(self, rows: np.ndarray, since: np.ndarray, quats: np.ndarray, scene: Scene) -> None:
         """Set quaternions of some Gaussians and their rotations ``since`` the bind state, by column. [4, R]"""
-        if self.quats is scene.quats:
-            self.quats = scene.quats.copy()
+        if self.quats is scene.gaussians.quats:
+            self.quats = scene.gaussians.quats.copy()
         self.quats[rows] = quats.T
         self.rows, self.turns = rows, since.T
 
@@ -250,7 +250,7 @@ def frame(scene: Scene, t: float, mode: str = "rigid", *, origin: np.ndarray | N
 def knot_slopes(scene: Scene, groups: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Slopes at the knots of `knots`, per unit of scene time: quaternions [G, S, 4] and displacements [G, S, 3]."""
     quats, displacements = knots(scene, groups)
-    return slopes(scene.track_times, quats), slopes(scene.track_times, displacements)
+    return slopes(scene.tracks.times, quats), slopes(scene.tracks.times, displacements)
 
 
 def group_poses(scene: Scene, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -286,12 +286,12 @@ def pose(scene: Scene, group_quats: np.ndarray, group_displacements: np.ndarray,
         t=float(t),
         means=poser.means(group_quats, group_displacements, center),
         quats=poser.quats(group_quats),
-        log_scales=scene.log_scales,
-        opacity_logits=scene.opacity_logits,
-        sh=scene.sh,
+        log_scales=scene.gaussians.log_scales,
+        opacity_logits=scene.gaussians.opacity_logits,
+        sh=scene.gaussians.sh,
         shading_factor=poser.shading(group_quats),
-        object_ids=scene.object_ids,
-        motion_ids=scene.motion_ids,
+        object_ids=scene.gaussians.object_ids,
+        motion_ids=scene.gaussians.motion_ids,
         group_quats=group_quats,
         group_displacements=group_displacements,
         origin=center,

@@ -76,7 +76,7 @@ class Gathered:
 def gather(scenes: Sequence[Scene]) -> Gathered:
     """Concatenate the Gaussians of scenes. A single scene is not copied."""
     lit = any(scene.shading is not None for scene in scenes)
-    bases = max((scene.sh.shape[1] for scene in scenes), default=1)
+    bases = max((scene.gaussians.sh.shape[1] for scene in scenes), default=1)
 
     def stacked(arrays: list[np.ndarray], shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
         return arrays[0] if len(arrays) == 1 else np.concatenate([np.empty((0, *shape), dtype), *arrays])
@@ -85,16 +85,20 @@ def gather(scenes: Sequence[Scene]) -> Gathered:
         return sh if sh.shape[1] == bases else np.pad(sh, ((0, 0), (0, bases - sh.shape[1]), (0, 0)))
 
     def vectors(scene: Scene) -> np.ndarray:
-        return scene.shading.vectors if scene.shading is not None else np.zeros((len(scene.means), 3), np.float32)
+        return (
+            scene.shading.vectors
+            if scene.shading is not None
+            else np.zeros((len(scene.gaussians.means), 3), np.float32)
+        )
 
     return Gathered(
-        means=stacked([scene.means for scene in scenes], (3,)),
-        quats=stacked([scene.quats for scene in scenes], (4,)),
-        log_scales=stacked([scene.log_scales for scene in scenes], (3,)),
-        opacity_logits=stacked([scene.opacity_logits for scene in scenes], ()),
-        object_ids=stacked([scene.object_ids for scene in scenes], (), np.int32),
-        sh=stacked([padded(scene.sh) for scene in scenes], (bases, 3)),
-        starts=(0, *(int(stop) for stop in np.cumsum([len(scene.means) for scene in scenes]))),
+        means=stacked([scene.gaussians.means for scene in scenes], (3,)),
+        quats=stacked([scene.gaussians.quats for scene in scenes], (4,)),
+        log_scales=stacked([scene.gaussians.log_scales for scene in scenes], (3,)),
+        opacity_logits=stacked([scene.gaussians.opacity_logits for scene in scenes], ()),
+        object_ids=stacked([scene.gaussians.object_ids for scene in scenes], (), np.int32),
+        sh=stacked([padded(scene.gaussians.sh) for scene in scenes], (bases, 3)),
+        starts=(0, *(int(stop) for stop in np.cumsum([len(scene.gaussians.means) for scene in scenes]))),
         shading=stacked([vectors(scene) for scene in scenes], (3,)) if lit else None,
         shading_rest=stacked([scene_player.rest_factors(scene) for scene in scenes], ()) if lit else None,
         lights=tuple(

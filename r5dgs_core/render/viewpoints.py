@@ -76,7 +76,7 @@ def candidates(scene: Scene, camera: str | None = None, t: float | None = None) 
         some = spread(scene.cameras, MOST_CAMERAS)
     else:
         some = [overview(scene)]
-    first = float(scene.track_times[0])
+    first = float(scene.tracks.times[0])
     times = np.unique([scene.t_max, 0.5 * (first + scene.t_max), first])[::-1].tolist() if t is None else [float(t)]
     return [Standpoint(view, when) for when in times for view in some]
 
@@ -120,8 +120,8 @@ def sized(camera: Camera, longest: int) -> Camera:
 def overview(scene: Scene) -> Camera:
     """Return a camera that sees the whole scene obliquely from above, for scenes without cameras."""
     up = axes.WORLD_TO_BLENDER[scene.world_convention].T @ np.array([0.0, 0.0, 1.0])
-    seen = scene.means[scene.object_ids > 0]
-    points = (seen if len(seen) else scene.means).astype(np.float64)
+    seen = scene.gaussians.means[scene.gaussians.object_ids > 0]
+    points = (seen if len(seen) else scene.gaussians.means).astype(np.float64)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     radius = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98)) if len(points) else 1.0
     side = np.cross(up, [1.0, 0.2, 0.1])

@@ -55,7 +55,11 @@ def of(scene: Scene, path: Path | None = None) -> Quality:
         The known errors.
     """
     splits = _evaluation(scene, path)
-    counts = np.bincount(scene.motion_ids, minlength=len(scene.groups)) if len(scene.means) else np.zeros(0)
+    counts = (
+        np.bincount(scene.gaussians.motion_ids, minlength=len(scene.groups))
+        if len(scene.gaussians.means)
+        else np.zeros(0)
+    )
     squares = [count * group.rigid_rms**2 for count, group in zip(counts, scene.groups, strict=False)]
     measured = any(group.rigid_max > 0 for group in scene.groups)
     rms = float(np.sqrt(sum(squares) / max(counts.sum(), 1))) / scene.extent if measured else None
@@ -72,7 +76,7 @@ def _evaluation(scene: Scene, path: Path | None) -> dict[str, Any]:
             if place.stat().st_mtime < path.stat().st_mtime:
                 continue
             found = strict_json.read(place, errors.SceneFileError)
-            if found["scene"] == scene.name and found["train"]["gaussians"] == len(scene.means):
+            if found["scene"] == scene.name and found["train"]["gaussians"] == len(scene.gaussians.means):
                 return found["splits"]
         except (OSError, errors.SceneFileError, KeyError, TypeError):  # missing, or not an evaluation
             continue

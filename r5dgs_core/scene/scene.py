@@ -106,6 +106,44 @@ class MotionGroup:
 
 
 @dataclass(frozen=True)
+class Gaussians:
+    """The Gaussians in their state at t_max, sorted by object id and, within an object, by motion group.
+
+    Attributes:
+        means: Centres, world. [N, 3] float32
+        quats: Unit wxyz. [N, 4] float32
+        log_scales: Natural logarithm of the standard deviations. [N, 3] float32
+        opacity_logits: Opacities before the sigmoid. [N] float32
+        sh: Spherical harmonics coefficients, 3DGS convention, display-referred sRGB. [N, K, 3] float32
+        object_ids: Object of each Gaussian. [N] int32
+        motion_ids: Motion group of each Gaussian. [N] int32
+        identities: Identity encodings. [N, 16] float16 or None
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    object_ids: np.ndarray
+    motion_ids: np.ndarray
+    identities: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observed motion of the groups.
+
+    Attributes:
+        times: Observed times, increasing, last = t_max. [S] float64
+        poses: Rotation wxyz and displacement of each group's pivot relative to the bind state. [G, S, 7] float64
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+
+
+@dataclass(frozen=True)
 class Classifier:
     """Linear classifier of identity encodings; row k is the k-th object with id >= 0 of `Scene.objects`.
 
@@ -166,6 +204,8 @@ class Shading:
 
 # Groups of arrays in `Scene`: class, and the names of its arrays in a file by attribute.
 GROUPS: dict[str, tuple[type, dict[str, str]]] = {
+    "gaussians": (Gaussians, {field.name: field.name for field in dataclasses.fields(Gaussians)}),
+    "tracks": (Tracks, {"times": "track_times", "poses": "track_poses"}),
     "classifier": (Classifier, {"weight": "classifier_weight", "bias": "classifier_bias"}),
     "residuals": (
         Residuals,
@@ -186,27 +226,17 @@ _GROUP_OF = {name: group for group, (_, names) in GROUPS.items() for name in nam
 class Scene:
     """A baked scene, with all data for playback, Blender and export.
 
-    Gaussians are in their state at t_max, sorted by object id and, within an object, by motion group.
-
     Attributes:
         name: Name of the scene.
-        means: Centres, world. [N, 3] float32
-        quats: Unit wxyz. [N, 4] float32
-        log_scales: Natural logarithm of the standard deviations. [N, 3] float32
-        opacity_logits: Opacities before the sigmoid. [N] float32
-        sh: Spherical harmonics coefficients, 3DGS convention, display-referred sRGB. [N, K, 3] float32
-        object_ids: Object of each Gaussian. [N] int32
-        motion_ids: Motion group of each Gaussian. [N] int32
-        track_times: Observed times, increasing, last = t_max. [S] float64
-        track_poses: Rotation wxyz and displacement of the pivot relative to the bind state. [G, S, 7] float64
+        gaussians: The Gaussians.
         objects: The objects, ordered by id.
         groups: The motion groups, ordered by id.
+        tracks: Their observed motion.
         t_max: Last observed time.
         frames_per_unit: Blender frames per unit of scene time.
         world_convention: Key of ``cameras.WORLD_TO_BLENDER``.
         cameras: The data set's distinct cameras.
         background_sh: Spherical harmonics of the sky by world viewing direction, 3DGS basis. [Kb, 3]
-        identities: Identity encodings. [N, 16] float16 or None
         classifier: Classifier of the identities, or None.
         residuals: Motion of single Gaussians in the observed time, or None.
         dynamics: Motion of single Gaussians past t_max, or None.
@@ -228,23 +258,15 @@ class Scene:
     """
 
     name: str
-    means: np.ndarray
-    quats: np.ndarray
-    log_scales: np.ndarray
-    opacity_logits: np.ndarray
-    sh: np.ndarray
-    object_ids: np.ndarray
-    motion_ids: np.ndarray
-    track_times: np.ndarray
-    track_poses: np.ndarray
+    gaussians: Gaussians
     objects: tuple[SceneObject, ...]
     groups: tuple[MotionGroup, ...]
+    tracks: Tracks
     t_max: float
     frames_per_unit: float
     world_convention: str
     cameras: tuple[Camera, ...]
     background_sh: np.ndarray
-    identities: np.ndarray | None = None
     classifier: Classifier | None = None
     residuals: Residuals | None = None
     dynamics: Dynamics | None = None
@@ -264,9 +286,9 @@ class Scene:
     @functools.cached_property
     def extent(self) -> float:
         """Size of the scene: diagonal of the box of the middle 98 % of the centres on each axis, world units."""
-        if len(self.means) == 0:
+        if len(self.gaussians.means) == 0:
             return 1.0
-        low, high = np.quantile(self.means.astype(np.float64), [0.01, 0.99], axis=0)
+        low, high = np.quantile(self.gaussians.means.astype(np.float64), [0.01, 0.99], axis=0)
         return float(max(np.linalg.norm(high - low), 1e-30))
 
     def arrays(self) -> dict[str, np.ndarray]:

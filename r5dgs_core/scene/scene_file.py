@@ -110,11 +110,11 @@ def read_meanings(path: str | Path) -> Meanings | None:
 
 def _warn_of_lost_detail(scene: Scene, path: str | Path) -> None:
     """Warn about a scene baked far from its world's origin without the feature `origin`."""
-    some = slice(None, None, max(1, len(scene.means) // 1000))
-    if len(scene.means) < 2:
+    some = slice(None, None, max(1, len(scene.gaussians.means) // 1000))
+    if len(scene.gaussians.means) < 2:
         return
-    step = float(np.spacing(np.abs(np.median(scene.means[some], axis=0)).max()))
-    size = float(np.exp(np.median(scene.log_scales[some].astype(np.float64))))
+    step = float(np.spacing(np.abs(np.median(scene.gaussians.means[some], axis=0)).max()))
+    size = float(np.exp(np.median(scene.gaussians.log_scales[some].astype(np.float64))))
     if step > 0.2 * size:
         _log.warning(
             "%s: is so far from the origin that its Gaussians, of %.2g units, are positioned only to %.2g units. "
@@ -135,7 +135,7 @@ def _write_zip(scene: Scene, stream: BinaryIO, exact: bool) -> None:
 def _write_members(scene: Scene, stream: BinaryIO, exact: bool, compression: int) -> bool:
     """Write the zip; returns False if it compresses so well that readers would reject it as a zip bomb."""
     with zipfile.ZipFile(stream, "w") as archive:
-        still = _TRACKS if len(scene.track_times) == 1 else ()  # every pose is then the identity
+        still = _TRACKS if len(scene.tracks.times) == 1 else ()  # every pose is then the identity
         arrays = {name: array for name, array in scene.arrays().items() if name in DTYPES and name not in still}
         head = {
             "format": FORMAT,

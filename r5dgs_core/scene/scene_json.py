@@ -24,7 +24,7 @@ def dump(scene: Scene, head: dict[str, Any]) -> bytes:
         **head,
         "generator": f"r5dgs {__version__}",
         "name": scene.name,
-        "gaussians": len(scene.means),
+        "gaussians": len(scene.gaussians.means),
         "t_max": float(scene.t_max),
         "frames_per_unit": float(scene.frames_per_unit),
         "world_convention": scene.world_convention,

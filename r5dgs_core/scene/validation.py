@@ -130,7 +130,7 @@ def _check_groups(arrays: Mapping[str, Any], place: str, guard: findings.Guard) 
 def _check_ids(scene: Scene, place: str, guard: findings.Guard) -> None:
     with guard():
         groups = len(scene.groups)
-        stray = scene.motion_ids[(scene.motion_ids < 0) | (scene.motion_ids >= groups)]
+        stray = scene.gaussians.motion_ids[(scene.gaussians.motion_ids < 0) | (scene.gaussians.motion_ids >= groups)]
         if len(stray):
             _fail(place, "motion_ids", f"ids of the {groups} motion groups", int(stray[0]))
     with guard():
@@ -201,7 +201,7 @@ def _check_range(
 def _check_residuals(scene: Scene, place: str, guard: findings.Guard) -> None:
     if scene.residuals is None:
         return
-    rows, count = scene.residuals.rows, len(scene.means)
+    rows, count = scene.residuals.rows, len(scene.gaussians.means)
     with guard():
         if len(rows) and (rows[0] < 0 or rows[-1] >= count or (rows[1:] <= rows[:-1]).any()):
             _fail(place, "residual_rows", f"increasing rows below {count}", "others")
@@ -229,7 +229,7 @@ def _check_units(scene: Scene, place: str, guard: findings.Guard) -> None:
 
 
 def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
-    times = scene.track_times
+    times = scene.tracks.times
     with guard():
         if len(times) == 0 or not (np.diff(times) >= _LEAST_STEP).all():
             _fail(place, "track_times", f"at least one time, increasing by {_LEAST_STEP:g} or more", times)
@@ -243,7 +243,7 @@ def _check_times(scene: Scene, place: str, guard: findings.Guard) -> None:
         if not _LEAST_LENGTH <= scene.near_plane <= cameras.FARTHEST:
             _fail(place, "near_plane", f"a positive depth up to {cameras.FARTHEST:g}", scene.near_plane)
     with guard(), np.errstate(invalid="ignore"):  # infinite means are reported separately
-        last = scene.track_poses[:, -1]
+        last = scene.tracks.poses[:, -1]
         off = np.abs(np.abs(last) - np.array([1.0, 0, 0, 0, 0, 0, 0])).max(axis=-1) > 1e-9 * max(1.0, scene.extent)
         if off.any():
             row = int(np.flatnonzero(off)[0])
@@ -266,7 +266,7 @@ def _check_objects(scene: Scene, place: str, guard: findings.Guard) -> None:
             if not all(0 <= channel <= 1 for channel in item.color):
                 _fail(place, f"object {item.name!r}", "a color of numbers from 0 to 1", item.color)
         with guard():
-            rows = scene.motion_ids[item.start : item.start + item.count]
+            rows = scene.gaussians.motion_ids[item.start : item.start + item.count]
             if any(later[2] <= earlier[2] for earlier, later in pairwise(runs(rows))):
                 _fail(place, f"motion_ids of object {item.name!r}", "increasing ids within the object", "another order")
 
@@ -277,16 +277,21 @@ def _check_ranges(scene: Scene, place: str, guard: findings.Guard) -> None:
         start, position = position, findings.UNREAD
         with guard():
             position = item.start + item.count
-            if item.start != start or item.count < 0 or position > len(scene.object_ids):
+            if item.start != start or item.count < 0 or position > len(scene.gaussians.object_ids):
                 _fail(place, f"object {item.name!r}", f"a range that starts at {start}", f"{item.start} + {item.count}")
         with guard():
-            rows = scene.object_ids[item.start : item.start + item.count]
+            rows = scene.gaussians.object_ids[item.start : item.start + item.count]
             if (rows != item.id).any():
                 found = sorted(set(rows.tolist()))[:5]
                 _fail(place, f"object {item.name!r}", f"object_ids {item.id} in its range", found)
     with guard():
-        if position != len(scene.object_ids):
-            _fail(place, "objects", f"ranges that cover {len(scene.object_ids)} Gaussians", f"{position} covered")
+        if position != len(scene.gaussians.object_ids):
+            _fail(
+                place,
+                "objects",
+                f"ranges that cover {len(scene.gaussians.object_ids)} Gaussians",
+                f"{position} covered",
+            )
 
 
 def _check_group(
@@ -303,8 +308,8 @@ def _check_group(
         if group.object_id not in object_ids:
             _fail(place, where, "an object of the table", group.object_id)
     with guard():
-        if not -1 <= group.anchor_index < len(scene.means):
-            _fail(place, where, f"an anchor_index below {len(scene.means)}, or -1", group.anchor_index)
+        if not -1 <= group.anchor_index < len(scene.gaussians.means):
+            _fail(place, where, f"an anchor_index below {len(scene.gaussians.means)}, or -1", group.anchor_index)
     with guard():
         if np.shape(group.pivot) != (3,) or not (np.abs(group.pivot) <= farthest).all():
             _fail(place, where, f"a pivot of three numbers up to {farthest:g}", group.pivot)
@@ -317,7 +322,7 @@ def _check_group(
             _fail(place, where, "'seen' as first and last time, in order", group.seen)
     if row == 0:
         with guard():
-            still = group.model.is_static and not (scene.track_poses[0] != scene.track_poses[0, -1]).any()
+            still = group.model.is_static and not (scene.tracks.poses[0] != scene.tracks.poses[0, -1]).any()
             if group.role != "pinned" or not still or group.follows is not None:
                 _fail(place, where, "role 'pinned', a static model and no motion", repr(group.role))
     if group.follows is None or group.follows is findings.UNREAD:

@@ -30,7 +30,7 @@ def _round_trip(bodies: int, scale: float, times: np.ndarray) -> float:
     scene = scene_of(clouds, [motion] * bodies, times=times)
     with tempfile.TemporaryDirectory() as folder:
         found = scene_file.read(scene_file.write(scene, Path(folder) / "s.r5dgs"))
-    return largest(found.means.astype(np.float64) - scene.means) / scene.extent
+    return largest(found.gaussians.means.astype(np.float64) - scene.gaussians.means) / scene.extent
 
 
 def _many_knots() -> float:

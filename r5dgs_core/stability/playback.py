@@ -31,10 +31,10 @@ def _distances(distance: float, mode: str = "rigid") -> float:
     for t in (*_PAST, *_FUTURES):
         quats, displacements = scene_player.group_poses(scene, t)
         for g in range(1, len(scene.groups)):
-            rows = np.flatnonzero(scene.motion_ids == g)
+            rows = np.flatnonzero(scene.gaussians.motion_ids == g)
             origin = scene.groups[g].pivot + displacements[g]
             frame = scene_player.frame(scene, t, mode, origin=origin)
-            worst = max(worst, shape_error(frame.means[rows], scene.means[rows]))
+            worst = max(worst, shape_error(frame.means[rows], scene.gaussians.means[rows]))
     return worst
 
 
@@ -45,9 +45,9 @@ def _absolute(distance: float) -> float:
     for t in _FUTURES:
         frame = scene_player.frame(scene, t)
         for g in range(1, len(scene.groups)):
-            rows = np.flatnonzero(scene.motion_ids == g)
+            rows = np.flatnonzero(scene.gaussians.motion_ids == g)
             grid = float(np.spacing(np.abs(frame.means[rows]).max()))
-            error = shape_error(frame.means[rows], scene.means[rows])
+            error = shape_error(frame.means[rows], scene.gaussians.means[rows])
             worst = max(worst, error / (math.sqrt(3) * grid / shortest))
     return worst
 
@@ -65,10 +65,10 @@ def _places(distance: float) -> float:
     scene, worst = every_motion(distance), 0.0
     for t in (1.0, HORIZON):
         for g in range(1, len(scene.groups)):
-            group, rows = scene.groups[g], np.flatnonzero(scene.motion_ids == g)
+            group, rows = scene.groups[g], np.flatnonzero(scene.gaussians.motion_ids == g)
             pose = models.evaluate(group.model, t - T_MAX)
             origin = group.pivot + pose[1]
-            expected = rotations.rotate(pose[0], scene.means[rows].astype(np.float64) - group.pivot)
+            expected = rotations.rotate(pose[0], scene.gaussians.means[rows].astype(np.float64) - group.pivot)
             frame = scene_player.frame(scene, t, origin=origin)
             worst = max(worst, largest(frame.means[rows] - expected) / RADIUS)
     return worst
@@ -85,7 +85,7 @@ def _at_t_max(mode: str) -> float:
     """Values of the frame at t_max that are not those of the bind state."""
     scene = every_motion(singles=True)
     frame = scene_player.frame(scene, scene.t_max, mode)
-    return different(frame.means, scene.means) + different(frame.quats, scene.quats)
+    return different(frame.means, scene.gaussians.means) + different(frame.quats, scene.gaussians.quats)
 
 
 def _jump(mode: str) -> float:
@@ -109,7 +109,7 @@ def _random_access(mode: str) -> float:
 def _agreement() -> float:
     """`standard` of members that share one twist against `rigid` with that twist, over the radius."""
     scene, worst = every_motion(singles=True), 0.0
-    rows = np.flatnonzero(scene.motion_ids == list(MOTIONS).index("world twist") + 1)
+    rows = np.flatnonzero(scene.gaussians.motion_ids == list(MOTIONS).index("world twist") + 1)
     for t in (1.0, 2.0, 5.0):
         rigid, single = (
             scene_player.frame(scene, t, mode).means[rows].astype(np.float64) for mode in ("rigid", "standard")
@@ -143,10 +143,10 @@ def _isolated(value: float) -> float:
     sound = {t: scene_player.frame(scene, t) for t in (0.4, 2.0)}
     for g in range(1, len(scene.groups)):
         broken = _wild(_wild(scene, g, "velocity", value), g, "angular_velocity", value)
-        poses = scene.track_poses.copy()
+        poses = scene.tracks.poses.copy()
         poses[g, :-1, 1:] = value
         broken = broken.with_arrays(track_poses=poses)
-        others = scene.motion_ids != g
+        others = scene.gaussians.motion_ids != g
         for t, expected in sound.items():
             frame = scene_player.frame(broken, t)
             count += different(frame.means[others], expected.means[others])
@@ -165,7 +165,7 @@ def _singles(value: float) -> tuple[float, float]:
     assert scene.dynamics is not None
     sound = scene_player.frame(scene, 2.0, "standard")
     for g in range(1, len(scene.groups)):
-        mine = scene.motion_ids == g
+        mine = scene.gaussians.motion_ids == g
         bad, still = (np.where(mine[:, None], np.float32(x), scene.dynamics.rates) for x in (value, 0.0))
         frame, expected = (
             scene_player.frame(scene.with_arrays(dynamics=states), 2.0, "standard") for states in (bad, still)
@@ -211,7 +211,7 @@ def _lacking(clouds: list[np.ndarray]) -> float:
     for mode in _EVERY_MODE:
         for t in (*_PAST, T_MAX, T_MAX + 1e-9, 1.0, 3.0):
             frame = scene_player.frame(scene, t, mode)
-            bad += frame.means.shape != scene.means.shape
+            bad += frame.means.shape != scene.gaussians.means.shape
             bad += int((~np.isfinite(frame.means)).sum() + (~np.isfinite(frame.quats)).sum())
     return float(bad)
 

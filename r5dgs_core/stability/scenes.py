@@ -8,7 +8,7 @@ import numpy as np
 
 from ..motion import models, rotations, se3
 from ..motion.models import MotionModel
-from ..scene.scene import Dynamics, MotionGroup, Scene, SceneObject
+from ..scene.scene import Dynamics, Gaussians, MotionGroup, Scene, SceneObject, Tracks
 from .cases import body, model_of
 
 T_MAX = 0.75
@@ -96,17 +96,18 @@ def scene_of(
     members = np.concatenate([np.zeros((0, 12)), *states]).astype(np.float32)
     return Scene(
         name="stability",
-        means=means,
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
-        log_scales=np.full((len(means), 3), -4, np.float32),
-        opacity_logits=np.full(len(means), 4, np.float32),
-        sh=np.zeros((len(means), 1, 3), np.float32),
-        object_ids=ids,
-        motion_ids=ids.copy(),
-        track_times=times,
-        track_poses=np.stack(tracks),
+        gaussians=Gaussians(
+            means=means,
+            quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(means), 1)),
+            log_scales=np.full((len(means), 3), -4, np.float32),
+            opacity_logits=np.full(len(means), 4, np.float32),
+            sh=np.zeros((len(means), 1, 3), np.float32),
+            object_ids=ids,
+            motion_ids=ids.copy(),
+        ),
         objects=tuple(table),
         groups=tuple(groups),
+        tracks=Tracks(times=times, poses=np.stack(tracks)),
         t_max=float(times[-1]),
         frames_per_unit=60.0,
         world_convention="blender",

@@ -158,7 +158,7 @@ class Server:
             self._scenes = found
         self._numbers = [stamps.index(stamp) for stamp in named]
         scenes = [list(self._scenes.values())[number] for number in self._numbers]
-        return {"scenes": [{"name": scene.name, "gaussians": len(scene.means)} for scene in scenes]}, {}
+        return {"scenes": [{"name": scene.name, "gaussians": len(scene.gaussians.means)} for scene in scenes]}, {}
 
     def _read(self, stamp: tuple[str, int, int]) -> Scene:
         """Read a scene file; the last unreadable file is not tried again until it changes, as viewports retry often."""
@@ -210,7 +210,7 @@ class Server:
             entries = asked.need(request, "instances", list)
             scenes, places = self._points.extend(scenes, edited_points.wanted(entries, self._numbers))
             instances = [edited_points.instance_of(entry, self._numbers, places) for entry in entries]
-            asked.check_rows(instances, [len(scene.means) for scene in scenes])
+            asked.check_rows(instances, [len(scene.gaussians.means) for scene in scenes])
             shown = sum(instance.count for instance in instances)
             asked.check_size(camera, shown, 0 if coverage is None else coverage[1])
         try:

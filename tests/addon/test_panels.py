@@ -113,7 +113,7 @@ def test_import_menu_export_menu_and_drag_and_drop_lead_to_the_operators(blender
 def test_cycles_shows_points_in_the_colours_of_the_file(blender, tmp_path):
     srgb = np.array([0.8, 0.35, 0.1])
     scene = scenes.make_scene(n=3000, objects=2, shading=False)
-    sh = np.tile(((srgb - 0.5) / 0.28209479177387814).astype(np.float32), (len(scene.means), 1, 1))
+    sh = np.tile(((srgb - 0.5) / 0.28209479177387814).astype(np.float32), (len(scene.gaussians.means), 1, 1))
     path = scene_file.write(scene.with_arrays(sh=sh), tmp_path / "one_colour.r5dgs")
     blender.ops.wm.read_homefile(app_template="", use_empty=True)
     blender.ops.r5dgs.load_scene(filepath=str(path))

@@ -104,6 +104,6 @@ def test_the_end_that_loading_chooses_is_never_too_far(blender, tmp_path):
     timeline = motions.addon("scene.timeline")
     whole = scenes.make_scene(n=300, objects=3, seed=1)
     for shift, shrink in ((0.0, 0.01), (0.0, 1.0), (50.0, 0.01), (-30.0, 1.0)):
-        times = shift + shrink * whole.track_times
+        times = shift + shrink * whole.tracks.times
         scene = dataclasses.replace(whole.with_arrays(track_times=times), t_max=float(times[-1]))
         timeline.check_end("scene", timeline.Times.of(scene))

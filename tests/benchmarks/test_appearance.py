@@ -44,7 +44,7 @@ def test_what_is_frozen_stays_as_at_t_max_and_all_else_goes_on(appearance):
     scene = scenes.make_scene(seed=2)
     t = scene.t_max + 0.2
     bind, free = scene_player.frame(scene, scene.t_max), scene_player.frame(scene, t)
-    shadow = np.isin(scene.motion_ids, [g.id for g in scene.groups if g.role == "shadow"])
+    shadow = np.isin(scene.gaussians.motion_ids, [g.id for g in scene.groups if g.role == "shadow"])
     for shading in (False, True):
         for shadows in (False, True):
             _, move = appearance.frozen(scene, shading, shadows)

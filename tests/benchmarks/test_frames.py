@@ -26,7 +26,7 @@ def test_the_scene_that_is_played_is_valid_and_its_bodies_move(load):
     validation.check(scene, "benchmark")
     for t in (0.2, 1.2):
         frame = scene_player.frame(scene, t)
-        moved = np.linalg.norm(frame.means - scene.means, axis=-1)
+        moved = np.linalg.norm(frame.means - scene.gaussians.means, axis=-1)
         assert (moved[:100] == 0).all() and (moved[100:] > 1e-3).all()
         assert len(np.unique(frame.motion_ids)) == 7
         output = scene_renderer.render_frame(scene, frame, camera)
@@ -39,13 +39,13 @@ def test_bodies_in_the_room_are_small_and_before_walls_that_stay(load):
     scene = frame_rate.make_scene(500, 4, 1, 2, camera, kind="room", share=0.2)
     validation.check(scene, "benchmark")
     assert [one.count for one in scene.objects] == [400, 25, 25, 25, 25]
-    walls = scene.means[:400]
+    walls = scene.gaussians.means[:400]
     assert (np.abs(walls).max(-1) == 1).all() and (walls.min(-1) >= -1).all()
     for one in scene.objects[1:]:
-        ball = scene.means[one.start : one.start + one.count]
+        ball = scene.gaussians.means[one.start : one.start + one.count]
         assert np.linalg.norm(ball - ball.mean(0), axis=-1).max() <= 2 * frame_rate.BALL
         assert ball[:, 2].max() < 0
-    moved = np.linalg.norm(scene_player.frame(scene, 0.2).means - scene.means, axis=-1)
+    moved = np.linalg.norm(scene_player.frame(scene, 0.2).means - scene.gaussians.means, axis=-1)
     assert (moved[:400] == 0).all() and (moved[400:] > 1e-3).all()
 
 

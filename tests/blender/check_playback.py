@@ -55,14 +55,14 @@ def extension_package() -> str:
 
 def times_to_check(scene) -> list[float]:
     """Knots, between knots, just beside t_max, and past it: on frames and between them."""
-    first, last = float(scene.track_times[0]), float(scene.t_max)
+    first, last = float(scene.tracks.times[0]), float(scene.t_max)
     span = max(last - first, 1e-3)
     frame = 1.0 / scene.frames_per_unit
     end = max(last + span / 3, 1.0)
     inside = first + span * np.array([0.0, 0.137, 0.31, 0.5, 0.763, 0.9])
     past = last + (end - last) * np.array([0.03, 0.21, 0.5, 0.777, 1.0])
     beside = [last - 0.37 * frame, last, min(last + 0.41 * frame, end)]
-    knots = scene.track_times[:: max(len(scene.track_times) // 3, 1)]
+    knots = scene.tracks.times[:: max(len(scene.tracks.times) // 3, 1)]
     return sorted({float(t) for t in (*inside, *knots, *beside, *past)})
 
 
@@ -188,7 +188,9 @@ def main(arguments: list[str]) -> int:
     collection = next(c for c in bpy.data.collections if c not in before and c.r5dgs.is_scene)
 
     failed = False
-    print(f"Blender {bpy.app.version_string}, {path.name}: {len(scene.means)} Gaussians, t_max {scene.t_max:g}")
+    print(
+        f"Blender {bpy.app.version_string}, {path.name}: {len(scene.gaussians.means)} Gaussians, t_max {scene.t_max:g}"
+    )
     for t in times_to_check(scene):
         error = position_error(collection, scene, modules, t)
         failed |= not error <= POSITION_TOLERANCE

@@ -109,7 +109,7 @@ def measure_keys(table: Table, path: Path, modules, package: str) -> None:
     scene = modules["scene_file"].read(path)
     sizes = []
     for group in scene.groups:
-        members = scene.means[scene.motion_ids == group.id]
+        members = scene.gaussians.means[scene.gaussians.motion_ids == group.id]
         if group.id != 0 and len(members):
             low, high = np.quantile(members, [0.02, 0.98], axis=0)
             sizes.append(float(np.linalg.norm(high - low)))

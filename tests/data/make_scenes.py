@@ -28,14 +28,14 @@ def tracks() -> Scene:
 def still() -> Scene:
     """Nothing moves: the file has no tracks."""
     scene = make_scene(n=40, objects=0, sh_degree=1, shading=False, identities=False)
-    return scene.with_arrays(track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
+    return scene.with_arrays(track_times=scene.tracks.times[-1:], track_poses=scene.tracks.poses[:, -1:])
 
 
 def field() -> Scene:
     """Residuals, motion of each Gaussian on its own, and a body whose model swings."""
     scene = make_scene(n=60, objects=2, shading=False, identities=False, world_convention="colmap")
     rng = np.random.default_rng(1)
-    rows = np.flatnonzero(scene.object_ids == 1)[:5].astype(np.int32)
+    rows = np.flatnonzero(scene.gaussians.object_ids == 1)[:5].astype(np.int32)
     ramp = (T_MAX - TIMES)[:, None]
     turns = rotations.rotvecs_to_quats(0.2 * ramp * rng.normal(size=(len(rows), 1, 3)))
     swinging = models.MotionModel("translation", velocity=[0.1, 0, 0], acceleration=[0.2, 0, 0], frequency=3.0)
@@ -46,8 +46,8 @@ def field() -> Scene:
             residual_offsets=(0.05 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
             residual_quats=turns.astype(np.float32),
             residual_log_scales=(0.1 * ramp * rng.normal(size=(len(rows), 1, 3))).astype(np.float32),
-            dynamics=(0.1 * rng.normal(size=(len(scene.means), 12))).astype(np.float32),
-            canonical_means=(scene.means + np.float32(0.1)).astype(np.float32),
+            dynamics=(0.1 * rng.normal(size=(len(scene.gaussians.means), 12))).astype(np.float32),
+            canonical_means=(scene.gaussians.means + np.float32(0.1)).astype(np.float32),
         ),
         groups=(*groups, *scene.groups[3:]),
         near_plane=0.04,
@@ -67,7 +67,7 @@ def words() -> Scene:
         scene.with_arrays(
             classifier_weight=rng.normal(size=(rows - 1, 16)).astype(np.float32),
             classifier_bias=rng.normal(size=rows - 1).astype(np.float32),
-            shading_rest=rng.uniform(0.8, 1.2, len(scene.means)).astype(np.float32),
+            shading_rest=rng.uniform(0.8, 1.2, len(scene.gaussians.means)).astype(np.float32),
             embeddings=unit[:rows, 0].astype(np.float32),
             vocabulary_embeddings=unit[rows : rows + 2, 0].astype(np.float32),
             canonical_embeddings=unit[rows + 2 :, 0].astype(np.float32),

@@ -69,7 +69,7 @@ def rich_scene(seed: int = 0, **changes: Any) -> Scene:
     """A small scene with every member that a file can have."""
     rng = np.random.default_rng(seed)
     plain = scenes.make_scene(n=COUNT, objects=2, seed=seed, sh_degree=1)
-    rows, knots, count = 4, len(plain.track_times), len(plain.objects)
+    rows, knots, count = 4, len(plain.tracks.times), len(plain.objects)
     offsets = rng.normal(scale=0.05, size=(rows, knots, 3)).astype(np.float32)
     growths = rng.normal(scale=0.05, size=(rows, knots, 3)).astype(np.float32)
     offsets[:, -1], growths[:, -1] = 0, 0
@@ -94,7 +94,7 @@ def rich_scene(seed: int = 0, **changes: Any) -> Scene:
             residual_quats=turns,
             residual_log_scales=growths,
             dynamics=rng.normal(scale=0.1, size=(COUNT, 12)).astype(np.float32),
-            canonical_means=plain.means + np.float32(0.1),
+            canonical_means=plain.gaussians.means + np.float32(0.1),
             shading_rest=np.ones(COUNT, np.float32),
             classifier_weight=rng.normal(size=(count - 1, 16)).astype(np.float32),
             classifier_bias=np.zeros(count - 1, np.float32),
@@ -139,7 +139,7 @@ def scene_reader() -> Reader:
 def use_scene(scene: Scene, path: Path) -> None:
     """Play, draw, search and write a scene; whatever that raises is a defect of the check that accepted it."""
     with as_defects():
-        first, last = float(scene.track_times[0]), scene.t_max
+        first, last = float(scene.tracks.times[0]), scene.t_max
         later = last + max(0.3 * (last - first), 1 / scene.frames_per_unit)
         frames = []
         for mode in ("rigid", *scene_player.modes(scene)[-1:]):
@@ -149,7 +149,7 @@ def use_scene(scene: Scene, path: Path) -> None:
             for name in ("means", "quats", "log_scales", "group_quats", "group_displacements"):
                 assert np.isfinite(getattr(frame, name)).all(), f"{name} at {frame.t} is not finite"
         for frame, camera in zip((frames[1], frames[-1]), (*scene.cameras[:2], None, None), strict=False):
-            if camera is not None and len(scene.means):
+            if camera is not None and len(scene.gaussians.means):
                 small = cameras.crop(camera, (camera.width - SIDE) // 2, (camera.height - SIDE) // 2, SIDE, SIDE)
                 output = scene_renderer.render_frame(scene, frame, small, backend="reference")
                 assert torch.isfinite(output.color).all() and torch.isfinite(output.alpha).all(), (
@@ -161,7 +161,7 @@ def use_scene(scene: Scene, path: Path) -> None:
         object_search.search(scene, "mug")
         json.dumps(scene_info.info(scene), allow_nan=False).encode()
         again = scene_file.read(scene_file.write(scene, path))
-        assert len(again.means) == len(scene.means) and again.objects == scene.objects
+        assert len(again.gaussians.means) == len(scene.gaussians.means) and again.objects == scene.objects
 
 
 @contextlib.contextmanager

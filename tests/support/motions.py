@@ -75,7 +75,7 @@ def offsets(bpy, collection, scene, t):
 
 def assert_plays_like_the_core(bpy, collection, scene, times, gone=()):
     """Every Gaussian of a loaded scene lies where playback has it; those of groups that are gone are nowhere."""
-    missing = np.isin(scene.motion_ids, gone)
+    missing = np.isin(scene.gaussians.motion_ids, gone)
     for t in times:
         found = offsets(bpy, collection, scene, t)
         assert (found <= POSITION_TOLERANCE)[~missing].all() and np.isnan(found[missing]).all(), f"t = {t}"

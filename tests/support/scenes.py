@@ -6,7 +6,7 @@ import numpy as np
 
 from r5dgs_core.motion import models, rotations
 from r5dgs_core.scene import cameras
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject, Shading
+from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Shading, Tracks
 
 T_MAX = 0.75
 TIMES = np.array([0.0, 0.05, 0.1, 0.17, 0.22, 0.3, 0.35, 0.4, 0.5, 0.55, 0.62, 0.68, T_MAX])
@@ -115,25 +115,26 @@ def make_scene(
     light = np.array([0.3, -0.2, 1.0])
     return Scene(
         name="synthetic",
-        means=means,
-        quats=rotations.normalize(rng.normal(size=(n, 4))).astype(np.float32),
-        log_scales=np.log(rng.uniform(0.01, 0.06, (n, 3))).astype(np.float32),
-        opacity_logits=rng.normal(2.0, 1.0, n).astype(np.float32),
-        sh=rng.normal(
-            scale=0.6 / (1 + np.arange((sh_degree + 1) ** 2))[None, :, None], size=(n, (sh_degree + 1) ** 2, 3)
-        ).astype(np.float32),
-        object_ids=object_ids,
-        motion_ids=motion_ids,
-        track_times=TIMES.copy(),
-        track_poses=np.stack(poses),
+        gaussians=Gaussians(
+            means=means,
+            quats=rotations.normalize(rng.normal(size=(n, 4))).astype(np.float32),
+            log_scales=np.log(rng.uniform(0.01, 0.06, (n, 3))).astype(np.float32),
+            opacity_logits=rng.normal(2.0, 1.0, n).astype(np.float32),
+            sh=rng.normal(
+                scale=0.6 / (1 + np.arange((sh_degree + 1) ** 2))[None, :, None], size=(n, (sh_degree + 1) ** 2, 3)
+            ).astype(np.float32),
+            object_ids=object_ids,
+            motion_ids=motion_ids,
+            identities=rng.normal(size=(n, 16)).astype(np.float16) if identities else None,
+        ),
         objects=tuple(table),
         groups=tuple(groups),
+        tracks=Tracks(times=TIMES.copy(), poses=np.stack(poses)),
         t_max=T_MAX,
         frames_per_unit=60.0,
         world_convention=world_convention,
         cameras=(orbit_camera(0.3), orbit_camera(1.4)),
         background_sh=np.array([[0.9, 1.0, 1.2]], np.float32),
-        identities=rng.normal(size=(n, 16)).astype(np.float16) if identities else None,
         shading=Shading((0.2 * rng.normal(size=(n, 3))).astype(np.float32), light / np.linalg.norm(light))
         if shading
         else None,

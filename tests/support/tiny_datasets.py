@@ -19,7 +19,7 @@ from r5dgs_core.motion.models import MotionModel
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
 from r5dgs_core.scene import cameras
-from r5dgs_core.scene.scene import MotionGroup, Scene, SceneObject
+from r5dgs_core.scene.scene import Gaussians, MotionGroup, Scene, SceneObject, Tracks
 from r5dgs_core.train import checkpoint
 from tests.support import scenes
 
@@ -184,17 +184,18 @@ def make_truth(*, floor: bool = True) -> Scene:
         table.append(SceneObject(k, name, tuple(aliases), "", (0.5, 0.5, 0.5), start, len(rows)))
     return Scene(
         name="tiny",
-        means=means,
-        quats=quats,
-        log_scales=log_scales,
-        opacity_logits=np.full(len(means), 4.0, np.float32),
-        sh=((colors - 0.5) / 0.28209479)[:, None].astype(np.float32),
-        object_ids=object_ids,
-        motion_ids=object_ids.copy(),
-        track_times=OBSERVED.copy(),
-        track_poses=np.stack(poses),
+        gaussians=Gaussians(
+            means=means,
+            quats=quats,
+            log_scales=log_scales,
+            opacity_logits=np.full(len(means), 4.0, np.float32),
+            sh=((colors - 0.5) / 0.28209479)[:, None].astype(np.float32),
+            object_ids=object_ids,
+            motion_ids=object_ids.copy(),
+        ),
         objects=tuple(table),
         groups=tuple(groups),
+        tracks=Tracks(times=OBSERVED.copy(), poses=np.stack(poses)),
         t_max=T_MAX,
         frames_per_unit=40.0,
         world_convention="blender",
@@ -205,9 +206,9 @@ def make_truth(*, floor: bool = True) -> Scene:
 
 def breathing(scene: Scene, share: float) -> Scene:
     """The scene with a ball that swells and shrinks by a share of its radius, at rest at `T_MAX`."""
-    rows = np.flatnonzero(scene.object_ids == BALL)
+    rows = np.flatnonzero(scene.gaussians.object_ids == BALL)
     growth = 1 + share * np.sin(2 * np.pi * (T_MAX - OBSERVED) / 0.6)  # [S]
-    arms = scene.means[rows].astype(np.float64) - CENTERS[BALL]
+    arms = scene.gaussians.means[rows].astype(np.float64) - CENTERS[BALL]
     return scene.with_arrays(
         residual_rows=rows.astype(np.int32),
         residual_offsets=(arms[:, None] * (growth - 1)[:, None]).astype(np.float32),
@@ -218,7 +219,7 @@ def breathing(scene: Scene, share: float) -> Scene:
 
 def without(scene: Scene, object_id: int) -> Scene:
     """The scene with one object made invisible."""
-    hidden = np.where(scene.object_ids == object_id, -30.0, scene.opacity_logits).astype(np.float32)
+    hidden = np.where(scene.gaussians.object_ids == object_id, -30.0, scene.gaussians.opacity_logits).astype(np.float32)
     return scene.with_arrays(opacity_logits=hidden)
 
 

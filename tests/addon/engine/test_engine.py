@@ -162,7 +162,7 @@ def test_cryptomatte_shares_pixels_among_objects_by_name(blender, loaded, scene,
     ranks = [(f"CryptoObject0{k}.{name}", f"CryptoObject0{k}.{part}") for k in (0, 1) for name, part in ("rg", "ba")]
     mug = sum(np.where(passes.found[i] == cryptomatte.value_of("mug"), passes.found[c], 0) for i, c in ranks)
     pose = scene_player.frame(scene, 0.3)
-    one_hot = ((scene.object_ids == 1) & (scene.motion_ids == 1)).astype(np.float32)[:, None]
+    one_hot = ((scene.gaussians.object_ids == 1) & (scene.gaussians.motion_ids == 1)).astype(np.float32)[:, None]
     expected = scene_renderer.render_frame(scene, pose, scene.cameras[0], features=one_hot).features.numpy()[..., 0]
     assert_almost_all_close(mug, expected, 1e-3)
     alpha = core(scene, 0.3).alpha.numpy()

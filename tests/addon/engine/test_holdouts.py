@@ -29,7 +29,7 @@ def cloud(collection, name):
 def shares(scene, rows):
     """Share of each pixel that some Gaussians cover, and the depth of the others at t_max. [H, W] each"""
     pose, camera = scene_player.frame(scene, scene.t_max), scene.cameras[0]
-    held = np.zeros(len(scene.means), np.float32)
+    held = np.zeros(len(scene.gaussians.means), np.float32)
     held[rows] = 1
     z = pose.means @ camera.T_cam_world[2, :3] + camera.T_cam_world[2, 3]
     features = np.stack([held, (1 - held) * z], axis=-1)

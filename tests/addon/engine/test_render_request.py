@@ -65,7 +65,7 @@ def affine(linear, translation=(0, 0, 0)):
 
 def everything(scene, matrix, number=0):
     """All of a scene, its world and its bind state moved by a matrix: at t_max they are at the same place."""
-    return scene_renderer.Instance(0, len(scene.means), matrix, number, matrix)
+    return scene_renderer.Instance(0, len(scene.gaussians.means), matrix, number, matrix)
 
 
 def core_color(several, instances, camera, sky=None):
@@ -222,7 +222,7 @@ def test_points_that_were_deleted_are_not_drawn(blender, picture, kitchen):
     keep[3:9] = keep[-5:] = False
     mug.data = without(blender, mug.data, np.arange(start, start + count)[keep])
     seen, arrays = drawn(blender, picture, sky=False)
-    rows = np.setdiff1d(np.arange(len(scene.means)), np.arange(start, start + count)[~keep])
+    rows = np.setdiff1d(np.arange(len(scene.gaussians.means)), np.arange(start, start + count)[~keep])
     cuts = np.flatnonzero(np.diff(rows) != 1) + 1
     parts = [scene_renderer.Instance(int(part[0]), len(part), affine(W), 0, affine(W)) for part in np.split(rows, cuts)]
     assert psnr(arrays["color"], core_color(scene, parts, seen.camera)) > 45
@@ -310,7 +310,7 @@ def test_an_orthographic_picture_has_depths_from_its_camera_and_nothing_behind_i
 
 
 def scene_points(scene):
-    return scene.means.astype(np.float64) @ W.T
+    return scene.gaussians.means.astype(np.float64) @ W.T
 
 
 def test_a_view_of_a_region_is_the_cameras_where_it_looks_through_it(blender, picture, kitchen):

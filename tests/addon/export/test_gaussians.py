@@ -180,7 +180,7 @@ def test_an_unedited_scene_is_that_of_playback(blender, scene, loaded, tmp_path)
 
 
 def test_what_bends_is_exported_bent_in_exact_mode(blender, scene, tmp_path):
-    rows, knots = np.array([120, 260], np.int32), len(scene.track_times)
+    rows, knots = np.array([120, 260], np.int32), len(scene.tracks.times)
     offsets = np.full((2, knots, 3), 0.5, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
     bent = scene.with_arrays(
         residual_rows=rows,
@@ -244,7 +244,7 @@ def test_instances_of_a_collection_come_with_their_own_place(blender, scene, loa
     blender.context.view_layer.update()
     found = export(blender, tmp_path / "a.ply")
     count = scene.object(1).count
-    assert len(found.means) == len(scene.means) + count
+    assert len(found.means) == len(scene.gaussians.means) + count
     mugs = np.sort(found.means[found.object_ids == 1][:, 2])
     np.testing.assert_allclose(mugs[count:], mugs[:count] + 5, atol=1e-4)
 
@@ -268,7 +268,7 @@ def test_axes_turn_the_whole_and_plain_files_have_no_ids(blender, scene, loaded,
     assert found.object_ids is None and found.identities is None
     turned = {"BLENDER": WORLD, "FILE": np.eye(3), "COLMAP": np.eye(3)}
     turned["OPENGL"] = cameras.WORLD_TO_BLENDER["opengl"].T @ WORLD
-    wanted = scene.means @ turned[axes].T
+    wanted = scene.gaussians.means @ turned[axes].T
     np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(wanted, axis=0), atol=1e-5)
 
 

@@ -97,7 +97,7 @@ def test_what_was_moved_in_its_anchor_or_by_a_parent_is_there_again(blender, sce
     blender.context.view_layer.update()
     saved = save(blender, tmp_path / "b.r5dgs")
     assert [group.model.kind for group in saved.groups] == [group.model.kind for group in scene.groups]
-    np.testing.assert_array_equal(saved.track_poses[1], scene.track_poses[1])
+    np.testing.assert_array_equal(saved.tracks.poses[1], scene.tracks.poses[1])
     assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
@@ -107,10 +107,10 @@ def test_edited_curves_are_there_again(blender, scene, loaded, tmp_path):
         anchor.location = place
         anchor.keyframe_insert("location", frame=frame)
     saved = save(blender, tmp_path / "b.r5dgs")
-    changed = [g for g in range(len(scene.groups)) if (saved.track_poses[g] != scene.track_poses[g]).any()]
+    changed = [g for g in range(len(scene.groups)) if (saved.tracks.poses[g] != scene.tracks.poses[g]).any()]
     assert changed == [2]
     again = motions.load(blender, tmp_path / "b.r5dgs")
-    for k, t in enumerate(scene.track_times):
+    for k, t in enumerate(scene.tracks.times):
         frame = 1 + 60 * t
         blender.context.scene.frame_set(int(frame), subframe=float(frame % 1))
         old, new = (cloud(c, name).matrix_world for c, name in ((loaded, "red apple"), (again, "red apple.001")))
@@ -137,7 +137,7 @@ def test_edited_physics_are_the_model_of_the_new_file(blender, scene, loaded, tm
     saved = save(blender, tmp_path / "b.r5dgs")
     model = saved.groups[2].model
     assert model.kind == "translation" and model.velocity == pytest.approx((0.2, 0.4, 1.0))
-    np.testing.assert_array_equal(saved.track_poses, scene.track_poses)
+    np.testing.assert_array_equal(saved.tracks.poses, scene.tracks.poses)
     assert_same_motion(blender, loaded, motions.load(blender, tmp_path / "b.r5dgs"), 3e-5 * scene.extent)
 
 
@@ -151,8 +151,8 @@ def test_names_colours_and_deletions_are_kept(blender, scene, loaded, tmp_path):
     saved = save(blender, tmp_path / "b.r5dgs")
     assert [item.id for item in saved.objects] == [-1, 0, 2, 3]
     assert saved.object(2).name == "tomato" and "vegetable" in saved.object(2).aliases
-    colour = 0.5 + 0.28209479177387814 * scene.sh[scene.object_ids == 3, 0]
-    found = 0.5 + 0.28209479177387814 * saved.sh[saved.object_ids == 3, 0]
+    colour = 0.5 + 0.28209479177387814 * scene.gaussians.sh[scene.gaussians.object_ids == 3, 0]
+    found = 0.5 + 0.28209479177387814 * saved.gaussians.sh[saved.gaussians.object_ids == 3, 0]
     np.testing.assert_allclose(found, colour * (0.5, 1, 1), atol=2e-3)  # harmonics are stored in half precision
 
 
@@ -168,13 +168,13 @@ def test_a_duplicate_becomes_an_object_of_its_own(blender, scene, loaded, tmp_pa
     assert copy.count == scene.object(1).count and copy.name not in {item.name for item in scene.objects}
     for t in TIMES:
         means = scene_player.frame(saved, t).means
-        shift = means[saved.object_ids == copy.id] - means[saved.object_ids == 1]
+        shift = means[saved.gaussians.object_ids == copy.id] - means[saved.gaussians.object_ids == 1]
         np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=5e-5)
 
 
 def test_hidden_objects_stay_in_the_file(blender, scene, loaded, tmp_path):
     cloud(loaded, "mug").hide_set(True)
-    assert len(save(blender, tmp_path / "b.r5dgs").means) == len(scene.means)
+    assert len(save(blender, tmp_path / "b.r5dgs").gaussians.means) == len(scene.gaussians.means)
 
 
 def test_the_file_that_a_scene_plays_from_is_not_replaced(blender, loaded, tmp_path):
@@ -211,7 +211,7 @@ def test_a_root_that_was_moved_is_said(blender, loaded, tmp_path, capsys):
 
 
 def test_residuals_survive(blender, scene, tmp_path):
-    rows, knots = np.array([120, 260], np.int32), len(scene.track_times)
+    rows, knots = np.array([120, 260], np.int32), len(scene.tracks.times)
     offsets = np.full((2, knots, 3), 0.05, np.float32) * np.linspace(1, 0, knots)[None, :, None].astype(np.float32)
     bent = scene.with_arrays(
         residual_rows=rows,
@@ -239,7 +239,7 @@ def test_a_motion_taken_from_another_object_is_there_again(blender, scene, loade
 
 @pytest.mark.parametrize("observed", [1, 4], ids=["still scene", "scene that begins late"])
 def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, scene, tmp_path, capfd, observed):
-    late = scene.with_arrays(track_times=scene.track_times[-observed:], track_poses=scene.track_poses[:, -observed:])
+    late = scene.with_arrays(track_times=scene.tracks.times[-observed:], track_poses=scene.tracks.poses[:, -observed:])
     if observed == 1:
         still = [dataclasses.replace(group, model=models.STATIC) for group in late.groups]
         late = dataclasses.replace(late, groups=tuple(still))
@@ -259,7 +259,7 @@ def test_what_moves_before_the_first_observed_time_is_said_to_be_lost(blender, s
     anchor.keyframe_insert("location", frame=first)
     save(blender, tmp_path / "b.r5dgs")
     said = capfd.readouterr().out
-    assert f"mug: what moves before frame {1 + 60 * late.track_times[0]:.4g}, the first observed time" in said
+    assert f"mug: what moves before frame {1 + 60 * late.tracks.times[0]:.4g}, the first observed time" in said
     assert "red apple" not in said
 
 

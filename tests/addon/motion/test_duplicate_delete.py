@@ -161,12 +161,12 @@ def test_deleting_takes_what_belongs_to_the_object_and_nothing_else(blender, sce
 def test_what_a_prompt_selects_is_one_object_though_some_of_it_moves_with_others(blender, tmp_path, name):
     """Clouds that move with another object are selected, and do not stand for that one."""
     scene = scenes.make_scene(n=400, objects=5, seed=1)
-    motion_ids = scene.motion_ids.copy()
-    motion_ids[np.flatnonzero((scene.object_ids == 0) & (motion_ids == 0))[-5:]] = (
+    motion_ids = scene.gaussians.motion_ids.copy()
+    motion_ids[np.flatnonzero((scene.gaussians.object_ids == 0) & (motion_ids == 0))[-5:]] = (
         2  # background that moves with the apple
     )
-    motion_ids[np.flatnonzero(scene.object_ids == 1)[-5:]] = 3  # of the mug, moving with the car
-    order = np.lexsort((motion_ids, scene.object_ids))
+    motion_ids[np.flatnonzero(scene.gaussians.object_ids == 1)[-5:]] = 3  # of the mug, moving with the car
+    order = np.lexsort((motion_ids, scene.gaussians.object_ids))
     fields = ("means", "quats", "log_scales", "opacity_logits", "sh", "identities", "shading", "object_ids")
     arrays = {field: scene.arrays()[field][order] for field in fields}
     scene = scene.with_arrays(**arrays, motion_ids=motion_ids[order])

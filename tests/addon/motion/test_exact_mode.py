@@ -133,7 +133,7 @@ def test_a_scene_whose_objects_are_rigid_says_that_there_is_nothing_to_play(blen
 
 def test_deleted_points_leave_the_others_where_they_belong(blender, scene, loaded):
     cloud = next(o for o in loaded.all_objects if o.r5dgs.object_id == tiny_datasets.BALL and o.type == "POINTCLOUD")
-    rows = np.flatnonzero(scene.object_ids == tiny_datasets.BALL)
+    rows = np.flatnonzero(scene.gaussians.object_ids == tiny_datasets.BALL)
     keep = rows[::2]
     compat = motions.addon("compat")
     (fewer,) = compat.new_point_clouds([len(keep)])

@@ -451,7 +451,9 @@ def test_far_from_the_origin_extrapolation_still_holds(blender, tmp_path):
     scene = scenes.make_scene(n=300, objects=3)
     shift = np.array([40.0, -25.0, 3.0])
     groups = tuple(dataclasses.replace(g, pivot=g.pivot + shift) for g in scene.groups)
-    far = dataclasses.replace(scene.with_arrays(means=(scene.means + shift).astype(np.float32)), groups=groups)
+    far = dataclasses.replace(
+        scene.with_arrays(means=(scene.gaussians.means + shift).astype(np.float32)), groups=groups
+    )
     path = scene_file.write(far, tmp_path / "far.r5dgs")
     collection = motions.load(blender, path)
     blender.ops.r5dgs.extrapolate_until(t_end=1.3)

@@ -166,7 +166,7 @@ def rendered(blender, scene, loaded):
     data = blender.data.cameras.new("view")
     eye = blender.data.objects.new("view", data)
     blender.context.scene.collection.objects.link(eye)
-    center = np.array(loaded.r5dgs.root.matrix_world)[:3, :3] @ scene.means.mean(0)
+    center = np.array(loaded.r5dgs.root.matrix_world)[:3, :3] @ scene.gaussians.means.mean(0)
     eye.location = center + np.array([0.0, -1.6, 0.6]) * scene.extent
     eye.rotation_euler = Euler((np.pi / 2 - 0.35, 0, 0))
     blender.context.scene.camera = eye

@@ -67,7 +67,9 @@ def test_far_from_the_origin_playback_still_holds(blender, tmp_path):
     scene = scenes.make_scene(n=300, objects=3)
     shift = np.array([40.0, -25.0, 3.0])
     groups = tuple(dataclasses.replace(g, pivot=g.pivot + shift) for g in scene.groups)
-    far = dataclasses.replace(scene.with_arrays(means=(scene.means + shift).astype(np.float32)), groups=groups)
+    far = dataclasses.replace(
+        scene.with_arrays(means=(scene.gaussians.means + shift).astype(np.float32)), groups=groups
+    )
     path = scene_file.write(far, tmp_path / "far.r5dgs")
     motions.assert_plays_like_the_core(blender, motions.load(blender, path), scene_file.read(path), TIMES)
 
@@ -75,7 +77,7 @@ def test_far_from_the_origin_playback_still_holds(blender, tmp_path):
 def test_noisy_tracks_get_one_key_per_knot_and_play_exactly(blender, tmp_path):
     scene = scenes.make_scene(n=200, objects=2)
     rng = np.random.default_rng(5)
-    poses = scene.track_poses.copy()
+    poses = scene.tracks.poses.copy()
     poses[1:, :-1] += rng.normal(scale=2e-3, size=poses[1:, :-1].shape)
     poses[..., :4] /= np.linalg.norm(poses[..., :4], axis=-1, keepdims=True)
     path = scene_file.write(scene.with_arrays(track_poses=poses), tmp_path / "noisy.r5dgs")
@@ -83,7 +85,7 @@ def test_noisy_tracks_get_one_key_per_knot_and_play_exactly(blender, tmp_path):
     collection = motions.load(blender, path)
     motions.assert_plays_like_the_core(blender, collection, scene, TIMES)
     frames = [round(p.co[0], 3) for p in curves_of(anchor_of(collection, "mug"))[("location", 0)].keyframe_points]
-    assert set(np.round(1 + 60 * scene.track_times, 3).astype(np.float32)) <= set(np.float32(frames))
+    assert set(np.round(1 + 60 * scene.tracks.times, 3).astype(np.float32)) <= set(np.float32(frames))
 
 
 def test_the_collection_tree_is_the_table(blender, scene_path):
@@ -96,7 +98,7 @@ def test_the_collection_tree_is_the_table(blender, scene_path):
         cloud = next(obj for obj in inside if obj.name == item.name)
         assert cloud.type == "POINTCLOUD" and cloud.parent in inside
         assert cloud.parent.type == "EMPTY" and cloud.parent.parent == collection.r5dgs.root
-    assert sum(len(obj.data.points) for obj in motions.clouds(collection)) == len(scene.means)
+    assert sum(len(obj.data.points) for obj in motions.clouds(collection)) == len(scene.gaussians.means)
     assert [entry.name for entry in collection.r5dgs.table] == [item.name for item in scene.objects]
 
 
@@ -104,17 +106,19 @@ def test_points_carry_the_files_gaussians_under_the_native_names(blender, scene_
     scene = scene_file.read(scene_path)
     for obj in motions.clouds(motions.load(blender, scene_path)):
         rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
-        np.testing.assert_array_equal(attribute(obj, "position", "vector", 3), scene.means[rows])
-        np.testing.assert_allclose(attribute(obj, "scale", "vector", 3), np.exp(scene.log_scales[rows]), rtol=1e-6)
-        np.testing.assert_array_equal(attribute(obj, "rotation", "value", 4), scene.quats[rows])
+        np.testing.assert_array_equal(attribute(obj, "position", "vector", 3), scene.gaussians.means[rows])
+        np.testing.assert_allclose(
+            attribute(obj, "scale", "vector", 3), np.exp(scene.gaussians.log_scales[rows]), rtol=1e-6
+        )
+        np.testing.assert_array_equal(attribute(obj, "rotation", "value", 4), scene.gaussians.quats[rows])
         base = attribute(obj, "radiance:base", "color", 4)
-        np.testing.assert_array_equal(base[:, :3], scene.sh[rows, 0])
-        np.testing.assert_allclose(base[:, 3], 1 / (1 + np.exp(-scene.opacity_logits[rows])), rtol=1e-5)
-        np.testing.assert_array_equal(attribute(obj, "radiance:sh_2", "vector", 3), scene.sh[rows, 3])
+        np.testing.assert_array_equal(base[:, :3], scene.gaussians.sh[rows, 0])
+        np.testing.assert_allclose(base[:, 3], 1 / (1 + np.exp(-scene.gaussians.opacity_logits[rows])), rtol=1e-5)
+        np.testing.assert_array_equal(attribute(obj, "radiance:sh_2", "vector", 3), scene.gaussians.sh[rows, 3])
         assert "radiance:sh_3" not in obj.data.attributes and "color" not in obj.data.attributes
         ids = np.empty(obj.r5dgs.count, np.int32)
         obj.data.attributes["object_id"].data.foreach_get("value", ids)
-        np.testing.assert_array_equal(ids, scene.object_ids[rows])
+        np.testing.assert_array_equal(ids, scene.gaussians.object_ids[rows])
         obj.data.attributes["gaussian"].data.foreach_get("value", ids)
         np.testing.assert_array_equal(ids, np.arange(rows.start, rows.stop))
 
@@ -138,7 +142,7 @@ def test_only_the_wanted_harmonics_are_stored(blender, tmp_path, degree, kept):
         for k in range(kept):
             rows = slice(obj.r5dgs.start, obj.r5dgs.start + obj.r5dgs.count)
             found = attribute(obj, f"radiance:sh_{k}", "vector", 3)
-            np.testing.assert_array_equal(found, stored.sh[rows, k + 1])
+            np.testing.assert_array_equal(found, stored.gaussians.sh[rows, k + 1])
 
 
 def curves_of(anchor):
@@ -171,9 +175,9 @@ def test_only_what_moves_has_curves(blender, scene_path):
 def test_what_only_slides_has_two_keys(blender, tmp_path):
     truth = drawn_scenes().make_truth()
     slide = models.MotionModel("translation", velocity=[0.9, 0.35, 0.0], radius=0.5)
-    poses = truth.track_poses.copy()
+    poses = truth.tracks.poses.copy()
     poses[:, :, :] = [1.0, 0, 0, 0, 0, 0, 0]
-    poses[1, :, 4:] = slide.velocity * (truth.track_times - truth.t_max)[:, None]
+    poses[1, :, 4:] = slide.velocity * (truth.tracks.times - truth.t_max)[:, None]
     still = dataclasses.replace(truth.groups[2], model=models.STATIC)
     groups = (truth.groups[0], dataclasses.replace(truth.groups[1], model=slide), still)
     sliding = dataclasses.replace(truth.with_arrays(track_poses=poses), groups=groups)
@@ -198,7 +202,7 @@ def test_a_larger_tolerance_gives_fewer_keys_and_keeps_its_promise(blender, scen
         )
         for t in TIMES:
             motions.go_to(blender, collection, t)
-            points = motions.all_points(blender, collection, len(scene.means))
+            points = motions.all_points(blender, collection, len(scene.gaussians.means))
             distance = np.linalg.norm(points - scene_player.frame(scene, t).means, axis=-1)
             assert distance.max() <= (tolerance + 2e-6) * scene.extent
     assert counts[1e-3] < 0.7 * counts[3e-6]
@@ -349,7 +353,7 @@ def test_registering_twice_in_a_row_is_clean(blender, extension):
 
 def test_an_anchor_stays_with_its_own_object_whoever_moves_with_it(blender, tmp_path):
     scene = scenes.make_scene(n=400, objects=3)
-    motion_ids, object_ids = scene.motion_ids.copy(), scene.object_ids.copy()
+    motion_ids, object_ids = scene.gaussians.motion_ids.copy(), scene.gaussians.object_ids.copy()
     floor = np.flatnonzero((object_ids == 0) & (motion_ids == 0))
     motion_ids[floor[-5:]] = 2  # labelled background, moving with the apple
     motion_ids[np.flatnonzero(object_ids == 3)[-4:]] = 0  # of the car, standing still

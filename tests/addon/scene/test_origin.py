@@ -44,7 +44,7 @@ def test_a_far_scene_is_shown_near_blenders_origin(blender, loaded, scene_path, 
     assert loaded_scenes.origin(loaded).tolist() == ORIGIN.tolist()
     clouds = sorted(loaded_scenes.members(loaded, "CLOUD"), key=lambda obj: obj.r5dgs.start)
     points = np.concatenate([points_of(obj) for obj in clouds])
-    np.testing.assert_array_equal(points, scene.means)
+    np.testing.assert_array_equal(points, scene.gaussians.means)
 
 
 def points_of(obj):
@@ -106,7 +106,7 @@ def test_an_exported_ply_is_relative_to_the_origin_and_says_so(blender, loaded, 
     scene, path = scene_file.read(scene_path), tmp_path / "out.ply"
     go_to(blender, scene.t_max)
     assert blender.ops.r5dgs.export_ply(filepath=str(path), axes="FILE") == {"FINISHED"}
-    np.testing.assert_allclose(np.sort(ply.read(path).means, 0), np.sort(scene.means, 0), atol=1e-5)
+    np.testing.assert_allclose(np.sort(ply.read(path).means, 0), np.sort(scene.gaussians.means, 0), atol=1e-5)
     assert b"\ncomment origin 5000000.125 -125000000.0 3.0\n" in path.read_bytes()
     assert f"relative to {TEXT}" in "".join(capfd.readouterr())
     assert blender.ops.r5dgs.export_ply(filepath=str(path), axes="COLMAP") == {"FINISHED"}
@@ -119,18 +119,24 @@ def test_an_edited_scene_keeps_the_origin(blender, loaded, scene_path, tmp_path)
     assert blender.ops.r5dgs.export_scene(filepath=str(tmp_path / "edited.r5dgs")) == {"FINISHED"}
     edited, scene = scene_file.read(tmp_path / "edited.r5dgs"), scene_file.read(scene_path)
     assert edited.origin.tolist() == ORIGIN.tolist()
-    assert np.abs(edited.means[edited.object_ids == 1] - scene.means[scene.object_ids == 1]).max() > 0.4
+    assert (
+        np.abs(
+            edited.gaussians.means[edited.gaussians.object_ids == 1]
+            - scene.gaussians.means[scene.gaussians.object_ids == 1]
+        ).max()
+        > 0.4
+    )
     np.testing.assert_array_equal(edited.cameras[0].T_cam_world, scene.cameras[0].T_cam_world)
 
 
 def shrunk(scene, factor):
     """A still scene in another unit."""
-    still = scene.with_arrays(track_times=scene.track_times[-1:], track_poses=scene.track_poses[:, -1:])
+    still = scene.with_arrays(track_times=scene.tracks.times[-1:], track_poses=scene.tracks.poses[:, -1:])
     small = [dataclasses.replace(g, pivot=factor * g.pivot, model=models.STATIC, follows=None) for g in still.groups]
     return dataclasses.replace(
         still.with_arrays(
-            means=(factor * still.means).astype(np.float32),
-            log_scales=(still.log_scales + np.log(factor)).astype(np.float32),
+            means=(factor * still.gaussians.means).astype(np.float32),
+            log_scales=(still.gaussians.log_scales + np.log(factor)).astype(np.float32),
         ),
         groups=tuple(small),
     )

@@ -74,7 +74,7 @@ def test_unfinished_runs_with_other_options_bake_to_what_they_show(tiny, tmp_pat
         base[1:] = rotations.multiply(rotations.rotvecs_to_quats(angles), base[1:])
         checkpoint.save(made.folder, state)
     scene = bake.bake(tiny_datasets.as_trained(made))
-    assert not scene.provenance["train"]["finished"] and scene.identities is None
+    assert not scene.provenance["train"]["finished"] and scene.gaussians.identities is None
     assert_shows_what_was_trained(made, scene)
 
 
@@ -108,7 +108,7 @@ def test_at_t_max_nothing_is_moved(baked):
     quats, displacements = scene_player.group_poses(baked, baked.t_max)
     np.testing.assert_array_equal(quats, rotations.identity(len(baked.groups)))
     np.testing.assert_array_equal(displacements, 0)
-    np.testing.assert_array_equal(scene_player.frame(baked, baked.t_max).means, baked.means)
+    np.testing.assert_array_equal(scene_player.frame(baked, baked.t_max).means, baked.gaussians.means)
 
 
 def test_objects_move_as_they_did_and_on_past_t_max(baked, tiny):
@@ -124,10 +124,10 @@ def test_objects_move_as_they_did_and_on_past_t_max(baked, tiny):
 
 def test_anchors_are_members_near_the_pivot(baked):
     for group in baked.groups:
-        members = np.flatnonzero(baked.motion_ids == group.id)
+        members = np.flatnonzero(baked.gaussians.motion_ids == group.id)
         assert group.anchor_index in members
-        distances = np.linalg.norm(baked.means[members] - group.pivot, axis=1)
-        assert np.linalg.norm(baked.means[group.anchor_index] - group.pivot) <= np.quantile(distances, 0.3)
+        distances = np.linalg.norm(baked.gaussians.means[members] - group.pivot, axis=1)
+        assert np.linalg.norm(baked.gaussians.means[group.anchor_index] - group.pivot) <= np.quantile(distances, 0.3)
 
 
 def test_a_scaled_and_shifted_world_gives_the_scaled_and_shifted_scene(tiny, tmp_path):
@@ -135,14 +135,14 @@ def test_a_scaled_and_shifted_world_gives_the_scaled_and_shifted_scene(tiny, tmp
     far = tiny_datasets.make_dataset(tmp_path / "far", scale=scale, shift=tuple(shift))
     a = bake.bake(train_briefly(tiny, tmp_path / "a", "train.iterations=8"))
     b = bake.bake(train_briefly(far, tmp_path / "b", "train.iterations=8"))
-    assert len(a.means) == len(b.means)
+    assert len(a.gaussians.means) == len(b.gaussians.means)
     assert b.extent == pytest.approx(scale * a.extent, rel=1e-3)
     # Rounding decides a few draws differently; all others agree.
-    gap = np.linalg.norm((b.means.astype(np.float64) - shift) / scale - a.means, axis=1)
+    gap = np.linalg.norm((b.gaussians.means.astype(np.float64) - shift) / scale - a.gaussians.means, axis=1)
     assert np.quantile(gap, 0.95) < 1e-3 * a.extent
-    assert np.quantile(np.abs(b.log_scales - np.log(scale) - a.log_scales), 0.95) < 1e-2
-    np.testing.assert_allclose(b.track_poses[..., :4], a.track_poses[..., :4], atol=1e-3)
-    np.testing.assert_allclose(b.track_poses[..., 4:] / scale, a.track_poses[..., 4:], atol=1e-3 * a.extent)
+    assert np.quantile(np.abs(b.gaussians.log_scales - np.log(scale) - a.gaussians.log_scales), 0.95) < 1e-2
+    np.testing.assert_allclose(b.tracks.poses[..., :4], a.tracks.poses[..., :4], atol=1e-3)
+    np.testing.assert_allclose(b.tracks.poses[..., 4:] / scale, a.tracks.poses[..., 4:], atol=1e-3 * a.extent)
     view = datasets.read(far.root).train[10]
     shown = scene_renderer.render_frame(b, scene_player.frame(b, view.t), view.camera).color.numpy()
     near = datasets.read(tiny.root).train[10].camera
@@ -166,9 +166,9 @@ def test_an_object_that_lost_all_its_gaussians_stays_in_the_table(trained, tmp_p
 
 def test_a_baked_scene_survives_its_file(baked, tmp_path):
     again = scene_file.read(scene_file.write(baked, tmp_path / "tiny.r5dgs"))
-    np.testing.assert_array_equal(again.object_ids, baked.object_ids)
-    np.testing.assert_allclose(again.means, baked.means, atol=1e-6)
-    np.testing.assert_array_equal(again.track_poses, baked.track_poses)
+    np.testing.assert_array_equal(again.gaussians.object_ids, baked.gaussians.object_ids)
+    np.testing.assert_allclose(again.gaussians.means, baked.gaussians.means, atol=1e-6)
+    np.testing.assert_array_equal(again.tracks.poses, baked.tracks.poses)
     assert again.needs == baked.needs and again.objects == baked.objects
     view = baked.cameras[0]
     for t in (0.0, 0.5, 1.0):
@@ -182,7 +182,7 @@ def test_without_masks_the_scene_is_all_background(tmp_path):
     data = tiny_datasets.make_dataset(tmp_path / "data", masks=False)
     scene = bake.bake(train_briefly(data, tmp_path / "run", "discovery.iterations=0"))
     validation.check(scene, "scene")
-    assert [o.id for o in scene.objects] == [0] and (scene.object_ids == 0).all()
+    assert [o.id for o in scene.objects] == [0] and (scene.gaussians.object_ids == 0).all()
     assert {row["name"]: row["decision"] for row in scene.needs}["tracks"] == "off"
 
 
@@ -221,8 +221,8 @@ def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_wher
     scene = bake.bake(train_briefly(data, tmp_path / "run"))
     group = next(g for g in scene.groups if g.role == "body" and g.object_id == tiny_datasets.BALL)
     assert group.seen is not None and group.seen[0] >= 0.4 and group.seen[1] == scene.t_max
-    path = scene.track_poses[group.id][:, 4:]
-    start = int(np.searchsorted(scene.track_times, group.seen[0]))
+    path = scene.tracks.poses[group.id][:, 4:]
+    start = int(np.searchsorted(scene.tracks.times, group.seen[0]))
     velocity = path[start + 1] - path[start]
     bends = np.linalg.norm(np.diff(path[: start + 2], n=2, axis=0), axis=-1)
     assert start >= 2 and np.linalg.norm(velocity) > 0.05 and bends.max() < 0.25 * np.linalg.norm(velocity)
@@ -232,9 +232,9 @@ def test_an_object_that_comes_late_moves_on_smoothly_before_and_is_measured_wher
     truth = datasets.read(data.root).ground_truth
     moved = scene.with_arrays(
         track_poses=np.where(
-            (np.arange(len(scene.groups)) == group.id)[:, None, None] & (scene.track_times < group.seen[0])[:, None],
+            (np.arange(len(scene.groups)) == group.id)[:, None, None] & (scene.tracks.times < group.seen[0])[:, None],
             [1.0, 0, 0, 0, 5, 5, 5],
-            scene.track_poses,
+            scene.tracks.poses,
         )
     )
     found, expected = evaluate.object_errors(moved, truth), evaluate.object_errors(scene, truth)

@@ -101,7 +101,7 @@ def test_a_classifier_is_on_where_one_was_trained():
 def test_what_is_off_is_not_in_the_scene(baked):
     found = {row["name"]: row["decision"] for row in baked.needs if "object" not in row}
     assert (found["shading"] == "on") == (baked.shading is not None)
-    assert (found["classifier"] == "on") == (baked.identities is not None)
+    assert (found["classifier"] == "on") == (baked.gaussians.identities is not None)
     assert (found["sky_gradient"] == "on") == (len(baked.background_sh) > 1)
 
 
@@ -188,13 +188,13 @@ def test_colour_that_depends_on_the_view_is_learned_where_you_say_that_it_is_nee
 def test_a_run_can_be_baked_without_what_it_has_learned(trained, baked, tiny, tmp_path):
     off = [f"needs.{name}=off" for name in NAMES]
     scene = bake.run_bake(trained.folder, tmp_path / "bare.r5dgs", None, off)
-    assert scene.identities is None and scene.shading is None and len(scene.background_sh) == 1
+    assert scene.gaussians.identities is None and scene.shading is None and len(scene.background_sh) == 1
     assert {group.role for group in scene.groups} == {"pinned", "body"} < {group.role for group in baked.groups}
-    assert (scene.track_poses == [1.0, 0, 0, 0, 0, 0, 0]).all()
-    assert len(scene.means) == sum(baked.groups[k].role != "shadow" for k in baked.motion_ids)
+    assert (scene.tracks.poses == [1.0, 0, 0, 0, 0, 0, 0]).all()
+    assert len(scene.gaussians.means) == sum(baked.groups[k].role != "shadow" for k in baked.gaussians.motion_ids)
     sliding = bake.run_bake(trained.folder, tmp_path / "sliding.r5dgs", None, ["needs.rotation=off"])
-    assert (sliding.track_poses[..., :4] == needs.STILL_QUAT).all() and np.ptp(
-        sliding.track_poses[1, :, 4:], 0
+    assert (sliding.tracks.poses[..., :4] == needs.STILL_QUAT).all() and np.ptp(
+        sliding.tracks.poses[1, :, 4:], 0
     ).max() > 0.1
 
 

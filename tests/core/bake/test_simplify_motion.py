@@ -54,7 +54,7 @@ def evidence_of(scene, data, shown=None):
 
 
 def simplified(scene, data, shown=None, **wanted):
-    observed = np.ones(scene.track_poses.shape[:2], bool)
+    observed = np.ones(scene.tracks.poses.shape[:2], bool)
     found = simplify_motion.simplify(scene, observed, evidence_of(scene, data, shown), NeedsSection(**wanted))
     rows = {row["name"]: row for row in found.rows if row["object"] == "brick"}
     return found.scene, rows
@@ -62,7 +62,7 @@ def simplified(scene, data, shown=None, **wanted):
 
 def with_noise(scene, turn=0.0, shift=0.0):
     """The scene with noise in the poses of the brick that its images do not show. rad, world units"""
-    draw, poses = np.random.default_rng(3), scene.track_poses.copy()
+    draw, poses = np.random.default_rng(3), scene.tracks.poses.copy()
     noise = rotations.rotvecs_to_quats(turn * draw.standard_normal((len(TIMES), 3)))
     poses[BRICK, :, :4] = rotations.multiply(noise, poses[BRICK, :, :4])
     poses[BRICK, :, :4] = rotations.multiply(poses[BRICK, :, :4], rotations.conjugate(poses[BRICK, -1, :4]))
@@ -91,7 +91,7 @@ def test_your_word_keeps_what_is_noise(given):
     name, truth, data = given
     noisy = with_noise(truth, 3e-4, 3e-5)
     scene, rows = simplified(noisy, data, rotation="on", tracks="on")
-    np.testing.assert_array_equal(scene.track_poses[BRICK], noisy.track_poses[BRICK])
+    np.testing.assert_array_equal(scene.tracks.poses[BRICK], noisy.tracks.poses[BRICK])
     assert all(row["decision"] == "on" for row in rows.values())
 
 
@@ -101,15 +101,15 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
     _, truth, data = given
     turns = np.zeros((len(TIMES), 3))
     turns[:, 2] = 0.01 * TAU / -TAU[0]
-    poses, vectors = truth.track_poses.copy(), np.zeros_like(truth.means)
+    poses, vectors = truth.tracks.poses.copy(), np.zeros_like(truth.gaussians.means)
     poses[BRICK, :, :4] = rotations.rotvecs_to_quats(turns)
-    vectors[truth.motion_ids == BRICK, 1] = 30.0  # a turn of 0.01 rad darkens by a third
+    vectors[truth.gaussians.motion_ids == BRICK, 1] = 30.0  # a turn of 0.01 rad darkens by a third
     light = np.array([1.0, 0, 0])
     carrier = truth.with_arrays(track_poses=poses, shading=vectors, light_direction=light)
     scene, rows = simplified(carrier, data, shown=carrier)
     row = rows["rotation"]
     assert row["decision"] == "on" and "serves colours" in row["reason"] and "dB" in row["reason"]
-    np.testing.assert_allclose(scene.track_poses[BRICK], poses[BRICK], atol=1e-12)
+    np.testing.assert_allclose(scene.tracks.poses[BRICK], poses[BRICK], atol=1e-12)
     later = scene_player.group_poses(scene, 2 * truth.t_max)
     assert scene.groups[BRICK].model.kind == "static"
     np.testing.assert_array_equal(later[0][BRICK], [1, 0, 0, 0])
@@ -118,7 +118,7 @@ def test_a_turn_that_carries_a_shadow_is_kept_while_it_is_seen_and_not_foretold(
 
 def test_without_images_only_what_is_too_small_to_be_seen_is_dropped(given):
     name, truth, _ = given
-    observed = np.ones(truth.track_poses.shape[:2], bool)
+    observed = np.ones(truth.tracks.poses.shape[:2], bool)
     small = simplify_motion.simplify(with_noise(truth, 1e-4, 1e-5), observed, None)
     rows = {row["name"]: row["decision"] for row in small.rows if row["object"] == "brick"}
     assert rows["rotation"] == ("on" if name == "turn" else "off")
@@ -131,16 +131,18 @@ def test_another_bind_state_shows_the_same_and_followers_follow(given):
     shadow = dataclasses.replace(
         truth.groups[BRICK], id=3, role="shadow", follows=BRICK, follow_matrix=np.diag([1.0, 1, 0]), anchor_index=-1
     )
-    poses = np.concatenate([truth.track_poses, truth.track_poses[:1]])
+    poses = np.concatenate([truth.tracks.poses, truth.tracks.poses[:1]])
     poses[BRICK, :-1, 4] += 0.003  # all poses but the last: it is the bind state that is off
     poses[3, :, 4:] = poses[BRICK, :, 4:] * [1, 1, 0]
     scene = dataclasses.replace(truth.with_arrays(track_poses=poses), groups=(*truth.groups, shadow))
     calm = poses.copy()
     calm[BRICK, -1, 4] += 0.003
     rebound = simplify_motion._rebound(scene, simplify_motion._followed(scene, calm))
-    np.testing.assert_array_equal(rebound.track_poses[:, -1], [[1, 0, 0, 0, 0, 0, 0]] * 4)
+    np.testing.assert_array_equal(rebound.tracks.poses[:, -1], [[1, 0, 0, 0, 0, 0, 0]] * 4)
     np.testing.assert_allclose(rebound.groups[BRICK].pivot - truth.groups[BRICK].pivot, [0.003, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(rebound.track_poses[3, :, 4:], rebound.track_poses[BRICK, :, 4:] * [1, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        rebound.tracks.poses[3, :, 4:], rebound.tracks.poses[BRICK, :, 4:] * [1, 1, 0], atol=1e-12
+    )
     before, after = scene_player.frame(scene, 0.3), scene_player.frame(rebound, 0.3)
     np.testing.assert_allclose(after.means, before.means, atol=1e-6)
 

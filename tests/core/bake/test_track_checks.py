@@ -39,9 +39,9 @@ def test_a_bad_track_stays_where_it_is_and_the_others_keep_their_bits(trained, t
             continue
         assert group.model.kind == healthy.model.kind  # its noise is measured in images, where the other one has gone
         np.testing.assert_allclose(group.model.velocity, healthy.model.velocity, atol=0.01)
-        np.testing.assert_array_equal(scene.track_poses[group.id], baked.track_poses[group.id])
-        mine, theirs = scene.motion_ids == group.id, baked.motion_ids == group.id
-        np.testing.assert_array_equal(scene.means[mine], baked.means[theirs])
+        np.testing.assert_array_equal(scene.tracks.poses[group.id], baked.tracks.poses[group.id])
+        mine, theirs = scene.gaussians.motion_ids == group.id, baked.gaussians.motion_ids == group.id
+        np.testing.assert_array_equal(scene.gaussians.means[mine], baked.gaussians.means[theirs])
 
 
 @pytest.mark.parametrize(("degrees", "told"), [(100, False), (150, True)])

@@ -83,7 +83,7 @@ def test_a_record_holds_what_evaluate_and_playing_find(made, tiny):
     assert found["splits"]["test"]["images"] == 4 and found["splits"]["val"]["images"] == 2
     assert found["playback"]["frames"] >= playback_speed.LEAST_FRAMES
     assert found["playback"]["fps"] == pytest.approx(1e3 / found["playback"]["ms_frame"])
-    assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).means)
+    assert found["gaussians"] == len(scene_file.read(case.beside(".r5dgs")).gaussians.means)
     assert main.main(["evaluate", str(case.run), "--progress", "none"]) == 0
     alone = json.loads((case.run / checkpoint.EVALUATION_FILE).read_text())
     assert alone["splits"]["test"]["rigid"]["psnr"] == pytest.approx(found["splits"]["test"]["psnr"], abs=1e-6)
@@ -120,8 +120,8 @@ def test_a_run_is_measured_in_every_mode_that_its_scene_has(made, tiny, tmp_path
 
     def with_dynamics(run, dataset):
         scene = plain(run, dataset)
-        still = np.zeros((len(scene.means), 12), np.float32)
-        return scene.with_arrays(dynamics=still, canonical_means=scene.means)
+        still = np.zeros((len(scene.gaussians.means), 12), np.float32)
+        return scene.with_arrays(dynamics=still, canonical_means=scene.gaussians.means)
 
     monkeypatch.setattr(bake, "bake", with_dynamics)
     result = benchmark.run_bench(plan_for(tiny, plan.out), progress_kind="none")["results"]
@@ -334,7 +334,7 @@ def test_playing_draws_each_camera_in_the_order_of_time(baked, tiny, monkeypatch
 
 
 def test_modes_take_turns_round_by_round(baked, tiny, monkeypatch):
-    still = baked.with_arrays(dynamics=np.zeros((len(baked.means), 12), np.float32))
+    still = baked.with_arrays(dynamics=np.zeros((len(baked.gaussians.means), 12), np.float32))
     drawn, frame = [], scene_player.frame
 
     def watch(scene, t, mode="rigid"):

@@ -68,8 +68,9 @@ def mask_written(root, ids):
     return root
 
 
-def scene_changed(root, **changes):
-    return scene_file.write(dataclasses.replace(scenes.make_scene(n=60, objects=2), **changes), root / "s.r5dgs")
+def scene_changed(root, arrays=None, **changes):
+    scene = scenes.make_scene(n=60, objects=2).with_arrays(**(arrays or {}))
+    return scene_file.write(dataclasses.replace(scene, **changes), root / "s.r5dgs")
 
 
 def moved_by(root, frames_per_unit=60.0, radius=0.3, **rates):
@@ -328,12 +329,12 @@ def _(root):
 def _(root):
     scene = scenes.make_scene(n=60, objects=2)
     lost = dataclasses.replace(scene.objects[-1], id=9, name="ghost", start=60, count=0, aliases=())
-    return scene_changed(root, objects=(*scene.objects, lost), identities=None)
+    return scene_changed(root, {"identities": None}, objects=(*scene.objects, lost))
 
 
 @case("S11")
 def _(root):
-    return scene_changed(root, log_scales=np.full((60, 3), 5, np.float32))
+    return scene_changed(root, {"log_scales": np.full((60, 3), 5, np.float32)})
 
 
 @case("S12")
@@ -360,7 +361,7 @@ def _(root):
 
 @case("S16")
 def _(root):
-    return scene_changed(root, opacity_logits=np.full(60, -20, np.float32))
+    return scene_changed(root, {"opacity_logits": np.full(60, -20, np.float32)})
 
 
 @pytest.fixture(scope="module")
@@ -565,10 +566,10 @@ def test_data_sets_and_scenes_are_checked_without_torch(tmp_path):
 def test_all_faults_of_a_scene_are_listed(tmp_path, monkeypatch):
     scene = scenes.make_scene(n=60, objects=3)
     groups = [dataclasses.replace(g, role="ghost" if g.id in (1, 2) else g.role) for g in scene.groups]
-    means = scene.means.copy()
+    means = scene.gaussians.means.copy()
     means[3] = np.nan
     broken = dataclasses.replace(
-        scene.with_arrays(means=means, quats=3 * scene.quats), groups=tuple(groups), frames_per_unit=-1.0
+        scene.with_arrays(means=means, quats=3 * scene.gaussians.quats), groups=tuple(groups), frames_per_unit=-1.0
     )
     monkeypatch.setattr(scene_file.validation, "check", lambda *_: None)
     path = scene_file.write(broken, tmp_path / "s.r5dgs", exact=True)

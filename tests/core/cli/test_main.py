@@ -174,7 +174,9 @@ def test_a_cap_and_a_preset_reach_the_run(tiny, tmp_path, capsys):
 def test_a_need_can_be_overridden_when_baking(made, tmp_path, capsys):
     bare = tmp_path / "bare.r5dgs"
     assert main.main(["bake", str(made[0]), "--out", str(bare), "--set", "needs.classifier=off"]) == 0
-    assert scene_file.read(bare).identities is None and scene_file.read(made[1]).identities is not None
+    assert (
+        scene_file.read(bare).gaussians.identities is None and scene_file.read(made[1]).gaussians.identities is not None
+    )
     wrong = ("bake", made[0], "--out", bare, "--set", "train.seed=1")
     assert "bake takes needs" in complaint(capsys, *wrong, status=ExitStatus.USAGE)
 

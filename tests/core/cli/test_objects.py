@@ -117,7 +117,7 @@ def test_a_camera_mode_or_time_that_is_not_there_is_named(path, capsys, tmp_path
 
 def test_an_object_without_gaussians_cannot_be_drawn(path, tmp_path):
     scene = scene_file.read(path)
-    ghost = dataclasses.replace(scene.objects[-1], id=9, name="ghost", start=len(scene.means), count=0)
+    ghost = dataclasses.replace(scene.objects[-1], id=9, name="ghost", start=len(scene.gaussians.means), count=0)
     haunted = dataclasses.replace(scene, objects=(*scene.objects, ghost))
     with pytest.raises(ConfigError, match="ghost: no Gaussians"):
         objects.render_objects(haunted, [9], tmp_path / "g.png")

@@ -128,7 +128,7 @@ def test_training_gives_the_same_pictures_in_any_world(tiny, tmp_path, scale, sh
     near = bake.bake(run.train(tiny.root, tmp_path / "near", settings))
     data = made(tmp_path / "data", scale, shift)
     far = bake.bake(run.train(data.root, tmp_path / "far", settings))
-    assert len(far.means) == pytest.approx(len(near.means), rel=0.02)
+    assert len(far.gaussians.means) == pytest.approx(len(near.gaussians.means), rel=0.02)
     here, there = datasets.read(tiny.root), datasets.read(data.root)
     for split in ("val", "test"):
         for one, other in zip(drawn(near, here.views(split)), drawn(far, there.views(split)), strict=True):
@@ -138,7 +138,7 @@ def test_training_gives_the_same_pictures_in_any_world(tiny, tmp_path, scale, sh
 def test_scenes_from_before_the_origin_are_measured_in_the_world_that_they_are_in(baked, tiny, tmp_path, caplog):
     data = made(tmp_path / "data", 1.0, 0.2 * FAR)
     older = dataclasses.replace(
-        baked.with_arrays(means=(baked.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
+        baked.with_arrays(means=(baked.gaussians.means.astype(np.float64) + 0.2 * FAR).astype(np.float32)),
         groups=tuple(dataclasses.replace(group, pivot=group.pivot + 0.2 * FAR) for group in baked.groups),
         cameras=tuple(cameras.moved(camera, 0.2 * FAR) for camera in baked.cameras),
     )

@@ -37,8 +37,8 @@ def pose(tiny):
         frame = scene_player.frame(tiny.truth, view.t)
         return Splats(
             *(torch.from_numpy(np.asarray(a, np.float32)) for a in (frame.means, frame.quats)),
-            torch.from_numpy(np.exp(np.asarray(tiny.truth.log_scales, np.float32))),
-            torch.sigmoid(torch.from_numpy(tiny.truth.opacity_logits)),
+            torch.from_numpy(np.exp(np.asarray(tiny.truth.gaussians.log_scales, np.float32))),
+            torch.sigmoid(torch.from_numpy(tiny.truth.gaussians.opacity_logits)),
             torch.zeros(len(frame.means), 3),
         )
 
@@ -83,7 +83,7 @@ def test_a_mask_that_knows_nothing_votes_for_nothing(seen, pose):
 
 def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen, pose):
     """Two of three masks of the ball are missed: as background they outvote the rest, as unknown they do nothing."""
-    truth = torch.from_numpy(np.array([CLASSES[int(i)] for i in tiny.truth.object_ids]))
+    truth = torch.from_numpy(np.array([CLASSES[int(i)] for i in tiny.truth.gaussians.object_ids]))
     fallback = torch.zeros(len(truth), dtype=torch.int64)
 
     def learned(missed):
@@ -92,7 +92,7 @@ def test_missed_masks_that_are_unknown_leave_the_labels_as_they_were(tiny, seen,
         ]
         labels = identity_training.elect(identity_training.votes(some, pose, CLASSES, len(truth)), fallback)
         settings = config.load(None, ["identity.iterations=60"])
-        means = torch.from_numpy(tiny.truth.means)
+        means = torch.from_numpy(tiny.truth.gaussians.means)
         encodings, weight, bias = identity_training.train_encodings(
             some, pose, CLASSES, labels, settings, means, torch.Generator().manual_seed(0)
         )

@@ -25,7 +25,7 @@ def matrix_of(linear, offset=(0.0, 0.0, 0.0)):
 
 
 def times_of(scene):
-    return np.concatenate([scene.track_times, LATER])
+    return np.concatenate([scene.tracks.times, LATER])
 
 
 def played(scene, motion_id, times):
@@ -41,10 +41,10 @@ def played(scene, motion_id, times):
 def pieces_of(scene, noise=0.0, before=None, after=None):
     """The clouds of a loaded scene: their maps are those of playback between ``after`` and ``before``, by object id."""
     random, pieces = np.random.default_rng(0), []
-    pairs = scene.object_ids.astype(np.int64) * 1000 + scene.motion_ids
+    pairs = scene.gaussians.object_ids.astype(np.int64) * 1000 + scene.gaussians.motion_ids
     for start, stop, pair in row_runs.runs(pairs):
         object_id, motion_id = (pair + 1) // 1000 if pair < 0 else pair // 1000, pair % 1000
-        object_id = int(scene.object_ids[start])
+        object_id = int(scene.gaussians.object_ids[start])
         maps = played(scene, motion_id, times_of(scene))
         maps[:, :3] += noise * random.normal(size=maps[:, :3].shape)
         own = np.asarray(scene.groups[motion_id].pivot)
@@ -81,7 +81,7 @@ def rich_scene(**options):
     """With residuals, dynamics, embeddings and a classifier."""
     scene = make_scene(n=300, sh_degree=2, **options)
     random, rows = np.random.default_rng(3), np.array([110, 150, 220])
-    offsets = random.normal(scale=0.05, size=(3, len(scene.track_times), 3)).astype(np.float32)
+    offsets = random.normal(scale=0.05, size=(3, len(scene.tracks.times), 3)).astype(np.float32)
     growths = random.normal(scale=0.1, size=offsets.shape).astype(np.float32)
     offsets[:, -1], growths[:, -1] = 0, 0
     turns = rotations.rotvecs_to_quats(0.3 * random.normal(size=offsets.shape))
@@ -97,7 +97,7 @@ def rich_scene(**options):
             residual_log_scales=growths,
             residual_quats=turns.astype(np.float32),
             dynamics=random.normal(size=(300, 12)).astype(np.float32),
-            canonical_means=scene.means + np.float32(0.1),
+            canonical_means=scene.gaussians.means + np.float32(0.1),
             classifier_weight=random.normal(size=(named, 16)).astype(np.float32),
             classifier_bias=random.normal(size=named).astype(np.float32),
             embeddings=units,
@@ -126,7 +126,7 @@ def test_deleted_objects_are_gone_with_all_that_is_theirs():
     assert [item.id for item in result.objects] == [-1, 0, 1, 3]
     assert [group.object_id for group in result.groups] == [0, 1, 3, 1]
     assert result.groups[3].follows == 1 and notes == []
-    keep = scene.object_ids != 2
+    keep = scene.gaussians.object_ids != 2
     assert_same(result, scene.with_arrays(**{n: scene.arrays()[n][keep] for n in MATCHING}), MATCHING[:6])
     np.testing.assert_array_equal(result.dynamics.rates, scene.dynamics.rates[keep])
     np.testing.assert_array_equal(result.embeddings, scene.embeddings[[0, 1, 2, 4]])
@@ -142,7 +142,7 @@ def test_without_its_leader_a_shadow_goes_on_by_itself():
     result, _ = edit(scene, [piece for piece in pieces_of(scene) if piece.object_id != 1])
     shadow = next(group for group in result.groups if group.role == "shadow")
     assert shadow.follows is None and shadow.object_id == 0
-    rows, old = result.motion_ids == shadow.id, scene.motion_ids == 4
+    rows, old = result.gaussians.motion_ids == shadow.id, scene.gaussians.motion_ids == 4
     for t in (0.3, 0.9):
         np.testing.assert_allclose(
             scene_player.frame(result, t).means[rows], scene_player.frame(scene, t).means[old], atol=1e-4
@@ -153,14 +153,14 @@ def test_without_its_leader_a_shadow_goes_on_by_itself():
 def test_what_was_put_elsewhere_within_its_motion_moves_on_with_it(matrix):
     scene = rich_scene()
     result, notes = edit(scene, pieces_of(scene, after={1: matrix}))
-    rows = scene.object_ids == 1
+    rows = scene.gaussians.object_ids == 1
     assert {name.split()[0] for name in notes} == {"'dynamics'", "'canonical_means'"}
-    np.testing.assert_array_equal(result.track_poses, scene.track_poses)
+    np.testing.assert_array_equal(result.tracks.poses, scene.tracks.poses)
     assert result.groups[1].model == scene.groups[1].model
     base = dataclasses.replace(scene, residuals=None)
     for t in (0.0, 0.31, 0.75, 0.9):
         maps = played(scene, 1, [t])[0] @ matrix
-        wanted = base.means[rows] @ maps[:3, :3].T + maps[:3, 3]
+        wanted = base.gaussians.means[rows] @ maps[:3, :3].T + maps[:3, 3]
         bent = np.zeros(len(rows), bool)
         bent[scene.residuals.rows] = True
         straight = ~bent[rows]
@@ -189,7 +189,7 @@ def test_a_parent_turns_the_learned_motion_and_its_model(mirror):
     assert turned.kind == model.kind
     np.testing.assert_allclose(turned.velocity, linear @ model.velocity)
     np.testing.assert_allclose(turned.angular_velocity, mirror * linear / 0.7 @ model.angular_velocity)
-    rows = (scene.object_ids == 1) & ~np.isin(np.arange(300), scene.residuals.rows)
+    rows = (scene.gaussians.object_ids == 1) & ~np.isin(np.arange(300), scene.residuals.rows)
     for t in (0.0, 0.31, 0.75, 0.99):
         wanted = scene_player.frame(scene, t).means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
         np.testing.assert_allclose(scene_player.frame(result, t).means[rows], wanted, atol=2e-5)
@@ -221,10 +221,10 @@ def test_new_curves_become_a_track_and_the_nearest_model():
     ]
     result, notes = edit(scene, pieces)
     assert not [note for note in notes if "model" in note]
-    rows = scene.object_ids == 2
+    rows = scene.gaussians.object_ids == 2
     bent = np.isin(np.flatnonzero(rows), scene.residuals.rows)
     for k in (0, 5, len(t) - 1):
-        wanted = scene.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
+        wanted = scene.gaussians.means[rows] @ maps[k, :3, :3].T + maps[k, :3, 3]
         np.testing.assert_allclose(scene_player.frame(result, t[k]).means[rows][~bent], wanted[~bent], atol=5e-5)
     np.testing.assert_array_equal(
         scene_player.frame(result, 0.9).means[~rows], scene_player.frame(scene, 0.9).means[~rows]
@@ -261,9 +261,9 @@ def test_a_still_object_that_was_made_to_move_gets_a_group_of_its_own():
     assert len(result.groups) == len(scene.groups) + 1
     group = result.groups[-1]
     assert (group.role, group.object_id, group.model.kind) == ("body", 0, "translation")
-    rows = result.motion_ids == group.id
+    rows = result.gaussians.motion_ids == group.id
     np.testing.assert_allclose(
-        scene_player.frame(result, 0.95).means[rows], result.means[rows] + (0, 0, 0.1), atol=1e-5
+        scene_player.frame(result, 0.95).means[rows], result.gaussians.means[rows] + (0, 0, 0.1), atol=1e-5
     )
 
 
@@ -279,15 +279,15 @@ def test_a_copy_is_an_object_of_its_own_with_the_motion_and_the_meaning_of_the_f
     assert result.object(9).name == "mug two" and result.object(9).count == first.count
     np.testing.assert_array_equal(result.embeddings[-1], scene.embeddings[-1])
     assert result.lookup.thresholds[-1] == scene.lookup.thresholds[-1]
-    rows, old = result.object_ids == 9, scene.object_ids == 3
+    rows, old = result.gaussians.object_ids == 9, scene.gaussians.object_ids == 3
     straight = ~np.isin(np.flatnonzero(old), scene.residuals.rows)
     for t in (0.2, 0.9):
         np.testing.assert_allclose(
             scene_player.frame(result, t).means[rows],
-            scene_player.frame(result, t).means[result.object_ids == 3] + aside[:3, 3], atol=2e-5,
+            scene_player.frame(result, t).means[result.gaussians.object_ids == 3] + aside[:3, 3], atol=2e-5,
         )  # fmt: skip
         np.testing.assert_array_equal(
-            scene_player.frame(result, t).means[result.object_ids == 3][straight],
+            scene_player.frame(result, t).means[result.gaussians.object_ids == 3][straight],
             scene_player.frame(scene, t).means[old][straight],
         )
 
@@ -299,12 +299,14 @@ def test_names_and_tints_are_taken_and_names_stay_unique():
     result, _ = edit(scene, pieces, table)
     assert [item.name for item in result.objects[2:4]] == ["cup", "cup 2"]
     assert result.object(1).aliases == ("beaker",)
-    rows = scene.object_ids == 1
-    colour = 0.5 + 0.28209479177387814 * scene.sh[rows, 0]
-    np.testing.assert_allclose(0.5 + 0.28209479177387814 * result.sh[rows, 0], colour * (0.5, 1, 2), atol=1e-6)
-    np.testing.assert_array_equal(result.sh[~rows], scene.sh[~rows])
+    rows = scene.gaussians.object_ids == 1
+    colour = 0.5 + 0.28209479177387814 * scene.gaussians.sh[rows, 0]
+    np.testing.assert_allclose(
+        0.5 + 0.28209479177387814 * result.gaussians.sh[rows, 0], colour * (0.5, 1, 2), atol=1e-6
+    )
+    np.testing.assert_array_equal(result.gaussians.sh[~rows], scene.gaussians.sh[~rows])
 
 
 def test_everything_may_be_deleted():
     result, _ = edit(rich_scene(), [])
-    assert len(result.means) == 0 and [item.id for item in result.objects] == [0]
+    assert len(result.gaussians.means) == 0 and [item.id for item in result.objects] == [0]

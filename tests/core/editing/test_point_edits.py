@@ -17,7 +17,7 @@ from tests.support import scenes
 def scene():
     """A scene with shading, harmonics of degree 2, and residuals of every fifth Gaussian."""
     made, random = scenes.make_scene(n=300, objects=3, sh_degree=2, seed=3), np.random.default_rng(1)
-    fade = (made.t_max - made.track_times)[None, :, None]
+    fade = (made.t_max - made.tracks.times)[None, :, None]
     offsets, turns, growths = (random.normal(size=(60, 1, 3)) * fade for _ in range(3))
     return made.with_arrays(
         residual_rows=np.arange(0, 300, 5, dtype=np.int32),
@@ -65,9 +65,16 @@ def assert_same(actual, expected, atol=2e-5):
 
 
 def test_an_edit_that_changes_nothing_is_the_scenes_own_rows(scene):
-    base = np.concatenate([scene.sh[ROWS, 0], 1 / (1 + np.exp(-scene.opacity_logits[ROWS, None]))], axis=-1)
+    base = np.concatenate(
+        [scene.gaussians.sh[ROWS, 0], 1 / (1 + np.exp(-scene.gaussians.opacity_logits[ROWS, None]))], axis=-1
+    )
     same = PointEdit(
-        ROWS, scene.means[ROWS], scene.quats[ROWS], np.exp(scene.log_scales[ROWS]), base, scene.sh[ROWS, 1:4]
+        ROWS,
+        scene.gaussians.means[ROWS],
+        scene.gaussians.quats[ROWS],
+        np.exp(scene.gaussians.log_scales[ROWS]),
+        base,
+        scene.gaussians.sh[ROWS, 1:4],
     )
     extended, (place,) = point_edits.extend(scene, [same])
     assert extended is scene and (place.start, place.count) == (40, 80)
@@ -77,13 +84,13 @@ def test_an_edit_that_changes_nothing_is_the_scenes_own_rows(scene):
 @pytest.mark.parametrize("scales", [(1.3, 1.3, 1.3), (1.0, 2.0, 0.5), (-1.0, 1.0, 1.0)])
 def test_an_affine_map_of_all_centres_is_taken_out_of_the_points(scene, scales):
     matrix = some_map(scales)
-    extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, mapped(scene.means[ROWS], matrix))])
+    extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, mapped(scene.gaussians.means[ROWS], matrix))])
     assert extended is scene and (place.start, place.count) == (40, 80)
     np.testing.assert_allclose(place.matrix, matrix, atol=1e-5)
 
 
 def test_a_map_is_found_though_some_points_were_moved_on_their_own(scene, rng):
-    matrix, means = some_map(), mapped(scene.means[ROWS], some_map())
+    matrix, means = some_map(), mapped(scene.gaussians.means[ROWS], some_map())
     means[:20] += rng.normal(size=(20, 3)).astype(np.float32)
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
     actual, expected = drawn(extended, place), affine_transform.place(scene, 40, 80, matrix)
@@ -98,8 +105,8 @@ def test_points_that_share_no_map_keep_their_shapes(scene, rng):
 
 
 def test_points_that_stay_in_place_keep_their_shapes_though_most_are_turned(scene):
-    matrix, means = some_map(), mapped(scene.means[ROWS], some_map())
-    means[:20] = scene.means[ROWS[:20]]
+    matrix, means = some_map(), mapped(scene.gaussians.means[ROWS], some_map())
+    means[:20] = scene.gaussians.means[ROWS[:20]]
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
     actual = drawn(extended, place)
     expected = affine_transform.join(
@@ -109,21 +116,21 @@ def test_points_that_stay_in_place_keep_their_shapes_though_most_are_turned(scen
 
 
 def test_points_flattened_onto_a_plane_are_no_affine_map(scene):
-    means = scene.means[ROWS] * np.array([1, 1, 0], np.float32)
+    means = scene.gaussians.means[ROWS] * np.array([1, 1, 0], np.float32)
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS, means)])
     np.testing.assert_array_equal(drawn(extended, place).means, means)
 
 
 def test_a_turned_plane_of_points_turns_its_shapes(scene):
-    flat = scene.with_arrays(means=scene.means * np.array([1, 1, 0], np.float32))
+    flat = scene.with_arrays(means=scene.gaussians.means * np.array([1, 1, 0], np.float32))
     matrix = some_map()
-    _, (place,) = point_edits.extend(flat, [PointEdit(ROWS, mapped(flat.means[ROWS], matrix))])
+    _, (place,) = point_edits.extend(flat, [PointEdit(ROWS, mapped(flat.gaussians.means[ROWS], matrix))])
     np.testing.assert_allclose(place.matrix, matrix, atol=1e-5)
 
 
 def test_copies_have_a_map_each(scene):
     first, second = np.eye(4), some_map()
-    means = np.concatenate([mapped(scene.means[ROWS], second), scene.means[ROWS]])
+    means = np.concatenate([mapped(scene.gaussians.means[ROWS], second), scene.gaussians.means[ROWS]])
     extended, (place,) = point_edits.extend(scene, [PointEdit(np.tile(ROWS, 2), means)])
     expected = affine_transform.join(
         [affine_transform.place(scene, 40, 80, second), affine_transform.place(scene, 40, 80, first)]
@@ -133,7 +140,7 @@ def test_copies_have_a_map_each(scene):
 
 def test_shading_and_bending_follow_copies(scene):
     t, matrix = 0.4 * scene.t_max, some_map()
-    means = np.concatenate([scene.means[ROWS], mapped(scene.means[ROWS], matrix)])
+    means = np.concatenate([scene.gaussians.means[ROWS], mapped(scene.gaussians.means[ROWS], matrix)])
     extended, (place,) = point_edits.extend(scene, [PointEdit(np.tile(ROWS, 2), means)])
     bend = affine_transform.bend_of(Residuals(scene), t, 40, 80)
     expected = affine_transform.join([affine_transform.place(scene, 40, 80, m, bend=bend) for m in (np.eye(4), matrix)])
@@ -144,7 +151,7 @@ def test_shading_and_bending_follow_copies(scene):
 
 def test_deleted_points_leave_the_numbers_of_the_others(scene):
     rows = ROWS[::3]
-    extended, (place,) = point_edits.extend(scene, [PointEdit(rows, scene.means[rows])])
+    extended, (place,) = point_edits.extend(scene, [PointEdit(rows, scene.gaussians.means[rows])])
     part = slice(place.start, place.start + place.count)
     for name in ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids"):
         np.testing.assert_array_equal(extended.arrays()[name][part], scene.arrays()[name][rows], err_msg=name)
@@ -153,24 +160,24 @@ def test_deleted_points_leave_the_numbers_of_the_others(scene):
 
 def test_given_shapes_and_colours_are_used_as_given(scene, rng):
     quats = rng.normal(size=(80, 4))
-    scales = np.exp(scene.log_scales[ROWS])
+    scales = np.exp(scene.gaussians.log_scales[ROWS])
     scales[:10] *= 3
-    base = np.concatenate([scene.sh[ROWS, 0] + 0.3, np.full((80, 1), 0.25)], axis=-1)
-    edit = PointEdit(ROWS, None, quats, scales, base, scene.sh[ROWS, 1:4] * 2)
+    base = np.concatenate([scene.gaussians.sh[ROWS, 0] + 0.3, np.full((80, 1), 0.25)], axis=-1)
+    edit = PointEdit(ROWS, None, quats, scales, base, scene.gaussians.sh[ROWS, 1:4] * 2)
     extended, (place,) = point_edits.extend(scene, [edit])
     found = drawn(extended, place)
     np.testing.assert_allclose(found.quats, rotations.normalize(quats), atol=1e-6)
     np.testing.assert_allclose(np.exp(found.log_scales), scales, rtol=1e-5)
-    np.testing.assert_array_equal(found.log_scales[10:], scene.log_scales[ROWS[10:]])
+    np.testing.assert_array_equal(found.log_scales[10:], scene.gaussians.log_scales[ROWS[10:]])
     np.testing.assert_allclose(1 / (1 + np.exp(-found.opacity_logits)), 0.25, rtol=1e-5)
-    np.testing.assert_allclose(found.sh[:, 0], scene.sh[ROWS, 0] + 0.3, atol=1e-6)
-    np.testing.assert_allclose(found.sh[:, 1:4], 2 * scene.sh[ROWS, 1:4], atol=1e-6)
-    np.testing.assert_array_equal(found.sh[:, 4:], scene.sh[ROWS, 4:])
+    np.testing.assert_allclose(found.sh[:, 0], scene.gaussians.sh[ROWS, 0] + 0.3, atol=1e-6)
+    np.testing.assert_allclose(found.sh[:, 1:4], 2 * scene.gaussians.sh[ROWS, 1:4], atol=1e-6)
+    np.testing.assert_array_equal(found.sh[:, 4:], scene.gaussians.sh[ROWS, 4:])
 
 
 def test_no_points_are_left_of_an_edit_without_rows(scene):
     extended, (place,) = point_edits.extend(scene, [PointEdit(ROWS[:0])])
-    assert place.count == 0 and len(extended.means) == 300
+    assert place.count == 0 and len(extended.gaussians.means) == 300
 
 
 @pytest.mark.parametrize(

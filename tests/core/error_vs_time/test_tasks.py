@@ -61,8 +61,10 @@ def scene():
 def field(scene):
     """The same scene with dynamics of its Gaussians."""
     rng = np.random.default_rng(0)
-    dynamics = np.where(scene.motion_ids[:, None] > 0, rng.normal(scale=0.3, size=(len(scene.means), 12)), 0)
-    return scene.with_arrays(dynamics=dynamics.astype(np.float32), canonical_means=scene.means)
+    dynamics = np.where(
+        scene.gaussians.motion_ids[:, None] > 0, rng.normal(scale=0.3, size=(len(scene.gaussians.means), 12)), 0
+    )
+    return scene.with_arrays(dynamics=dynamics.astype(np.float32), canonical_means=scene.gaussians.means)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +127,7 @@ def test_the_state_of_a_model_is_its_twist():
 def test_single_gaussians_are_integrated_where_there_are_dynamics(scene, field):
     rows, absent = integrator_task.measure(field, 0.25, 1)
     steps = only(rows, method="Magnus-4, own dynamics", error_kind="position")
-    assert steps.count == int((scene.motion_ids > 0).sum())
+    assert steps.count == int((scene.gaussians.motion_ids > 0).sum())
     assert steps.error_worst < 1e-3 and not absent
     trace = [only(rows, method="trace_rk2, own dynamics", setting=s, error_kind="position").error for s in TRACE]
     assert trace == sorted(trace, reverse=True) and trace[0] > steps.error

@@ -35,7 +35,7 @@ def test_the_result_has_its_fixed_shape_and_is_json(result, scene):
     for row in result["objects"]:
         assert set(row) == {"id", "name", "position_error", "rotation_error_deg"}
     assert set(result["train"]) == {"seconds", "iterations", "gaussians"}
-    assert result["train"]["gaussians"] == len(scene.means)
+    assert result["train"]["gaussians"] == len(scene.gaussians.means)
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
@@ -76,7 +76,9 @@ def test_a_wrong_spin_is_a_rotation_error_of_that_many_degrees(scene, data):
 
 def test_swapped_names_cost_the_same_id_score_only(scene, data):
     swapped = np.array([0, 2, 1, 3])
-    ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
+    ids = np.where(
+        scene.gaussians.object_ids > 0, swapped[np.maximum(scene.gaussians.object_ids, 0)], scene.gaussians.object_ids
+    ).astype(np.int32)
     result = evaluate.evaluate(scene.with_arrays(object_ids=ids), data, splits=("val",), backend=BACKEND)
     values = result["splits"]["val"]["rigid"]
     assert values["miou_matched"] == 1.0
@@ -113,9 +115,9 @@ def test_what_the_data_set_does_not_have_is_none(scene, data):
 
 def test_the_classifier_decides_the_id_map_where_there_is_one(scene):
     classes = [item.id for item in scene.objects if item.id >= 0]
-    codes = np.zeros((len(scene.means), 16), np.float16)
-    rows = scene.object_ids >= 0
-    codes[rows, [classes.index(i) for i in scene.object_ids[rows]]] = 1
+    codes = np.zeros((len(scene.gaussians.means), 16), np.float16)
+    rows = scene.gaussians.object_ids >= 0
+    codes[rows, [classes.index(i) for i in scene.gaussians.object_ids[rows]]] = 1
     weight = np.zeros((len(classes), 16), np.float32)
     weight[:, : len(classes)] = np.eye(len(classes))
     bias = np.array([0.05, 0, 0, 0], np.float32)
@@ -135,7 +137,7 @@ def test_transparent_pixels_are_compared_on_the_background_of_the_training(scene
     for path in (tmp_path / "clear" / "val").iterdir():
         images.write_png(path, np.zeros((pictures.HEIGHT, pictures.WIDTH, 4), np.uint8))
     clear = dataset.read(tmp_path / "clear")
-    empty = scene.with_arrays(opacity_logits=np.full_like(scene.opacity_logits, -20))
+    empty = scene.with_arrays(opacity_logits=np.full_like(scene.gaussians.opacity_logits, -20))
     for name, level in (("white", 1.0), ("black", 0.0)):
         sky = np.full((1, 3), (level - 0.5) / 0.28209479177387814, np.float32)
         provenance = {"config": {"train": {"background": name}}}
@@ -203,7 +205,9 @@ def test_the_images_past_t_max_are_counted(scene, result):
 
 def test_the_table_says_what_its_overlap_is(scene, data):
     swapped = np.array([0, 2, 1, 3])
-    ids = np.where(scene.object_ids > 0, swapped[np.maximum(scene.object_ids, 0)], scene.object_ids).astype(np.int32)
+    ids = np.where(
+        scene.gaussians.object_ids > 0, swapped[np.maximum(scene.gaussians.object_ids, 0)], scene.gaussians.object_ids
+    ).astype(np.int32)
     wrong = evaluate.evaluate(scene.with_arrays(object_ids=ids), data, backend=BACKEND)
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(evaluation_table.make(wrong))

@@ -28,7 +28,7 @@ def test_pixels_are_those_of_the_id_maps_and_overlap_with_own_masks_is_whole(sce
     for row in rows:
         assert row.pixels == pytest.approx(np.mean([(ids == row.id).sum() for ids in maps]))
         assert row.views == sum((ids == row.id).any() for ids in maps)
-        assert row.gaussians == (scene.object_ids == row.id).sum()
+        assert row.gaussians == (scene.gaussians.object_ids == row.id).sum()
         assert row.iou == (1.0 if row.id >= 0 else None)
     assert sum(row.pixels for row in rows) == pytest.approx(pictures.WIDTH * pictures.HEIGHT)
 
@@ -45,9 +45,9 @@ def test_own_views_take_every_camera_and_times_all_over(scene):
 
 def test_confidence_is_the_mean_probability_of_the_label_by_opacity(scene):
     classes = [item.id for item in scene.objects if item.id >= 0]
-    codes = np.zeros((len(scene.means), 16), np.float16)
-    rows = scene.object_ids >= 0
-    codes[rows, [classes.index(i) for i in scene.object_ids[rows]]] = 1
+    codes = np.zeros((len(scene.gaussians.means), 16), np.float16)
+    rows = scene.gaussians.object_ids >= 0
+    codes[rows, [classes.index(i) for i in scene.gaussians.object_ids[rows]]] = 1
     weight = np.zeros((len(classes), 16), np.float32)
     weight[:, : len(classes)] = 3 * np.eye(len(classes))
     coded = scene.with_arrays(
@@ -55,10 +55,10 @@ def test_confidence_is_the_mean_probability_of_the_label_by_opacity(scene):
     )
     sure = np.exp(3) / (np.exp(3) + len(classes) - 1)
     assert object_table.confidences(coded) == pytest.approx(dict.fromkeys(classes, sure))
-    mine = np.flatnonzero(scene.object_ids == 2)
+    mine = np.flatnonzero(scene.gaussians.object_ids == 2)
     wrong = codes.copy()
     wrong[mine[0]] = np.roll(wrong[mine[0]], 1)
-    opacities = 1 / (1 + np.exp(-scene.opacity_logits[mine].astype(np.float64)))
+    opacities = 1 / (1 + np.exp(-scene.gaussians.opacity_logits[mine].astype(np.float64)))
     share = opacities[0] / opacities.sum()
     other = 1 / (np.exp(3) + len(classes) - 1)
     found = object_table.confidences(coded.with_arrays(identities=wrong))
@@ -74,9 +74,9 @@ def test_without_encodings_there_is_no_confidence(scene):
 
 def test_strays_move_with_another_object_than_they_show(scene):
     assert object_table.strays(scene) == {}  # the shadow is background that follows its caster
-    ids = scene.motion_ids.copy()
-    mine = np.flatnonzero(scene.object_ids == 2)
-    floor = np.flatnonzero((scene.object_ids == 0) & (scene.motion_ids == 0))
+    ids = scene.gaussians.motion_ids.copy()
+    mine = np.flatnonzero(scene.gaussians.object_ids == 2)
+    floor = np.flatnonzero((scene.gaussians.object_ids == 0) & (scene.gaussians.motion_ids == 0))
     ids[mine[:4]], ids[mine[4:6]], ids[floor[:3]] = 1, 0, 3
     assert object_table.strays(scene.with_arrays(motion_ids=ids)) == {0: 3, 2: 6}
     still = dataclasses.replace(scene.with_arrays(motion_ids=np.zeros_like(ids)), groups=scene.groups[:1])
@@ -89,7 +89,7 @@ def test_motion_is_told_in_the_words_of_the_sidebar(scene):
     group = dataclasses.replace(scene.groups[1], model=dataclasses.replace(scene.groups[1].model, kind="static"))
     assert scene_summary.motion_of(scene, [group]) == "rests"
     for share, word in ((0.8, "still"), (1.2, "rests")):
-        poses = scene.track_poses.copy()
+        poses = scene.tracks.poses.copy()
         poses[1] = [1, 0, 0, 0, 0, 0, 0]
         poses[1, 0, 4] = share * scene_summary.STILL * group.model.radius
         noisy = scene.with_arrays(track_poses=poses)

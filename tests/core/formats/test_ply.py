@@ -12,13 +12,13 @@ from tests.support.scenes import make_scene
 def splats(degree=0, n=50, groups=True):
     scene = make_scene(n=n, sh_degree=degree)
     return Splats(
-        scene.means,
-        scene.quats,
-        scene.log_scales,
-        scene.opacity_logits,
-        scene.sh,
-        scene.identities.astype(np.float32) if groups else None,
-        scene.object_ids if groups else None,
+        scene.gaussians.means,
+        scene.gaussians.quats,
+        scene.gaussians.log_scales,
+        scene.gaussians.opacity_logits,
+        scene.gaussians.sh,
+        scene.gaussians.identities.astype(np.float32) if groups else None,
+        scene.gaussians.object_ids if groups else None,
     )
 
 

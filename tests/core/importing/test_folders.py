@@ -134,7 +134,7 @@ def test_trace_and_freegave_need_their_last_time(traced):
     with pytest.raises(CheckpointError, match=r"cfg_args: 'max_time': expected .* found nothing; give it with --t-max"):
         importer.import_run(traced)
     scene = importer.import_run(traced, importer.Options(t_max=0.6, knots=3))
-    np.testing.assert_allclose(scene.track_times, [0.0, 0.3, 0.6])
+    np.testing.assert_allclose(scene.tracks.times, [0.0, 0.3, 0.6])
 
 
 def test_a_classifier_needs_identities(tmp_path):
@@ -257,19 +257,19 @@ def test_rows_are_sampled_the_same_in_chunks(deformed, monkeypatch):
     parts = importer.import_run(deformed, importer.Options(knots=3), lambda *count: told.append(count))
     np.testing.assert_array_equal(parts.residuals.rows, whole.residuals.rows)
     np.testing.assert_allclose(parts.residuals.offsets, whole.residuals.offsets, atol=1e-6)
-    np.testing.assert_allclose(parts.means, whole.means, atol=1e-6)
+    np.testing.assert_allclose(parts.gaussians.means, whole.gaussians.means, atol=1e-6)
     assert told == [(7, 24), (14, 24), (21, 24), (24, 24)]
 
 
 def test_a_data_set_gives_times_cameras_and_axes(deformed, tiny):
     dataset = datasets.read(tiny.root)
     scene = importer.import_run(deformed, importer.Options(data=tiny.root))
-    np.testing.assert_allclose(scene.track_times, dataset.times)
+    np.testing.assert_allclose(scene.tracks.times, dataset.times)
     assert scene.t_max == dataset.t_max
     assert [camera.name for camera in scene.cameras] == [camera.name for camera in dataset.cameras]
     assert (scene.world_convention, scene.frames_per_unit) == ("blender", 40.0)
     without = importer.import_run(deformed, importer.Options(knots=4, world="opengl", t_max=0.5))
-    np.testing.assert_allclose(without.track_times, np.linspace(0, 0.5, 4))
+    np.testing.assert_allclose(without.tracks.times, np.linspace(0, 0.5, 4))
     assert without.world_convention == "opengl"
 
 
@@ -294,7 +294,7 @@ def test_the_command_writes_a_scene_that_info_reads(deformed, tmp_path, capsys):
     assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3"]) == 0
     assert "import 24: of 24 Gaussians" in capsys.readouterr().out
     scene = scene_file.read(out)
-    assert scene.name == "run" and len(scene.track_times) == 3
+    assert scene.name == "run" and len(scene.tracks.times) == 3
     assert scene.provenance["imported"]["settings"]["is_blender"] is True
     assert main.main(["import", str(deformed), "--out", str(out), "--knots", "3", "--progress", "json"]) == 0
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]

@@ -81,13 +81,15 @@ def test_gaussian_grouping_gives_objects_by_its_classifier(tmp_path):
     labels = (cloud.identities @ weight[:, :, 0, 0].T + bias).argmax(1).numpy()
     assert len(set(labels.tolist())) > 3
     order = np.argsort(labels, kind="stable")
-    np.testing.assert_array_equal(scene.object_ids, labels[order])
-    np.testing.assert_allclose(scene.identities, cloud.identities.numpy()[order], rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(scene.gaussians.object_ids, labels[order])
+    np.testing.assert_allclose(scene.gaussians.identities, cloud.identities.numpy()[order], rtol=1e-3, atol=1e-3)
     present = np.union1d(labels, [0])
     assert [item.name for item in scene.objects] == ["background", *(f"object {k}" for k in present if k > 0)]
     np.testing.assert_allclose(scene.classifier.weight, weight[present, :, 0, 0], atol=1e-7)
-    again = (scene.identities.astype(np.float32) @ scene.classifier.weight.T + scene.classifier.bias).argmax(1)
-    assert (present[again] == scene.object_ids).mean() > 0.9  # identities are kept as float16
+    again = (scene.gaussians.identities.astype(np.float32) @ scene.classifier.weight.T + scene.classifier.bias).argmax(
+        1
+    )
+    assert (present[again] == scene.gaussians.object_ids).mean() > 0.9  # identities are kept as float16
     sorted_rule = foreign.resting(cloud)
     assert_drawn(scene, 0.0, Drawn(sorted_rule.means[order], sorted_rule.covariances[order]), tolerance=1e-6)
     assert_pictured(scene, 0.0, cloud, sorted_rule, 0.0)
@@ -104,7 +106,7 @@ def test_deformable_adds_rotations_and_scales(tmp_path, inputs, time, screws):
     scene = imported(folder, tmp_path, knots=KNOTS)
     assert scene.t_max == 1.0 and scene.dynamics is None
     assert scene.world_convention == ("blender" if time else "colmap")
-    times = scene.track_times
+    times = scene.tracks.times
     moved = foreign.added(cloud, weights, times[0]).means - foreign.added(cloud, weights, times[-1]).means
     assert moved.norm(dim=1).min() > 0.01
     for t in times:
@@ -153,12 +155,12 @@ def test_trace_turns_before_the_canonical_rotation_and_flies_on(tmp_path, light)
         assert v.norm(dim=1).mean() > 0.2 and w.norm(dim=1).mean() > 0.2
         return foreign.twisted(cloud, moved, turn, growth, lambda tau: (v + a * tau, w + e * tau), t)
 
-    for t in scene.track_times:
+    for t in scene.tracks.times:
         assert_drawn(scene, t, rule(t))
     assert_drawn(scene, LATER, rule(LATER), "standard")
     assert (rule(LATER).means - rule(T_MAX).means).norm(dim=1).mean() > 0.02
     scene = importer.dataclasses.replace(scene, near_plane=0.2)  # nothing is nearer than that here
-    assert_pictured(scene, scene.track_times[2], cloud, rule(scene.track_times[2]), 1.0)
+    assert_pictured(scene, scene.tracks.times[2], cloud, rule(scene.tracks.times[2]), 1.0)
     assert_pictured(scene, LATER, cloud, rule(LATER), 1.0, "standard")
 
 
@@ -181,7 +183,7 @@ def test_trace_with_codes_mixes_the_twists_of_motion_patterns(tmp_path):
         v, w, a, e = torch.einsum("nk,kij->inj", shares, patterns)
         return foreign.twisted(cloud, moved, turn, growth, lambda tau: (v + a * tau, w + e * tau), t)
 
-    for t in (*scene.track_times, LATER):
+    for t in (*scene.tracks.times, LATER):
         assert_drawn(scene, t, rule(t), "standard")
 
 
@@ -227,7 +229,7 @@ def test_freegave_turns_against_the_sign_of_its_weights(tmp_path, width, depth):
         assert rates(0.0)[1].norm(dim=1).mean() > 0.02
         return foreign.twisted(cloud, moved, turn, growth, rates, t)
 
-    for t in scene.track_times:
+    for t in scene.tracks.times:
         assert_drawn(scene, t, rule(t))
     near, far = T_MAX + 0.02, T_MAX + 0.04
     errors = [np.abs(scene_player.frame(scene, t, "standard").means - rule(t).means.numpy()).max() for t in (near, far)]
@@ -266,8 +268,8 @@ def test_a_run_far_from_the_origin_keeps_what_its_files_hold_and_gets_an_origin(
     rows = json.loads(path.read_text())
     path.write_text(json.dumps([{**row, "position": (np.array(row["position"]) + shift).tolist()} for row in rows]))
     scene = imported(tmp_path / "run", tmp_path)
-    assert np.abs(scene.origin - shift).max() < 8 and np.abs(scene.means).max() < 8
+    assert np.abs(scene.origin - shift).max() < 8 and np.abs(scene.gaussians.means).max() < 8
     stored = far.means.numpy().astype(np.float32).astype(np.float64)
-    np.testing.assert_allclose(scene.means + scene.origin, stored, atol=1e-6)
+    np.testing.assert_allclose(scene.gaussians.means + scene.origin, stored, atol=1e-6)
     np.testing.assert_allclose(scene.cameras[0].center + scene.origin, foreign.view().center + shift, atol=1e-8)
     assert [record.getMessage() for record in caplog.records if "to 0.25 units" in record.getMessage()]

@@ -150,7 +150,7 @@ def test_a_caption_answers_for_a_name_that_says_nothing():
 @pytest.mark.parametrize("kind", ["text", "clip"])
 def test_an_object_without_gaussians_gets_no_embedding_and_that_is_said(kind):
     scene = ring(named("lemon", "hammer"))
-    keep = scene.object_ids != 2
+    keep = scene.gaussians.object_ids != 2
     bare = dataclasses.replace(
         scene.with_arrays(**{name: scene.arrays()[name][keep] for name in PER_GAUSSIAN}),
         objects=tuple(dataclasses.replace(item, count=0 if item.id == 2 else item.count) for item in scene.objects),
@@ -190,9 +190,9 @@ def ring(scene, count=4, width=96):
 def seen():
     """A scene whose third object is hidden in the second, and whose fourth has no opacity."""
     scene = ring(named("mug", "globe", "pearl", "ghost"))
-    logits = np.full(len(scene.means), 4.0, np.float32)
-    logits[scene.object_ids == 4] = -12.0
-    scales = np.full_like(scene.log_scales, np.log(0.05))
+    logits = np.full(len(scene.gaussians.means), 4.0, np.float32)
+    logits[scene.gaussians.object_ids == 4] = -12.0
+    scales = np.full_like(scene.gaussians.log_scales, np.log(0.05))
     return scene.with_arrays(opacity_logits=logits, log_scales=scales)
 
 
@@ -205,7 +205,7 @@ def test_the_best_views_are_spread_over_cameras_and_times(seen):
         assert len({sighting.camera.name for sighting in own}) > 1 and len({sighting.t for sighting in own}) > 1
         for sighting in own:
             left, top, right, bottom = sighting.box
-            assert right - left == pytest.approx(bottom - top) and seen.track_times[0] <= sighting.t <= seen.t_max
+            assert right - left == pytest.approx(bottom - top) and seen.tracks.times[0] <= sighting.t <= seen.t_max
 
 
 def test_crops_show_the_object_alone_on_gray_and_in_its_place(seen):
@@ -214,8 +214,8 @@ def test_crops_show_the_object_alone_on_gray_and_in_its_place(seen):
     assert alone.shape == context.shape == (64, 64, 3) and alone.min() >= 0 and context.max() <= 1
     np.testing.assert_allclose(alone[0, 0], 0.5, atol=0.02)
     assert (np.abs(alone - 0.5).max(-1) > 0.05).mean() > 0.1
-    away = seen.sh.copy()
-    away[seen.object_ids != 1] *= -1
+    away = seen.gaussians.sh.copy()
+    away[seen.gaussians.object_ids != 1] *= -1
     others = seen.with_arrays(sh=away)
     np.testing.assert_allclose(best_views.crops(others, 1, sighting, 64)[0], alone, atol=1e-6)
     assert np.abs(best_views.crops(others, 1, sighting, 64)[1] - context).max() > 0.05
@@ -223,10 +223,10 @@ def test_crops_show_the_object_alone_on_gray_and_in_its_place(seen):
 
 def test_hidden_views_are_worth_less(seen):
     whole = best_views.find(seen, [1])[1]
-    wall = seen.means.copy()
-    rows = np.flatnonzero(seen.object_ids == 0)
+    wall = seen.gaussians.means.copy()
+    rows = np.flatnonzero(seen.gaussians.object_ids == 0)
     camera = next(camera for camera in seen.cameras if camera.name == whole[0].camera.name)
-    middle = seen.means[seen.object_ids == 1].mean(0)
+    middle = seen.gaussians.means[seen.gaussians.object_ids == 1].mean(0)
     toward = camera.center - middle
     side = np.cross(toward, [0, 0, 1.0]) / np.linalg.norm(np.cross(toward, [0, 0, 1.0]))
     spread = np.linspace(0, 0.5, len(rows))[:, None]
@@ -344,7 +344,7 @@ def test_naming_an_object_changes_that_alone(file, capsys):
     assert after.object(3) == dataclasses.replace(
         before.object(3), name="glazed donut", aliases=("snack", "bun"), caption="a sweet"
     )
-    np.testing.assert_array_equal(after.means, before.means)
+    np.testing.assert_array_equal(after.gaussians.means, before.gaussians.means)
     assert after.lookup == before.lookup
     assert [m.object_id for m in object_search.search(after, "snack")] == [3]
     assert main.main(["name", str(file), "glazed donut", "--alias", "bun"]) == 0

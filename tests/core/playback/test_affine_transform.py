@@ -97,18 +97,20 @@ def test_a_placed_range_has_the_colours_that_the_renderer_gives_it(tint):
     seen = sh_color.to_rgb(placed.sh.astype(np.float64), towards / np.linalg.norm(towards, axis=-1, keepdims=True))
     np.testing.assert_allclose(np.maximum(seen, 0), wanted, atol=2e-5)
     np.testing.assert_array_equal(placed.means, posed.means)
-    np.testing.assert_array_equal(placed.object_ids, scene.object_ids[start : start + count])
+    np.testing.assert_array_equal(placed.object_ids, scene.gaussians.object_ids[start : start + count])
 
 
 def test_a_placed_range_is_lit_as_playback_lights_it():
     scene = make_scene(n=200, shading=True)
     frame = scene_player.frame(scene, 0.2)
     group = scene.groups[1]
-    rows = np.flatnonzero(scene.motion_ids == 1)
+    rows = np.flatnonzero(scene.gaussians.motion_ids == 1)
     turn = rotations.quats_to_rotmats(frame.group_quats[1])
     matrix = matrix_of(turn, group.pivot + frame.group_displacements[1] - turn @ group.pivot)
     placed = affine_transform.place(scene, int(rows[0]), len(rows), matrix)
-    colour = np.maximum(0.5 + spherical_harmonics.C0 * scene.sh[rows, 0], 0) * frame.shading_factor[rows, None]
+    colour = (
+        np.maximum(0.5 + spherical_harmonics.C0 * scene.gaussians.sh[rows, 0], 0) * frame.shading_factor[rows, None]
+    )
     np.testing.assert_allclose(np.maximum(0.5 + spherical_harmonics.C0 * placed.sh[:, 0], 0), colour, atol=1e-6)
 
 
@@ -124,7 +126,7 @@ def test_the_light_turns_with_the_world():
 @pytest.mark.parametrize("turns_harmonics", [True, False])
 def test_what_bends_is_bent_as_the_renderer_bends_it(t, turns_harmonics):
     scene, random = make_scene(n=200, sh_degree=3, shading=True), np.random.default_rng(1)
-    rows, knots = np.array([70, 71, 120, 190]), len(scene.track_times)
+    rows, knots = np.array([70, 71, 120, 190]), len(scene.tracks.times)
     offsets, growths = random.normal(scale=0.1, size=(2, 4, knots, 3)).astype(np.float32)
     turns = rotations.rotvecs_to_quats(0.5 * random.normal(size=offsets.shape)).astype(np.float32)
     offsets[:, -1], growths[:, -1], turns[:, -1] = 0, 0, (1, 0, 0, 0)

@@ -31,29 +31,31 @@ def bending() -> Scene:
 def twisting(scene: Scene) -> Scene:
     """The scene with dynamics in which each body moves by one twist."""
     rng = np.random.default_rng(2)
-    dynamics = np.zeros((len(scene.means), 12), np.float32)
+    dynamics = np.zeros((len(scene.gaussians.means), 12), np.float32)
     for group in scene.groups:
-        rows = np.flatnonzero(scene.motion_ids == group.id)
+        rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)
         if group.role != "body":
             continue
         v, w, a, e = rng.normal(size=(4, 3))
-        v, a = se3.recentre(w, v, e, a, scene.means[rows].astype(float))
+        v, a = se3.recentre(w, v, e, a, scene.gaussians.means[rows].astype(float))
         tile = np.ones((len(rows), 1))
         dynamics[rows] = np.concatenate([v, tile * w, a, tile * e], -1)
-    return scene.with_arrays(dynamics=dynamics, canonical_means=scene.means.copy())
+    return scene.with_arrays(dynamics=dynamics, canonical_means=scene.gaussians.means.copy())
 
 
 @pytest.mark.parametrize("k", [0, 3, 7])
 def test_residuals_change_the_bind_state_before_the_group_moves_it(bending, k):
     frame, i = scene_player.frame(bending, float(TIMES[k])), 11
     row = int(bending.residuals.rows[i])
-    group = bending.groups[int(bending.motion_ids[row])]
+    group = bending.groups[int(bending.gaussians.motion_ids[row])]
     q, d = frame.group_quats[group.id], frame.group_displacements[group.id]
-    bent = bending.means[row] + bending.residuals.offsets[i, k]
+    bent = bending.gaussians.means[row] + bending.residuals.offsets[i, k]
     np.testing.assert_allclose(frame.means[row], group.pivot + rotations.rotate(q, bent - group.pivot) + d, atol=1e-5)
-    turned = rotations.multiply(bending.residuals.quats[i, k].astype(float), bending.quats[row].astype(float))
+    turned = rotations.multiply(bending.residuals.quats[i, k].astype(float), bending.gaussians.quats[row].astype(float))
     assert rotations.angle_between(rotations.multiply(q, turned), frame.quats[row].astype(float)) < 1e-4
-    np.testing.assert_allclose(frame.log_scales[row], bending.log_scales[row] + bending.residuals.log_scales[i, k])
+    np.testing.assert_allclose(
+        frame.log_scales[row], bending.gaussians.log_scales[row] + bending.residuals.log_scales[i, k]
+    )
 
 
 def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
@@ -61,7 +63,7 @@ def test_residuals_are_smooth_between_knots_and_gone_at_t_max(bending):
     paths = np.stack([scene_player.frame(bending, t).means for t in times])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
     assert steps.max() < 0.2
-    np.testing.assert_array_equal(scene_player.frame(bending, T_MAX).means, bending.means)
+    np.testing.assert_array_equal(scene_player.frame(bending, T_MAX).means, bending.gaussians.means)
     np.testing.assert_array_equal(scene_player.frame(bending, -1.0).means, scene_player.frame(bending, 0.0).means)
 
 
@@ -77,8 +79,8 @@ def test_the_sign_of_a_residual_quaternion_does_not_matter(bending):
 def test_equal_twists_move_a_body_rigidly_in_mode_standard():
     scene = twisting(make_scene())
     frame = scene_player.frame(scene, 1.0, "standard")
-    for start, stop, g in row_runs.runs(scene.motion_ids):
-        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
+        before, after = scene.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
         np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-4)
         assert scene.groups[g].role == "body" or (before == after).all()
@@ -88,13 +90,13 @@ def test_the_literal_form_is_rigid_only_where_offsets_are_those_at_t_max():
     scene = twisting(make_scene())
     standard, literal = (scene_player.frame(scene, 1.0, mode) for mode in ("standard", "rigid_paper"))
     np.testing.assert_allclose(literal.means, standard.means, atol=2e-3)
-    body = scene.motion_ids == 1
+    body = scene.gaussians.motion_ids == 1
     turn = rotations.rotvecs_to_quats(np.array([0, 0, 1.0]))
     canonical = scene.dynamics.canonical_means.astype(float)
     canonical[body] = rotations.rotate(turn, canonical[body])
     turned = scene.with_arrays(canonical_means=canonical.astype(np.float32))
     off = scene_player.frame(turned, 1.0, "rigid_paper").means.astype(float)
-    after, before = off[body], scene.means[body].astype(float)
+    after, before = off[body], scene.gaussians.means[body].astype(float)
     pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
     assert np.abs(pairs[1] - pairs[0]).max() > 0.05
 
@@ -112,7 +114,7 @@ def test_all_modes_meet_at_t_max_and_agree_before_it(twisted, mode):
     for name in ("means", "quats"):
         np.testing.assert_array_equal(getattr(frame, name), scene.arrays()[name])
         np.testing.assert_array_equal(getattr(scene_player.frame(scene, 0.2, mode), name), getattr(rigid, name))
-    np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.means, atol=1e-6)
+    np.testing.assert_allclose(scene_player.frame(scene, T_MAX + 1e-9, mode).means, scene.gaussians.means, atol=1e-6)
 
 
 @pytest.mark.parametrize("source", group_dynamics.SOURCES[1:])
@@ -123,7 +125,7 @@ def test_bodies_of_one_twist_move_alike_in_all_modes(twisted, source):
         np.testing.assert_allclose(rigid.means, own.means, atol=3 * residuals.TOLERANCE * scene.extent)
         assert rotations.angle_between(rigid.quats.astype(float), own.quats.astype(float)).max() < 2e-3
         np.testing.assert_allclose(rigid.shading_factor, own.shading_factor, atol=2e-3)
-        since = rigid.group_quats[scene.motion_ids[own.turned_rows]]
+        since = rigid.group_quats[scene.gaussians.motion_ids[own.turned_rows]]
         assert rotations.angle_between(since, own.turned_quats).max() < 2e-3
 
 
@@ -132,9 +134,9 @@ def test_sources_move_every_group_rigidly_for_long(twisted, mode):
     scene = twisted
     player, t = scene_player.Player(scene, mode), T_MAX + 4.0
     _, displacements = player.group_poses(t)
-    for start, stop, g in row_runs.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         frame = player.frame(t, scene.groups[g].pivot + displacements[g])
-        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+        before, after = scene.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
         np.testing.assert_allclose(pairs[1], pairs[0], atol=5e-7 if scene.groups[g].role == "body" else 2e-6)
 
@@ -152,19 +154,19 @@ def loose(scene: Scene, rows: np.ndarray, size: float) -> Scene:
 @pytest.mark.parametrize("variant", ["", "/least_squares"])
 def test_hybrid_is_rigid_but_for_those_whose_motion_no_group_explains(twisted, variant):
     dynamics = twisted.dynamics.rates + (twisted.dynamics.rates != 0) * np.float32(0.2)
-    dynamics[np.flatnonzero(twisted.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
+    dynamics[np.flatnonzero(twisted.gaussians.motion_ids == 1)[::6]] = 0.0  # a stray that rests while its group moves
     scene = twisted.with_arrays(dynamics=dynamics)
     rigid, own = scene_player.frame(scene, 1.1, f"rigid{variant}"), scene_player.frame(scene, 1.1, "standard")
-    everyone = np.arange(len(scene.means), dtype=np.int32)
-    some = np.flatnonzero(scene.motion_ids == 1)[::3].astype(np.int32)
+    everyone = np.arange(len(scene.gaussians.means), dtype=np.int32)
+    some = np.flatnonzero(scene.gaussians.motion_ids == 1)[::3].astype(np.int32)
     for rows, size in ((None, 0.0), (everyone, 1e-3), (some, 0.5), (everyone, 0.5)):
         changed = scene if rows is None else loose(scene, rows, size)
         frame = scene_player.frame(changed, 1.1, f"hybrid{variant}")
-        free = np.zeros(len(scene.means), bool)
+        free = np.zeros(len(scene.gaussians.means), bool)
         if rows is not None and size > 0.1:
             free[rows] = True
         elif rows is not None:
-            free[scene.motion_ids == 0] = True  # what is pinned by rule has no motion that explains anything
+            free[scene.gaussians.motion_ids == 0] = True  # what is pinned by rule has no motion that explains anything
         for name in ("means", "quats", "shading_factor"):
             np.testing.assert_array_equal(getattr(frame, name)[free], getattr(own, name)[free])
             np.testing.assert_array_equal(getattr(frame, name)[~free], getattr(rigid, name)[~free])
@@ -175,7 +177,7 @@ def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
     dynamics = twisted.dynamics.rates.copy()
     dynamics[:, 3:6] *= 0.1  # TRACE's midpoint steps are exact enough for slow spins
     dynamics[:, 9:] *= 0.1
-    moved = twisted.means + np.float32(0.3) * (twisted.motion_ids[:, None] == 1)
+    moved = twisted.gaussians.means + np.float32(0.3) * (twisted.gaussians.motion_ids[:, None] == 1)
     scene = twisted.with_arrays(dynamics=dynamics, canonical_means=moved.astype(np.float32))
     literal, rigid = (scene_player.frame(scene, 1.0, mode) for mode in ("rigid_paper", "rigid/representative"))
     np.testing.assert_allclose(literal.means, rigid.means, atol=1e-4)
@@ -183,15 +185,15 @@ def test_the_literal_form_is_rigid_where_the_object_only_moved_along(twisted):
 
 
 def test_an_anchored_background_goes_with_its_representative(twisted):
-    still = twisted.motion_ids == 0
+    still = twisted.gaussians.motion_ids == 0
     dynamics = twisted.dynamics.rates.copy()
     dynamics[still, :3] = [0.3, 0.0, -0.1]
     scene = twisted.with_arrays(dynamics=dynamics)
     pinned, anchored = (scene_player.frame(scene, 1.0, f"rigid_paper/{kind}") for kind in ("pinned", "anchored"))
-    np.testing.assert_array_equal(pinned.means[still], scene.means[still])
+    np.testing.assert_array_equal(pinned.means[still], scene.gaussians.means[still])
     moved = 0.25 * np.array([0.3, 0.0, -0.1])
-    np.testing.assert_allclose(anchored.means[still], scene.means[still] + moved, atol=1e-6)
-    body = scene.motion_ids == 1
+    np.testing.assert_allclose(anchored.means[still], scene.gaussians.means[still] + moved, atol=1e-6)
+    body = scene.gaussians.motion_ids == 1
     np.testing.assert_array_equal(anchored.means[body], pinned.means[body])
 
 

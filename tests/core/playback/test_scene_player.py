@@ -18,8 +18,8 @@ def scene():
 
 def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
     frame = scene_player.frame(scene, T_MAX)
-    np.testing.assert_array_equal(frame.means, scene.means)
-    np.testing.assert_array_equal(frame.quats, scene.quats)
+    np.testing.assert_array_equal(frame.means, scene.gaussians.means)
+    np.testing.assert_array_equal(frame.quats, scene.gaussians.quats)
     assert (frame.shading_factor == 1).all()
     assert (frame.group_quats == rotations.identity(len(scene.groups))).all()
     assert (frame.group_displacements == 0).all()
@@ -28,15 +28,15 @@ def test_the_bind_state_plays_at_t_max_to_the_bit(scene):
 def test_playback_is_continuous_at_t_max(scene):
     for t in (np.nextafter(T_MAX, 0.0), AFTER, T_MAX + 1e-9, T_MAX - 1e-9):
         frame = scene_player.frame(scene, t)
-        np.testing.assert_allclose(frame.means, scene.means, atol=1e-6)
+        np.testing.assert_allclose(frame.means, scene.gaussians.means, atol=1e-6)
         assert rotations.angle_between(frame.group_quats, rotations.identity(1)).max() < 1e-7
 
 
 def test_knots_are_met_exactly(scene):
-    for k, t in enumerate(scene.track_times):
+    for k, t in enumerate(scene.tracks.times):
         quats, displacements = scene_player.group_poses(scene, t)
-        np.testing.assert_allclose(displacements, scene.track_poses[:, k, 4:], atol=1e-12)
-        assert rotations.angle_between(quats, scene.track_poses[:, k, :4]).max() < 1e-7
+        np.testing.assert_allclose(displacements, scene.tracks.poses[:, k, 4:], atol=1e-12)
+        assert rotations.angle_between(quats, scene.tracks.poses[:, k, :4]).max() < 1e-7
 
 
 def test_before_the_first_time_the_first_pose_is_held(scene):
@@ -51,7 +51,7 @@ def test_between_knots_the_curve_is_smooth_and_near_the_motion(scene):
         true_quats, true, _, _ = models.curve(group.model, times - T_MAX)
         assert np.linalg.norm(displacements[:, group.id] - true, axis=-1).max() < 2e-3
         assert rotations.angle_between(quats[:, group.id], true_quats).max() < 2e-3
-    inner = scene.track_times[1:-1]
+    inner = scene.tracks.times[1:-1]
     before, at, after = (np.stack([scene_player.group_poses(scene, t + h)[1] for t in inner]) for h in (-1e-7, 0, 1e-7))
     np.testing.assert_allclose((at - before) / 1e-7, (after - at) / 1e-7, atol=1e-4)
 
@@ -64,8 +64,8 @@ def test_keys_at_the_knots_reproduce_playback(scene):
     quat_slopes, slopes = scene_player.knot_slopes(scene)
     times = np.linspace(0, T_MAX, 131)
     for g in range(len(scene.groups)):
-        location = key_reduction.Keys(scene.track_times, displacements[g], slopes[g], slopes[g])
-        rotation = key_reduction.Keys(scene.track_times, quats[g], quat_slopes[g], quat_slopes[g])
+        location = key_reduction.Keys(scene.tracks.times, displacements[g], slopes[g], slopes[g])
+        rotation = key_reduction.Keys(scene.tracks.times, quats[g], quat_slopes[g], quat_slopes[g])
         keyed = key_reduction.evaluate(location, times), key_reduction.evaluate(rotation, times, unit=True)
         played = [scene_player.group_poses(scene, t) for t in times]
         np.testing.assert_allclose(keyed[0], np.stack([p[1][g] for p in played]), atol=1e-12)
@@ -82,7 +82,7 @@ def test_slopes_are_exact_for_parabolas_on_uneven_times():
 
 
 def test_signs_in_the_file_do_not_matter(scene):
-    flipped = scene.track_poses.copy()
+    flipped = scene.tracks.poses.copy()
     flipped[:, ::2, :4] *= -1
     other = scene.with_arrays(track_poses=flipped)
     for t in (0.13, 0.5, 0.74):
@@ -93,21 +93,21 @@ def test_signs_in_the_file_do_not_matter(scene):
 @pytest.mark.parametrize("t", [0.0, 0.33, 0.9, 3.0])
 def test_every_group_moves_rigidly(scene, t):
     frame = scene_player.frame(scene, t)
-    for start, stop, g in row_runs.runs(scene.motion_ids):
-        before, after = scene.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
+        before, after = scene.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
         pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
         np.testing.assert_allclose(pairs[1], pairs[0], atol=2e-6)
         pivot, q, d = scene.groups[g].pivot, frame.group_quats[g], frame.group_displacements[g]
         np.testing.assert_allclose(after, pivot + rotations.rotate(q, before - pivot) + d, atol=1e-6)
-        own = rotations.multiply(q, scene.quats[start:stop].astype(float))
+        own = rotations.multiply(q, scene.gaussians.quats[start:stop].astype(float))
         assert rotations.angle_between(own, frame.quats[start:stop].astype(float)).max() < 1e-6
 
 
 def test_pinned_gaussians_never_change(scene):
-    still = scene.motion_ids == 0
+    still = scene.gaussians.motion_ids == 0
     for t in (0.0, 2.0):
         frame = scene_player.frame(scene, t)
-        np.testing.assert_array_equal(frame.means[still], scene.means[still])
+        np.testing.assert_array_equal(frame.means[still], scene.gaussians.means[still])
         assert (frame.shading_factor[still] == 1).all()
 
 
@@ -121,7 +121,7 @@ def test_a_follower_takes_its_leaders_displacement_without_turning(scene):
 
 def test_shading_follows_the_light_in_the_objects_frame(scene):
     frame = scene_player.frame(scene, 1.1)
-    row = int(np.flatnonzero(scene.motion_ids == 1)[0])
+    row = int(np.flatnonzero(scene.gaussians.motion_ids == 1)[0])
     rotmat = rotations.quats_to_rotmats(frame.group_quats[1])
     light = scene.shading.light
     expected = 1 + (rotmat.T @ light - light) @ scene.shading.vectors[row]
@@ -142,10 +142,10 @@ def test_scenes_without_gaussians_objects_or_motion_play():
     empty = make_scene(n=0, objects=0, unassigned=0)
     assert len(scene_player.frame(empty, 5.0).means) == 0
     still = make_scene(n=30, objects=0)
-    np.testing.assert_array_equal(scene_player.frame(still, 5.0).means, still.means)
+    np.testing.assert_array_equal(scene_player.frame(still, 5.0).means, still.gaussians.means)
     base = make_scene()
-    single = base.with_arrays(track_times=base.track_times[-1:], track_poses=base.track_poses[:, -1:])
-    np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.means)
+    single = base.with_arrays(track_times=base.tracks.times[-1:], track_poses=base.tracks.poses[:, -1:])
+    np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.gaussians.means)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e4])
@@ -154,13 +154,15 @@ def test_bodies_keep_their_shape_near_and_far_and_for_long(scene, shift, t):
     """Where the origin is the body's own place, to single precision of the body's size."""
     away = np.array([1.0, -1.0, 0.5]) * shift
     groups = tuple(dataclasses.replace(group, pivot=group.pivot + away) for group in scene.groups)
-    moved = dataclasses.replace(scene.with_arrays(means=(scene.means + away).astype(np.float32)), groups=groups)
+    moved = dataclasses.replace(
+        scene.with_arrays(means=(scene.gaussians.means + away).astype(np.float32)), groups=groups
+    )
     player = scene_player.Player(moved)
     _, displacements = player.group_poses(t)
-    for start, stop, g in row_runs.runs(moved.motion_ids):
+    for start, stop, g in row_runs.runs(moved.gaussians.motion_ids):
         if moved.groups[g].role == "body":
             frame = player.frame(t, moved.groups[g].pivot + displacements[g])
-            before, after = moved.means[start:stop].astype(float), frame.means[start:stop].astype(float)
+            before, after = moved.gaussians.means[start:stop].astype(float), frame.means[start:stop].astype(float)
             pairs = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
             apart = pairs[0] > 0.1
             assert np.abs(pairs[1] / np.where(apart, pairs[0], 1) - 1)[apart].max() < 1e-6

@@ -43,7 +43,7 @@ def test_fewer_ranks_keep_the_largest(posed):
 
 def test_more_groups_than_one_pass_holds_are_as_exact(posed):
     scene, _ = posed
-    many = np.arange(len(scene.means)) % (2 * coverage.CHANNELS + 3)
+    many = np.arange(len(scene.gaussians.means)) % (2 * coverage.CHANNELS + 3)
     found, parts = shares(posed, many, len(np.unique(many)))
     np.testing.assert_allclose(parts.sum(-1), picture(posed).alpha.numpy(), atol=1e-5)
     alone = np.where(many == 17, 17, -1)

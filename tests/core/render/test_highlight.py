@@ -23,7 +23,7 @@ def drawn(scene, t, background):
 
 def rows_of(scene, object_id):
     """The scene with nothing but one object's Gaussians."""
-    kept = scene.object_ids == object_id
+    kept = scene.gaussians.object_ids == object_id
     arrays = ("means", "quats", "log_scales", "opacity_logits", "sh", "object_ids", "motion_ids", "shading")
     cut = {name: scene.arrays()[name][kept] for name in arrays}
     return scene.with_arrays(**cut, identities=None)
@@ -62,11 +62,15 @@ def test_what_is_not_asked_for_is_gray_and_dim(scene):
 
 
 def test_an_object_is_alone_even_where_others_hide_it(scene):
-    toward = scene.means[scene.object_ids == 1].mean(0) - CAMERA.center
+    toward = scene.gaussians.means[scene.gaussians.object_ids == 1].mean(0) - CAMERA.center
     behind = [item for item in scene.objects if item.id == 1]
     wall = scene.with_arrays(
-        means=np.where((scene.object_ids == 3)[:, None], CAMERA.center + 0.5 * toward, scene.means).astype(np.float32),
-        log_scales=np.where((scene.object_ids == 3)[:, None], 0.0, scene.log_scales).astype(np.float32),
+        means=np.where(
+            (scene.gaussians.object_ids == 3)[:, None], CAMERA.center + 0.5 * toward, scene.gaussians.means
+        ).astype(np.float32),
+        log_scales=np.where((scene.gaussians.object_ids == 3)[:, None], 0.0, scene.gaussians.log_scales).astype(
+            np.float32
+        ),
     )
     before = highlight.isolate(scene, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
     after = highlight.isolate(wall, [behind[0].id], CAMERA, scene.t_max, backend=BACKEND)
@@ -87,7 +91,9 @@ def test_cameras_are_found_by_name_and_by_number(scene):
 
 def test_the_best_standpoint_sees_the_most_objects(scene):
     away = scenes.looking_camera([9.0, 0, 1], [1.0, 0, 0], 0.9, 48, 36, "away")
-    near = scenes.looking_camera(scene.means[scene.object_ids == 2].mean(0) + [0.4, 0, 0], [-1.0, 0, 0], 0.5, 48, 36)
+    near = scenes.looking_camera(
+        scene.gaussians.means[scene.gaussians.object_ids == 2].mean(0) + [0.4, 0, 0], [-1.0, 0, 0], 0.5, 48, 36
+    )
     among = [viewpoints.Standpoint(camera, 0.3) for camera in (away, near, scenes.orbit_camera(0.3))]
     ids = [item.id for item in scene.objects if item.id > 0]
     assert viewpoints.best(scene, among, ids, backend=BACKEND) is among[2]
@@ -111,9 +117,11 @@ def test_candidates_are_cameras_at_times(scene):
 def test_a_scene_without_cameras_is_seen_from_above_its_side(convention):
     scene = scenes.make_scene(n=400, objects=3, seed=2, world_convention=convention)
     turn = cameras.WORLD_TO_BLENDER[convention].T
-    turned = dataclasses.replace(scene.with_arrays(means=(scene.means @ turn.T).astype(np.float32)), cameras=())
+    turned = dataclasses.replace(
+        scene.with_arrays(means=(scene.gaussians.means @ turn.T).astype(np.float32)), cameras=()
+    )
     camera = viewpoints.overview(turned)
-    pixels, depth = cameras.project(camera, turned.means[turned.object_ids > 0].astype(np.float64))
+    pixels, depth = cameras.project(camera, turned.gaussians.means[turned.gaussians.object_ids > 0].astype(np.float64))
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
     assert inside.mean() > 0.95
     rotation = camera.T_cam_world[:3, :3]

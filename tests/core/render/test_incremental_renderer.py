@@ -83,13 +83,13 @@ def test_where_almost_all_moves_everything_is_drawn(scene, made):
     for shift in (0.0, 0.1, 0.2):
         matrix = np.eye(4)
         matrix[0, 3] = shift
-        assert_shows(theatre, scene, [Instance(0, len(scene.means), matrix)], CAMERA)
+        assert_shows(theatre, scene, [Instance(0, len(scene.gaussians.means), matrix)], CAMERA)
     assert not made
 
 
 def test_bodies_at_equal_depths_keep_their_order_whoever_moves():
     scene = scenes.make_scene(n=900, seed=3)
-    flat = scene.with_arrays(means=scene.means * np.array([1, 1, 0], np.float32))
+    flat = scene.with_arrays(means=scene.gaussians.means * np.array([1, 1, 0], np.float32))
     above = scenes.looking_camera((0, 0, 5.0), (0, 0, -1.0), 0.8, 80, 72, up=(0, 1.0, 0))
     instances = group_instances(flat, 1.0)
     instances = [Instance(one.start, one.count, np.eye(4)) for one in instances]
@@ -169,10 +169,10 @@ def test_a_light_turns_with_its_world_and_not_with_what_moves_in_it(pair):
 def test_a_tint_is_that_of_the_harmonics(degree):
     scene = scenes.make_scene(n=300, sh_degree=degree, seed=5)
     tint, c0 = np.array([0.3, 1.5, 0.0]), 0.28209479177387814
-    sh = tint * scene.sh.astype(np.float64)
-    sh[:, 0] = (tint * (0.5 + c0 * scene.sh[:, 0]) - 0.5) / c0
+    sh = tint * scene.gaussians.sh.astype(np.float64)
+    sh[:, 0] = (tint * (0.5 + c0 * scene.gaussians.sh[:, 0]) - 0.5) / c0
     painted = scene.with_arrays(sh=sh.astype(np.float32))
-    n = len(scene.means)
+    n = len(scene.gaussians.means)
     one = incremental_renderer.Stage(scene).render([Instance(0, n, np.eye(4), tint=tuple(tint))], CAMERA)
     other = incremental_renderer.Stage(painted).render([Instance(0, n, np.eye(4))], CAMERA)
     np.testing.assert_allclose(one.color.numpy(), other.color.numpy(), atol=1e-5)

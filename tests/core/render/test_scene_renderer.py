@@ -33,7 +33,7 @@ def matrix(rotation=(1.0, 0, 0, 0), translation=(0.0, 0, 0), scale=1.0):
 
 
 def whole(scene, transform):
-    return [Instance(0, len(scene.means), transform)]
+    return [Instance(0, len(scene.gaussians.means), transform)]
 
 
 def image(scene, pose, camera=CAMERA, **options):
@@ -43,7 +43,7 @@ def image(scene, pose, camera=CAMERA, **options):
 def group_instances(scene, t):
     quats, displacements = scene_player.group_poses(scene, t)
     result = []
-    for start, stop, g in row_runs.runs(scene.motion_ids):
+    for start, stop, g in row_runs.runs(scene.gaussians.motion_ids):
         pivot = scene.groups[g].pivot
         transform = matrix(quats[g])
         transform[:3, 3] = pivot + displacements[g] - transform[:3, :3] @ pivot
@@ -60,9 +60,9 @@ def test_instances_at_the_groups_poses_render_like_playback(scene, t):
 
 def test_identity_instances_are_the_bind_state(scene):
     posed = scene_renderer.pose_instances(scene, whole(scene, np.eye(4)))
-    np.testing.assert_array_equal(posed.means, scene.means)
-    np.testing.assert_allclose(posed.quats, scene.quats, atol=1e-6)
-    np.testing.assert_array_equal(posed.log_scales, scene.log_scales)
+    np.testing.assert_array_equal(posed.means, scene.gaussians.means)
+    np.testing.assert_allclose(posed.quats, scene.gaussians.quats, atol=1e-6)
+    np.testing.assert_array_equal(posed.log_scales, scene.gaussians.log_scales)
     np.testing.assert_array_equal(posed.shading_factor, 1)
 
 
@@ -87,7 +87,10 @@ def test_shapes_follow_any_linear_map(scene):
         transform = np.eye(4)
         transform[:3, :3] = linear
         posed = scene_renderer.pose_instances(scene, whole(scene, transform))
-        before, after = covariances(scene.quats, scene.log_scales), covariances(posed.quats, posed.log_scales)
+        before, after = (
+            covariances(scene.gaussians.quats, scene.gaussians.log_scales),
+            covariances(posed.quats, posed.log_scales),
+        )
         expected = linear @ before @ linear.T
         np.testing.assert_allclose(after, expected, atol=1e-5 * np.abs(expected).max())
         np.testing.assert_allclose(np.linalg.norm(posed.quats, axis=-1), 1, atol=1e-6)
@@ -139,7 +142,7 @@ def test_every_array_takes_the_same_rows(scene, cuts):
     rows = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in ranges)])
     for name in ("means", "log_scales", "opacity_logits", "sh", "object_ids"):
         np.testing.assert_array_equal(getattr(posed, name), scene.arrays()[name][rows])
-    np.testing.assert_allclose(posed.quats, scene.quats[rows], atol=1e-6)
+    np.testing.assert_allclose(posed.quats, scene.gaussians.quats[rows], atol=1e-6)
     assert len(posed.pose_ids) == len(posed.shading_factor) == len(rows)
 
 
@@ -193,7 +196,7 @@ def test_neither_dark_colours_nor_turned_shading_give_light(scene):
         shading=rng.normal(scale=3.0, size=(300, 3)).astype(np.float32),
     )
     frame = scene_player.frame(dark, 0.1)
-    rgb = 0.5 + 0.28209479177387814 * dark.sh[:, 0].astype(np.float64)
+    rgb = 0.5 + 0.28209479177387814 * dark.gaussians.sh[:, 0].astype(np.float64)
     rotmats = rotations.quats_to_rotmats(frame.group_quats)[frame.motion_ids]
     factor = 1 + ((np.swapaxes(rotmats, 1, 2) @ dark.shading.light - dark.shading.light) * dark.shading.vectors).sum(-1)
     assert ((rgb < 0).any(-1) & (factor < 0)).any()
@@ -206,8 +209,10 @@ def test_neither_dark_colours_nor_turned_shading_give_light(scene):
 def moved_away(scene, shift):
     """The scene and its camera somewhere else, with centres that float32 holds there to the bit."""
     groups = tuple(dataclasses.replace(group, pivot=group.pivot + shift) for group in scene.groups)
-    far = dataclasses.replace(scene.with_arrays(means=(scene.means + shift).astype(np.float32)), groups=groups)
-    assert (far.means.astype(np.float64) - shift == scene.means).all()
+    far = dataclasses.replace(
+        scene.with_arrays(means=(scene.gaussians.means + shift).astype(np.float32)), groups=groups
+    )
+    assert (far.gaussians.means.astype(np.float64) - shift == scene.gaussians.means).all()
     T_cam_world = CAMERA.T_cam_world.copy()
     T_cam_world[:3, 3] -= T_cam_world[:3, :3] @ shift
     return far, dataclasses.replace(CAMERA, T_cam_world=T_cam_world)
@@ -216,7 +221,7 @@ def moved_away(scene, shift):
 @pytest.mark.parametrize("t", [0.31, scenes.T_MAX, 1.2])
 def test_a_picture_far_from_the_origin_is_the_one_near_it(t):
     scene = scenes.make_scene(n=300, sh_degree=2, seed=3)
-    scene = scene.with_arrays(means=(np.round(scene.means * 64) / 64).astype(np.float32))
+    scene = scene.with_arrays(means=(np.round(scene.gaussians.means * 64) / 64).astype(np.float32))
     far, camera = moved_away(scene, np.array([1e5, -1e5, 65536.0]))
     near = image(scene, scene_player.frame(scene, t))
     sharp = image(far, scene_player.frame(far, t, origin=camera.center), camera)
@@ -232,11 +237,11 @@ def test_a_picture_far_from_the_origin_is_the_one_near_it(t):
 def test_harmonics_follow_what_turns_on_its_own():
     """Bodies whose members all have the twist of their body look alike whichever of them carries the harmonics."""
     scene = scenes.make_scene(n=300, sh_degree=2, seed=3, shadows=False)
-    dynamics = np.zeros((len(scene.means), 12), np.float32)
+    dynamics = np.zeros((len(scene.gaussians.means), 12), np.float32)
     spin = np.array([0.0, 1.0, 2.5])
     for group in scene.groups[1:]:
-        rows = np.flatnonzero(scene.motion_ids == group.id)
-        dynamics[rows, :3] = np.cross(spin, scene.means[rows] - group.pivot)
+        rows = np.flatnonzero(scene.gaussians.motion_ids == group.id)
+        dynamics[rows, :3] = np.cross(spin, scene.gaussians.means[rows] - group.pivot)
         dynamics[rows, 3:6] = spin
     scene = scene.with_arrays(dynamics=dynamics)
     together = image(scene, scene_player.frame(scene, 1.2, "rigid/median"))

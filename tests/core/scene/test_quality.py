@@ -23,7 +23,7 @@ def path(scene, tmp_path):
 
 def evaluation(of, **changes):
     splits = {"val": {"rigid": {"psnr": 31.25}}, "test": {"rigid": {"psnr": 28.5}}}
-    return {"scene": of.name, "train": {"gaussians": len(of.means)}, "splits": splits, **changes}
+    return {"scene": of.name, "train": {"gaussians": len(of.gaussians.means)}, "splits": splits, **changes}
 
 
 def write(place, content, later=10.0):
@@ -72,7 +72,7 @@ def test_the_rigid_motions_error_is_weighted_by_gaussians_and_a_share_of_the_siz
     groups = list(scene.groups)
     groups[1] = dataclasses.replace(groups[1], rigid_rms=0.3, rigid_max=0.5)
     bent = dataclasses.replace(scene, groups=tuple(groups))
-    share = np.mean(scene.motion_ids == 1)
+    share = np.mean(scene.gaussians.motion_ids == 1)
     found = quality.of(bent)
     assert found.rigid_rms == pytest.approx(0.3 * np.sqrt(share) / scene.extent)
     assert "%" in found.text() and "picture error not measured" in found.text()

@@ -119,7 +119,7 @@ def test_a_file_keeps_its_near_plane_and_one_without_has_the_default(scene, path
 
 def test_a_scene_without_gaussians_is_a_scene(tmp_path):
     empty = make_scene(n=0, objects=0, unassigned=0)
-    assert len(scene_file.read(scene_file.write(empty, tmp_path / "empty.r5dgs")).means) == 0
+    assert len(scene_file.read(scene_file.write(empty, tmp_path / "empty.r5dgs")).gaussians.means) == 0
 
 
 def test_playback_from_the_file_is_within_rounding(scene, path):
@@ -132,16 +132,18 @@ def test_playback_from_the_file_is_within_rounding(scene, path):
 
 
 def test_values_beyond_the_fixed_point_are_stored_in_full(scene, tmp_path):
-    wide = scene.with_arrays(log_scales=scene.log_scales - 40, opacity_logits=scene.opacity_logits + 1e4)
+    wide = scene.with_arrays(
+        log_scales=scene.gaussians.log_scales - 40, opacity_logits=scene.gaussians.opacity_logits + 1e4
+    )
     back = scene_file.read(scene_file.write(wide, tmp_path / "wide.r5dgs"))
-    np.testing.assert_array_equal(back.log_scales, wide.log_scales)
-    np.testing.assert_array_equal(back.opacity_logits, wide.opacity_logits)
+    np.testing.assert_array_equal(back.gaussians.log_scales, wide.gaussians.log_scales)
+    np.testing.assert_array_equal(back.gaussians.opacity_logits, wide.gaussians.opacity_logits)
 
 
 def test_forty_thousand_gaussians_stay_small(tmp_path):
     large = make_scene(n=40_000, objects=6)
     assert scene_file.write(large, tmp_path / "large.r5dgs").stat().st_size < 2.9e6
-    plain = dataclasses.replace(large, identities=None, shading=None)
+    plain = dataclasses.replace(large, gaussians=dataclasses.replace(large.gaussians, identities=None), shading=None)
     assert scene_file.write(plain, tmp_path / "plain.r5dgs").stat().st_size < 1.6e6
 
 
@@ -374,7 +376,9 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing(scene, tmp_path, m
 
 def test_inconsistent_scenes_are_not_written(scene, tmp_path):
     path = tmp_path / "scene.r5dgs"
-    bad = scene.with_arrays(means=np.where(np.arange(300)[:, None] == 5, np.nan, scene.means).astype(np.float32))
+    bad = scene.with_arrays(
+        means=np.where(np.arange(300)[:, None] == 5, np.nan, scene.gaussians.means).astype(np.float32)
+    )
     with pytest.raises(errors.SceneFileError, match="not written.*means"):
         scene_file.write(bad, path)
     with pytest.raises(errors.SceneFileError, match="provenance"):
@@ -457,7 +461,7 @@ def test_checking_many_groups_takes_calls_in_proportion_to_their_number(monkeypa
 
 
 def test_residual_rows_whose_differences_overflow_are_not_increasing(scene):
-    rows, knots = np.array([1, -(2**31)], np.int32), len(scene.track_times)
+    rows, knots = np.array([1, -(2**31)], np.int32), len(scene.tracks.times)
     wild = scene.with_arrays(
         residual_rows=rows,
         residual_offsets=np.zeros((2, knots, 3), np.float32),

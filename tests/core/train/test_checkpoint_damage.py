@@ -152,7 +152,7 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(
     else:
         newest.unlink()
     assert checkpoint.load(newest.parent).iteration < stopped
-    assert len(bake.bake(tiny_datasets.as_trained(checkpoint.open_run(newest.parent))).means) > 0
+    assert len(bake.bake(tiny_datasets.as_trained(checkpoint.open_run(newest.parent))).gaussians.means) > 0
     caplog.clear()
     assert main.main(["train", str(tiny.root), "--out", str(newest.parent), "--resume", "--progress", "none"]) == 0
     told = [record.getMessage() for record in caplog.records if "checkpoint before it" in record.getMessage()]

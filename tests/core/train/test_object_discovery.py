@@ -102,8 +102,8 @@ def test_a_resumed_run_keeps_the_masks_that_it_began_with(unmasked, tiny, tmp_pa
     assert [item.name for item in scene.objects] == ["background", "object 1", "object 2"]
     assert scene.provenance["discovered"] and scene.classifier is None
     shadows = {group.id for group in scene.groups if group.role == "shadow"}
-    bodies = ~np.isin(scene.motion_ids, list(shadows))
-    np.testing.assert_array_equal(scene.object_ids[bodies], scene.motion_ids[bodies])
+    bodies = ~np.isin(scene.gaussians.motion_ids, list(shadows))
+    np.testing.assert_array_equal(scene.gaussians.object_ids[bodies], scene.gaussians.motion_ids[bodies])
 
 
 def test_the_short_run_is_that_of_the_run_it_is_for(unmasked):

@@ -206,7 +206,7 @@ def test_an_object_that_one_mask_names_is_background_with_a_warning(data, tmp_pa
     assert "object 9" in caplog.text and "Remedy" in caplog.text
     scene = bake.bake(done, datasets.read(data))
     assert [entry.id for entry in scene.objects] == [0, 1, 2]
-    assert np.isfinite(scene.track_poses).all() and np.isfinite(scene.means).all()
+    assert np.isfinite(scene.tracks.poses).all() and np.isfinite(scene.gaussians.means).all()
 
 
 def test_an_object_of_a_single_pixel_is_no_obstacle(data, tmp_path):

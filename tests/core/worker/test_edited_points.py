@@ -45,8 +45,12 @@ def entry(key):
 
 
 def scattered(scene, rows):
-    means = scene.means[rows] + np.random.default_rng(0).normal(scale=0.2, size=(len(rows), 3)).astype(np.float32)
-    return PointEdit(rows, means, None, 2 * np.exp(scene.log_scales[rows]), None, 0.5 * scene.sh[rows, 1:4])
+    means = scene.gaussians.means[rows] + np.random.default_rng(0).normal(scale=0.2, size=(len(rows), 3)).astype(
+        np.float32
+    )
+    return PointEdit(
+        rows, means, None, 2 * np.exp(scene.gaussians.log_scales[rows]), None, 0.5 * scene.gaussians.sh[rows, 1:4]
+    )
 
 
 def test_edited_points_are_drawn_beside_untouched_rows(path, scene):

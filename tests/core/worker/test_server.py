@@ -74,7 +74,7 @@ def test_a_rendered_time_is_the_cores_picture(path):
     expected = scene_renderer.render_frame(scene, scene_player.frame(scene, 0.9, origin=CAMERA.center), CAMERA)
     request = {"command": "render", "camera": CAMERA_JSON, "t": 0.9, "want": ["depth", "alpha", "ids"]}
     _, (header, arrays) = talk(load(path), request)
-    assert header["ok"] and header["result"]["gaussians"] == len(scene.means)
+    assert header["ok"] and header["result"]["gaussians"] == len(scene.gaussians.means)
     for name in ("color", "depth", "alpha", "ids"):
         np.testing.assert_array_equal(arrays[name], getattr(expected, name).numpy())
 
@@ -250,7 +250,7 @@ def test_a_warm_up_that_fails_after_it_was_announced_ends_with_the_reason(monkey
 def test_what_is_known_of_the_error_comes_with_the_picture(path, tmp_path):
     scene = scene_file.read(path)
     rows = np.arange(20, 40, dtype=np.int32)
-    shape = (len(rows), len(scene.track_times))
+    shape = (len(rows), len(scene.tracks.times))
     offsets = np.full((*shape, 3), 0.1, np.float32)
     offsets[:, -1] = 0
     bent = dataclasses.replace(

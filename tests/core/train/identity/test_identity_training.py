@@ -361,7 +361,7 @@ def test_pixels_of_the_trained_scene_belong_to_the_objects_of_the_masks(baked, t
 
 def test_members_of_an_object_lie_where_it_is(baked, tiny):
     for k in (1, 2):
-        members = baked.means[baked.object_ids == k]
+        members = baked.gaussians.means[baked.gaussians.object_ids == k]
         assert len(members) > 50
         distances = np.linalg.norm(members - tiny.center(k, 0.75), axis=1)
         assert np.quantile(distances, 0.9) < 0.85  # half a diagonal of the brick is 0.72

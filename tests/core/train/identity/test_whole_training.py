@@ -49,9 +49,14 @@ def test_a_run_hands_its_identities_to_the_scene(tiny, tmp_path, training):
     finished = run.train(tiny.root, tmp_path / "run", settings)
     scene = bake.bake(tiny_datasets.as_trained(finished), datasets.read(tiny.root))
     if training == "off":
-        assert scene.identities is None and scene.classifier is None
+        assert scene.gaussians.identities is None and scene.classifier is None
         return
-    assert scene.identities.shape == (len(scene.means), 16) and scene.classifier.weight.shape == (3, 16)
-    answers = (scene.identities.astype(np.float32) @ scene.classifier.weight.T + scene.classifier.bias).argmax(1)
-    agreement = (answers == np.maximum(scene.object_ids, 0)).mean()
+    assert scene.gaussians.identities.shape == (len(scene.gaussians.means), 16) and scene.classifier.weight.shape == (
+        3,
+        16,
+    )
+    answers = (
+        scene.gaussians.identities.astype(np.float32) @ scene.classifier.weight.T + scene.classifier.bias
+    ).argmax(1)
+    agreement = (answers == np.maximum(scene.gaussians.object_ids, 0)).mean()
     assert agreement > (0.5 if training == "joint" else 0.8)

@@ -328,7 +328,7 @@ def test_what_the_user_switches_off_does_not_come_back_as_residuals(made, tiny):
     def travel(*overrides: str) -> float:
         changed = dataclasses.replace(made, config=made.config.override(overrides))
         scene = bake.bake(changed, data)
-        mine = scene.object_ids == body
+        mine = scene.gaussians.object_ids == body
         early, late = (scene_player.frame(scene, t).means[mine].mean(0) for t in (0.0, scene.t_max))
         return float(np.linalg.norm(late - early))
 

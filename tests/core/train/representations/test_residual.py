@@ -279,7 +279,7 @@ def test_what_breathes_is_found_and_what_is_rigid_keeps_no_residuals(breathing):
     assert tensors["residual.gains"][BALL - 1] > 0.5 > tensors["residual.gains"][BRICK - 1]
     row = next(row for row in scene.needs if row["name"] == "residuals")
     assert row["decision"] == "on" and "ball (+" in row["reason"] and "1 of 2 objects are rigid" in row["reason"]
-    assert set(scene.motion_ids[scene.residuals.rows].tolist()) == {BALL}
+    assert set(scene.gaussians.motion_ids[scene.residuals.rows].tolist()) == {BALL}
     assert scene.groups[BRICK].rigid_rms == scene.groups[BRICK].rigid_max == 0
     assert 0.02 < scene.groups[BALL].rigid_rms < scene.groups[BALL].rigid_max < 1
 
@@ -305,7 +305,7 @@ def test_residuals_bring_the_images_of_what_breathes_closer(breathing):
 def test_the_ball_grows_and_shrinks_as_it_did(breathing):
     data, _, scene = breathing
     rows = scene.residuals.rows
-    arms = scene.means[rows] - scene.groups[BALL].pivot
+    arms = scene.gaussians.means[rows] - scene.groups[BALL].pivot
     far = np.linalg.norm(arms, axis=1) > 0.2
     sizes = [np.linalg.norm(arms[far] + scene.residuals.offsets[far, s], axis=1).mean() for s in range(6)]
     true = 1 + 0.35 * np.sin(2 * np.pi * (tiny_datasets.T_MAX - tiny_datasets.OBSERVED) / 0.6)
@@ -326,17 +326,20 @@ def test_the_scene_shows_what_was_trained_and_then_keeps_its_last_shape(breathin
             -10 * np.log10(np.mean((shown - expected) ** 2)) > 45
         )  # the noise of a track that does not turn is left out
     later = scene_player.frame(scene, scene.t_max + 0.3)
-    rows = scene.motion_ids == BALL
-    gaps = [np.linalg.norm(np.diff(m[rows].astype(np.float64), axis=0), axis=1) for m in (scene.means, later.means)]
+    rows = scene.gaussians.motion_ids == BALL
+    gaps = [
+        np.linalg.norm(np.diff(m[rows].astype(np.float64), axis=0), axis=1)
+        for m in (scene.gaussians.means, later.means)
+    ]
     np.testing.assert_allclose(gaps[1], gaps[0], atol=1e-5)
-    assert np.array_equal(later.log_scales, scene.log_scales)
+    assert np.array_equal(later.log_scales, scene.gaussians.log_scales)
 
 
 def test_a_scene_may_be_baked_without_residuals(breathing, tmp_path):
     _, done, scene = breathing
     plain = bake.run_bake(done.folder, tmp_path / "plain.r5dgs", None, ["needs.residuals=off"])
     assert plain.residuals is None and plain.groups[BALL].rigid_max == 0
-    assert np.array_equal(plain.means, scene.means)
+    assert np.array_equal(plain.gaussians.means, scene.gaussians.means)
     row = next(row for row in plain.needs if row["name"] == "residuals")
     assert row["decision"] == "off" and row["reason"].startswith("set off by you")
 

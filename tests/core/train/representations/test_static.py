@@ -72,7 +72,7 @@ def test_a_scene_at_rest_has_nothing_that_moves_in_run_file_and_memory(still, tm
     assert {decisions[name] for name in ("tracks", "rotation", "shading", "shadows", "residuals")} == {"off"}
     assert [o.name for o in scene.objects] == ["background", "brick", "ball"]
     assert all(group.model.is_static for group in scene.groups)
-    np.testing.assert_array_equal(scene_player.frame(scene, 7.0).means, scene.means)
+    np.testing.assert_array_equal(scene_player.frame(scene, 7.0).means, scene.gaussians.means)
 
 
 def test_what_moves_a_little_is_seen(still, tiny):
