@@ -81,7 +81,8 @@ def _menu_import(menu, context):
 
 
 def _menu_export(menu, context):
-    menu.layout.operator(export_ply.R5DGS_OT_export_ply.bl_idname, text="R5DGS Gaussians (.ply)")
+    gaussians = f"R5DGS {export_ply.FORMAT.label} ({export_ply.FORMAT.suffix})"
+    menu.layout.operator(export_ply.R5DGS_OT_export_ply.bl_idname, text=gaussians)
     menu.layout.operator(export_scene.R5DGS_OT_export_scene.bl_idname, text="R5DGS Edited Scene (.r5dgs)")
     menu.layout.operator(export_masks.R5DGS_OT_export_masks.bl_idname, text="R5DGS Object Masks")
     menu.layout.operator(export_cameras.R5DGS_OT_export_cameras.bl_idname, text="R5DGS Cameras")

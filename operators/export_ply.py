@@ -8,6 +8,9 @@ from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 from ..r5dgs_addon.export import frame_range, gaussians
 from ..r5dgs_addon.scene import loaded_scenes, selection
 from ..r5dgs_addon.ui import stepwise_operator
+from ..r5dgs_core.formats import registry
+
+FORMAT = registry.get("ply")
 
 
 class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
@@ -18,7 +21,7 @@ class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
     bl_options = {"REGISTER", "PRESET"}
 
     filepath: StringProperty(name="File", description="The .ply file", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: StringProperty(default=f"*{FORMAT.suffix}", options={"HIDDEN"})
     check_existing: BoolProperty(default=True, options={"HIDDEN"})
     which: EnumProperty(name="Objects", description="Objects to export", items=gaussians.WHICH, default="VISIBLE")
     frames: EnumProperty(name="Frames", description="Frames to export", items=frame_range.FRAMES)
@@ -42,13 +45,17 @@ class R5DGS_OT_export_ply(stepwise_operator.Running, bpy.types.Operator):
     def suggest(self, context):
         if not self.filepath:
             stem = Path(bpy.data.filepath).stem or "gaussians"
-            self.filepath = str(Path(bpy.path.abspath("//")) / f"{stem}.ply") if bpy.data.filepath else f"{stem}.ply"
+            self.filepath = (
+                str(Path(bpy.path.abspath("//")) / f"{stem}{FORMAT.suffix}")
+                if bpy.data.filepath
+                else f"{stem}{FORMAT.suffix}"
+            )
         return False
 
     def steps(self, context):
         return gaussians.ply_steps(
             context,
-            self.target_file(".ply"),
+            self.target_file(FORMAT.suffix),
             self.which,
             axes=self.axes,
             plain=self.plain,

@@ -77,6 +77,7 @@ ALLOWED = {
         "config",
         "playback",
         "render",
+        "formats",
         "importing",
         "evaluation",
         "language",
@@ -93,7 +94,7 @@ ALLOWED = {
 # Modules that may import modules of the project inside functions: the command line, which starts fast, and the worker,
 # which answers before torch is there and if it is missing.
 LATE_MODULES = {
-    *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.info", "cli.masks"),
+    *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.export", "cli.info", "cli.masks"),
     *("cli.objects", "cli.language", "check", "check.run", "cli.demo", "stability.training"),
     *("worker.server", "worker.requests"),
 }

@@ -41,8 +41,3 @@ def go_to(scene: bpy.types.Scene, frame: int) -> None:
     """Go to a whole frame. If it is the current one, keep its sub-frame and edits without keyframes."""
     if frame != scene.frame_current:
         scene.frame_set(frame)
-
-
-def numbered(path, frame: int):
-    """Insert the frame number into a path: scene.ply -> scene_0012.ply."""
-    return path.with_name(f"{path.stem}_{frame:04d}{path.suffix}")

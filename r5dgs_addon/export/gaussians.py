@@ -8,7 +8,7 @@ import numpy as np
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.editing import point_edits
-from ...r5dgs_core.formats import ply
+from ...r5dgs_core.formats import ply, registry
 from ...r5dgs_core.playback import affine_transform
 from ...r5dgs_core.playback.residuals import Residuals
 from ...r5dgs_core.scene import cameras, scene_file
@@ -207,7 +207,7 @@ def ply_steps(
     frames, most, clouds = frame_range.frames_of(scene, every, step), 0, set()
     with frame_range.frame_kept(scene):
         for number, frame in enumerate(frames):
-            target = frame_range.numbered(path, frame) if every else path
+            target = registry.numbered(path, frame) if every else path
             yield Step(number, len(frames), target.name)
             frame_range.go_to(scene, frame)
             splats, names = splats_of(context, wanted, axes, sources)

@@ -1,5 +1,5 @@
-"""The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, info, check, objects,
-lookup, query, name, config, warm-up.
+"""The ``r5dgs`` command: demo, train, masks, associate, bake, import, evaluate, report, bench, export, info, check,
+objects, lookup, query, name, config, warm-up.
 
 Modules: `parser` defines the arguments, `runs` and its neighbours run the commands, `exit_status` maps errors.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .. import errors, terminal
-from . import exit_status, parser, runs
+from . import exit_status, export, parser, runs
 from . import options as cli_options
 from .exit_status import ExitStatus
 
@@ -203,6 +203,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], ExitStatus | None]] = {
     "evaluate": _evaluate,
     "report": _report,
     "bench": _bench,
+    "export": export.run,
     "info": _info,
     "check": _check,
     "objects": _objects,

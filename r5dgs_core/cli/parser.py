@@ -9,7 +9,7 @@ from typing import Any
 from .. import __version__
 from ..bench import variants
 from ..playback import modes
-from . import options
+from . import export, options
 
 TASKS = ("dynamics", "poses", "images", "raster")  # of `error_vs_time.report_rows`
 SPLITS = ("train", "val", "test")  # of `data.dataset`
@@ -239,6 +239,18 @@ def _bench(commands: Any) -> None:
     options.add_settings(p)
 
 
+def _export(commands: Any) -> None:
+    p = _command(
+        commands,
+        "export",
+        "write a scene in a format of other programs",
+        "Write the Gaussians of a scene at a time or for a range of frames as PLY, or its cameras as transforms.json.",
+        "scene.r5dgs --to ply --out frame.ply --frames 1:60",
+        "user/export.md",
+    )
+    export.add_arguments(p)
+
+
 def _info(commands: Any) -> None:
     p = _command(
         commands,
@@ -378,5 +390,5 @@ def _warm_up(commands: Any) -> None:
 
 _COMMANDS = (
     *(_demo, _train, _masks, _associate, _bake, _import, _evaluate, _report, _bench),
-    *(_info, _check, _objects, _lookup, _query, _name, _config, _warm_up),
+    *(_export, _info, _check, _objects, _lookup, _query, _name, _config, _warm_up),
 )

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .. import atomic_files
+from .. import atomic_files, errors
 from ..motion import rotations
 from ..scene import cameras
 from ..scene.cameras import Camera
+from ..scene.scene import Scene
+from . import registry
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,31 @@ def write_transforms(path: str | Path, views: Sequence[View]) -> Path:
     head = "".join(f"{json.dumps(key)}: {json.dumps(value)},\n " for key, value in shared.items())
     atomic_files.write(path, ("{" + head + '"frames": [\n' + ",\n".join(rows) + "\n]}\n").encode())
     return Path(path)
+
+
+def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
+    """Write every camera of a scene at each time, in the data set's world. Implements `registry.Format.write`.
+
+    Images are named as in Blender's export of all cameras: ``images/CAMERA/0001.png`` with frame numbers, else
+    ``images/CAMERA.png``.
+    """
+    views = []
+    for number, t in enumerate(options.times):
+        end = ".png" if options.frames is None else f"/{options.frames[number]:04d}.png"
+        views += [View(f"images/{c.name}{end}", cameras.moved(c, scene.origin), t) for c in scene.cameras]
+    if not views:
+        raise errors.ConfigError(f"{scene.name}: expected cameras in the scene, found none; train it from a data set")
+    yield write_transforms(path, views)
+
+
+FORMAT = registry.Format(
+    name="cameras",
+    label="Cameras",
+    suffix=".json",
+    keeps="lens, pose and time of every camera of the data set, as transforms.json of NeRF and D-NeRF",
+    loses="everything but cameras",
+    write=export,
+)
 
 
 def write_colmap(folder: str | Path, views: Sequence[View]) -> Path:

@@ -8,6 +8,7 @@ encoding) and obj_id. Other columns and elements are skipped.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,8 +16,12 @@ import numpy as np
 
 from .. import atomic_files, errors, findings
 from ..motion import rotations
+from ..playback import played_splats
+from ..playback.scene_player import Player
 from ..scene import validation
+from ..scene.scene import Scene
 from ..scene.splats import Splats
+from . import registry
 
 _TYPES = {
     "char": "i1",
@@ -71,6 +76,24 @@ def write(splats: Splats, path: str | Path, *, plain: bool = False, origin: np.n
     except OSError as error:
         raise errors.SceneFileError(f"{path}: cannot be written: {error}") from error
     return path
+
+
+def export(scene: Scene, path: Path, options: registry.Options) -> Iterator[Path]:
+    """Write the Gaussians at each time, in the world of the scene file. Implements `registry.Format.write`."""
+    player = Player(scene)
+    for t, target in zip(options.times, FORMAT.paths(path, options), strict=True):
+        yield write(played_splats.at(player, t, options.object_ids), target, origin=scene.origin)
+
+
+FORMAT = registry.Format(
+    name="ply",
+    label="Gaussians",
+    suffix=".ply",
+    keeps="Gaussians of one time with their shading, object ids and identity encodings; one file per frame",
+    loses="motion between frames, names of objects, sky, cameras",
+    write=export,
+    per_frame=True,
+)
 
 
 def read(path: str | Path, guard: findings.Guard = findings.STRICT) -> Splats:

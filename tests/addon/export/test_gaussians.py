@@ -6,6 +6,7 @@ import importlib
 import numpy as np
 import pytest
 
+from r5dgs_core.cli import export as export_command
 from r5dgs_core.formats import ply
 from r5dgs_core.playback import scene_player
 from r5dgs_core.render import scene_renderer
@@ -325,3 +326,21 @@ def test_a_path_that_names_no_file_is_refused_and_none_is_written_beside_it(blen
         with pytest.raises(RuntimeError, match="export: expected a .* file, got .*; give it a name"):
             getattr(blender.ops.r5dgs, operator)(filepath=path)
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("frame", [1, 30, 46, 60])
+def test_the_command_writes_the_gaussians_that_blender_exports(blender, loaded, tmp_path, frame):
+    blender.context.scene.frame_set(frame)
+    theirs = export(blender, tmp_path / "blender.ply", axes="FILE")
+    (path,) = export_command.run_export(
+        tmp_path / "scene.r5dgs", "ply", tmp_path / "command.ply", t=(frame - 1) / loaded.r5dgs.frames_per_unit
+    )
+    ours = ply.read(path)
+    assert len(ours.means) == len(theirs.means)
+    first, second = (np.lexsort((s.opacity_logits, s.object_ids)) for s in (ours, theirs))
+    for name in ("object_ids", "opacity_logits", "identities"):
+        np.testing.assert_array_equal(getattr(ours, name)[first], getattr(theirs, name)[second])
+    for name in ("means", "log_scales", "sh"):
+        np.testing.assert_allclose(getattr(ours, name)[first], getattr(theirs, name)[second], atol=2e-4, err_msg=name)
+    same = np.abs((ours.quats[first] * theirs.quats[second]).sum(-1))
+    np.testing.assert_allclose(same, 1, atol=1e-5)

@@ -1,0 +1,132 @@
+"""The command ``r5dgs export``: write a scene file in a format of other programs."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .. import errors, folder_lock, input_paths
+from ..formats import registry
+from . import options
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
+
+
+def add_arguments(p: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    p.add_argument("file", type=Path, metavar="SCENE", help=".r5dgs file")
+    p.add_argument(
+        "--to", required=True, metavar="FORMAT", help=f"format of the file, one of {', '.join(registry.MODULES)}"
+    )
+    out = "file to write; with --frames, the frame number is inserted into the name of each PLY file"
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help=out)
+    when = p.add_mutually_exclusive_group()
+    when.add_argument("--time", type=float, metavar="T", help="scene time (default: t_max); may exceed t_max")
+    frames = "range of Blender frames, both included; frame 1 is scene time 0"
+    when.add_argument("--frames", type=frame_range, metavar="A:B", help=frames)
+    p.add_argument("--objects", metavar="WORDS", help="objects to export: 'red mug', 'all except the table'")
+    p.add_argument("--overwrite", action="store_true", help="replace existing files")
+    options.add_progress(p)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the command."""
+    given = {"t": args.time, "frames": args.frames, "words": args.objects, "overwrite": args.overwrite}
+    run_export(args.file, args.to, args.out, **given, progress_kind=args.progress)
+
+
+@folder_lock.writes("out")
+def run_export(
+    path: Path,
+    to: str,
+    out: Path,
+    *,
+    t: float | None = None,
+    frames: tuple[int, int] | None = None,
+    words: str | None = None,
+    overwrite: bool = False,
+    progress_kind: str = "none",
+) -> list[Path]:
+    """Write a scene file in another format.
+
+    Args:
+        path: The scene file.
+        to: Name of the format, a key of `formats.registry.MODULES`.
+        out: File to write; the frame number is inserted if each frame is a file of its own.
+        t: Scene time; t_max if neither ``t`` nor ``frames`` is given.
+        frames: First and last Blender frame; frame 1 is scene time 0.
+        words: Objects to export, as in ``r5dgs query``; all if None.
+        overwrite: True to replace existing files.
+        progress_kind: Form of progress output (`progress.make`).
+
+    Returns:
+        The files written.
+
+    Raises:
+        UsageError: The format is unknown, or ``out`` or ``t`` does not suit it.
+        ConfigError: A file exists, or no object matches the words.
+    """
+    if to not in registry.MODULES:
+        raise errors.UsageError(f"--to {to}: expected one of {', '.join(registry.MODULES)}")
+    chosen = registry.get(to)
+    if out.suffix.lower() != chosen.suffix:
+        raise errors.UsageError(f"--out {out}: expected a name that ends in {chosen.suffix}")
+    if t is not None and not math.isfinite(t):
+        raise errors.UsageError(f"--time {t}: expected a finite number")
+    input_paths.check_output("--out", out)
+    input_paths.check_scene(path)
+    from ..progress import make
+    from ..scene import scene_file
+
+    scene = scene_file.read(path)
+    numbers = None if frames is None else tuple(range(frames[0], frames[1] + 1))
+    times = (scene.t_max if t is None else t,)
+    if numbers is not None:
+        times = tuple((number - 1) / scene.frames_per_unit for number in numbers)
+    what = registry.Options(times, numbers, None if words is None else object_ids(scene, words))
+    targets = chosen.paths(out, what)
+    present = [target for target in targets if target.exists()]
+    if present and not overwrite:
+        raise errors.ConfigError(f"{present[0]}: the file exists; replace it with --overwrite, or choose another name")
+    written = []
+    with make(progress_kind) as progress:
+        for target in chosen.write(scene, out, what):
+            written.append(target)
+            progress({"event": "export", "done": len(written), "total": len(targets), "unit": "files"})
+        if progress_kind == "json":
+            progress({"event": "written", "paths": [str(target) for target in written]})
+    if progress_kind != "json":
+        print(f"written: {written[0]}" + (f" to {written[-1].name}" if len(written) > 1 else ""))
+        print(f"not kept: {chosen.loses}")
+    return written
+
+
+def frame_range(text: str) -> tuple[int, int]:
+    """Convert an argument A:B to two integers, A <= B."""
+    try:
+        first, last = (int(part) for part in text.split(":"))
+    except ValueError:
+        first, last = 1, 0
+    if first > last:
+        raise argparse.ArgumentTypeError(f"expected first and last frame, such as 1:60, got {text!r}")
+    return first, last
+
+
+def object_ids(scene: Scene, words: str) -> frozenset[int]:
+    """Return the ids of the objects that the words name or describe, without an encoder.
+
+    Raises:
+        ConfigError: Nothing matches one of the phrases.
+    """
+    from ..language import query
+    from ..search import object_search
+
+    found = object_search.search(scene, words)
+    missing = query.unanswered(scene, words) if found else [words]
+    if missing:
+        labels = [label for label in object_search.labels_of(scene) if label.object_id > 0]
+        raise errors.ConfigError(f"--objects {words!r}: {object_search.explain_nothing(labels, missing[0])}")
+    return frozenset(match.object_id for match in found)

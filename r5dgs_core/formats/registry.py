@@ -1,0 +1,73 @@
+"""Export formats, shared by ``r5dgs export`` and Blender: what each keeps of a scene, and what it loses."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
+
+MODULES = {  # module of this room that defines `FORMAT`, by the name of the format
+    "ply": "ply",
+    "cameras": "camera_files",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Part of a scene to export.
+
+    Attributes:
+        times: Scene times, at least one.
+        frames: Frame number of each time; None for a single time without a number.
+        object_ids: Objects to export; None for all.
+    """
+
+    times: tuple[float, ...]
+    frames: tuple[int, ...] | None = None
+    object_ids: frozenset[int] | None = None
+
+
+@dataclass(frozen=True)
+class Format:
+    """An export format.
+
+    Attributes:
+        name: Name on the command line.
+        label: Name in Blender's menus.
+        suffix: Suffix of its files, with the dot.
+        keeps: What a file holds of the scene.
+        loses: What it does not hold.
+        write: Writes a scene and yields the path of each file when it is complete. Files are replaced atomically.
+        per_frame: True if each frame is a file of its own.
+        extra: Extra of ``pip install r5dgs[extra]`` that it needs, or None.
+    """
+
+    name: str
+    label: str
+    suffix: str
+    keeps: str
+    loses: str
+    write: Callable[[Scene, Path, Options], Iterator[Path]]
+    per_frame: bool = False
+    extra: str | None = None
+
+    def paths(self, path: Path, options: Options) -> list[Path]:
+        """Return the files that `write` makes."""
+        if not self.per_frame or options.frames is None:
+            return [path]
+        return [numbered(path, frame) for frame in options.frames]
+
+
+def get(name: str) -> Format:
+    """Return a format by its name. Raises KeyError for an unknown name."""
+    return importlib.import_module(f".{MODULES[name]}", __package__).FORMAT
+
+
+def numbered(path: Path, frame: int) -> Path:
+    """Insert a frame number into a path: scene.ply -> scene_0012.ply."""
+    return path.with_name(f"{path.stem}_{frame:04d}{path.suffix}")

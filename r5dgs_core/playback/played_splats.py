@@ -1,0 +1,44 @@
+"""Gaussians of a scene at a time, with rotations and shading applied to their colours."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from ..color import tints
+from ..scene import spherical_harmonics
+from ..scene.splats import Splats
+from . import affine_transform
+from .scene_player import Player
+
+
+def at(player: Player, t: float, object_ids: Collection[int] | None = None) -> Splats:
+    """Return the Gaussians at a time as renderers without motion or shading need them.
+
+    Args:
+        player: The scene in a playback mode.
+        t: Scene time, may exceed t_max.
+        object_ids: Objects to include; None for all Gaussians.
+    """
+    frame = player.frame(t)
+    chosen = np.ones(len(frame.means), bool) if object_ids is None else np.isin(frame.object_ids, list(object_ids))
+    rows = np.flatnonzero(chosen)
+    bind = affine_transform.bind_state(player.scene, rows)
+    sh = bind.sh
+    if sh.shape[1] > 1:
+        turns = frame.group_quats[frame.motion_ids]
+        if frame.turned_rows is not None and frame.turned_quats is not None:
+            turns[frame.turned_rows] = frame.turned_quats
+        sh = spherical_harmonics.turned(sh, turns[rows])
+    if frame.shading_factor is not None:
+        sh = tints.tint_sh(sh, frame.shading_factor[rows, None])
+    return Splats(
+        means=frame.means[rows],
+        quats=frame.quats[rows],
+        log_scales=frame.log_scales[rows],
+        opacity_logits=frame.opacity_logits[rows],
+        sh=sh,
+        identities=bind.identities,
+        object_ids=bind.object_ids,
+    )

@@ -1,0 +1,89 @@
+"""The command ``r5dgs export``."""
+
+import json
+
+import numpy as np
+import pytest
+
+from r5dgs_core.cli import main
+from r5dgs_core.cli.exit_status import ExitStatus
+from r5dgs_core.data import transforms
+from r5dgs_core.formats import ply
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import cameras, scene_file
+from tests.support.command_line import complaint
+
+
+@pytest.fixture
+def path(scene, tmp_path):
+    return scene_file.write(scene, tmp_path / "scene.r5dgs", exact=True)
+
+
+def export(path, *arguments):
+    return main.main(["export", str(path), *map(str, arguments)])
+
+
+def test_ply_holds_the_gaussians_of_a_time(path, scene, tmp_path):
+    out = tmp_path / "a.ply"
+    for t in (0.3, scene.t_max + 0.4):
+        assert export(path, "--to", "ply", "--out", out, "--time", t, "--overwrite") == 0
+        frame, found = scene_player.frame(scene, t), ply.read(out)
+        np.testing.assert_array_equal(found.means, frame.means)
+        np.testing.assert_allclose(found.quats, frame.quats, atol=1e-6)
+        np.testing.assert_array_equal(found.object_ids, scene.object_ids)
+
+
+def test_without_a_time_it_is_that_of_t_max(path, scene, tmp_path):
+    assert export(path, "--to", "ply", "--out", tmp_path / "a.ply") == 0
+    np.testing.assert_array_equal(ply.read(tmp_path / "a.ply").means, scene.means)
+
+
+def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):
+    arguments = ("--to", "ply", "--out", tmp_path / "a.ply", "--frames", "9:11", "--progress", "json")
+    assert export(path, *arguments) == 0
+    paths = [str(tmp_path / f"a_{number:04d}.ply") for number in (9, 10, 11)]
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["paths"] == paths
+    means = scene_player.frame(scene, 9 / scene.frames_per_unit).means
+    np.testing.assert_array_equal(ply.read(paths[1]).means, means)
+
+
+def test_objects_are_chosen_by_words(path, scene, tmp_path, capsys):
+    assert export(path, "--to", "ply", "--out", tmp_path / "a.ply", "--objects", "cup and toy car") == 0
+    assert set(ply.read(tmp_path / "a.ply").object_ids) == {1, 3}
+    for words in ("zebra", "cup and zebra"):
+        line = complaint(capsys, "export", path, "--to", "ply", "--out", tmp_path / "b.ply", "--objects", words)
+        assert "zebra" in line and not (tmp_path / "b.ply").exists()
+
+
+def test_cameras_are_those_of_the_scene(path, scene, tmp_path):
+    out = tmp_path / "transforms_train.json"
+    assert export(path, "--to", "cameras", "--out", out, "--frames", "1:2") == 0
+    entries, _ = transforms.read(out)
+    assert [entry.t for entry in entries] == pytest.approx([0, 0, 1 / 60, 1 / 60])
+    assert entries[2].file_path == f"images/{scene.cameras[0].name}/0002.png"
+    for entry, camera in zip(entries, scene.cameras * 2, strict=True):
+        np.testing.assert_allclose(cameras.opengl_to_cam_world(entry.matrix), camera.T_cam_world, atol=1e-12)
+
+
+def test_files_are_replaced_only_on_demand(path, tmp_path, capsys):
+    (tmp_path / "a_0002.ply").write_text("mine")
+    arguments = ("export", path, "--to", "ply", "--out", tmp_path / "a.ply", "--frames", "1:3")
+    assert "a_0002.ply" in complaint(capsys, *arguments) and "--overwrite" in complaint(capsys, *arguments)
+    assert (tmp_path / "a_0002.ply").read_text() == "mine" and not (tmp_path / "a_0001.ply").exists()
+    assert main.main([*map(str, arguments), "--overwrite"]) == 0
+    assert len(ply.read(tmp_path / "a_0002.ply").means) > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--to", "obj", "--out", "a.obj"), "ply, cameras"),
+        (("--to", "ply", "--out", "a.json"), ".ply"),
+        (("--to", "ply", "--out", "a.ply", "--frames", "5:1"), "'5:1'"),
+        (("--to", "ply", "--out", "a.ply", "--frames", "all"), "'all'"),
+        (("--to", "ply", "--out", "a.ply", "--time", "nan"), "--time"),
+        (("--to", "ply", "--out", "a.ply", "--time", "1", "--frames", "1:2"), "--time"),
+    ],
+)
+def test_wrong_arguments_are_named(path, capsys, arguments, named):
+    assert named in complaint(capsys, "export", path, *arguments, status=ExitStatus.USAGE)

@@ -1,0 +1,37 @@
+"""Export formats: the registry, the user's page and a format that the developer's page adds."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from r5dgs_core.cli import main
+from r5dgs_core.formats import registry
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
+from tests.support import extending_page
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "user" / "export.md"
+
+
+@pytest.mark.parametrize("name", registry.MODULES)
+def test_the_users_page_lists_each_format(name):
+    found = registry.get(name)
+    assert found.name == name
+    row = f"| `{name}` | `{found.suffix}` | {found.keeps} | {found.loses} |"
+    assert row in PAGE.read_text().splitlines()
+
+
+def test_the_users_page_lists_no_other_format():
+    assert re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.MULTILINE) == list(registry.MODULES)
+
+
+def test_the_developers_page_adds_a_format(scene, tmp_path, monkeypatch):
+    extending_page.load("Export format", "r5dgs_core.formats.csv_points", monkeypatch)
+    monkeypatch.setitem(registry.MODULES, "csv", "csv_points")
+    path = scene_file.write(scene, tmp_path / "scene.r5dgs")
+    assert main.main(["export", str(path), "--to", "csv", "--out", str(tmp_path / "a.csv"), "--time", "0.5"]) == 0
+    head, *rows = (tmp_path / "a.csv").read_text().splitlines()
+    means = scene_player.frame(scene_file.read(path), 0.5).means
+    assert head == "x,y,z" and len(rows) == len(means)
+    assert [float(value) for value in rows[7].split(",")] == pytest.approx(means[7], rel=1e-5)
