@@ -81,21 +81,23 @@ def test_steps_are_counted_once(duration, count):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e200])
-@pytest.mark.parametrize("column", range(12))
-def test_one_bad_point_changes_no_bit_of_the_others(bad, column, caplog):
-    twist_propagation.warn_of_wild_dynamics.cache_clear()
-    still, spoiled = STATE.copy(), STATE.copy()
-    still[2], spoiled[2, column] = 0.0, bad
-    with caplog.at_level(logging.WARNING):
-        turns, moves = point_dynamics.propagate(spoiled, 0.8, 1e-6)
+def test_one_bad_point_changes_no_bit_of_the_others(bad, caplog):
+    still, others = STATE.copy(), [0, 1, 3, 4]
+    still[2] = 0.0
     expected = point_dynamics.propagate(still, 0.8, 1e-6)
-    others = [0, 1, 3, 4]
-    np.testing.assert_array_equal(turns[others], expected[0][others])
-    np.testing.assert_array_equal(moves[others], expected[1][others])
-    assert np.isfinite(turns[2]).all() and np.isfinite(moves[2]).all()
-    if not math.isfinite(bad):
-        assert (turns[2] == [1, 0, 0, 0]).all() and (moves[2] == 0).all()
-        assert "1 of 5 points" in caplog.text
+    for column in range(12):
+        twist_propagation.warn_of_wild_dynamics.cache_clear()
+        caplog.clear()
+        spoiled = STATE.copy()
+        spoiled[2, column] = bad
+        with caplog.at_level(logging.WARNING):
+            turns, moves = point_dynamics.propagate(spoiled, 0.8, 1e-6)
+        np.testing.assert_array_equal(turns[others], expected[0][others])
+        np.testing.assert_array_equal(moves[others], expected[1][others])
+        assert np.isfinite(turns[2]).all() and np.isfinite(moves[2]).all()
+        if not math.isfinite(bad):
+            assert (turns[2] == [1, 0, 0, 0]).all() and (moves[2] == 0).all()
+            assert "1 of 5 points" in caplog.text, column
 
 
 def test_huge_dynamics_stay_finite_in_single_precision():
@@ -132,7 +134,8 @@ def test_the_last_step_is_shorter_so_that_the_time_is_met():
     np.testing.assert_allclose(points, 1.0, atol=1e-15)
 
 
-def test_a_path_that_explodes_stays_where_it_last_was_however_far_ahead():
+def test_a_path_that_explodes_stays_where_it_last_was_however_far_ahead(monkeypatch):
+    monkeypatch.setattr(rk2_cache, "MOST_STEPS", 2000)
     start = np.zeros((2, 3))
     v, w = np.array([[0.1, 0, 0], [0.1, 0, 0]]), np.array([[0, 0, 400.0], [0, 0, 0.5]])
     path = rk2_cache.SteppedPath(start, v, w, 0 * v, np.array([[300.0, 0, 0], [0, 0, 0]]), 1 / 60)

@@ -17,10 +17,24 @@ NEAR = RasterSettings().near_plane
 ALPHA_MIN, ALPHA_MAX = RasterSettings().alpha_min, RasterSettings().alpha_max
 
 
-@pytest.mark.parametrize("name", extreme_scenes.CASES)
+WHOLE_IMAGES = ("one Gaussian covers a 4K image", "an image of 4096 by 4096 px")  # a minute of the reference
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in WHOLE_IMAGES)) for name in extreme_scenes.CASES]
+)
 def test_both_backends_draw_it_within_the_bars_and_all_is_finite(name):
     case = extreme_scenes.CASES[name]()
     assert_within_bars(case.inputs, case.camera, case.background, settings=case.settings)
+
+
+@pytest.mark.parametrize("side", ["height", "width"])
+def test_one_gaussian_covers_the_middle_strips_of_a_4k_image(side):
+    case, thickness = extreme_scenes.CASES["one Gaussian covers a 4K image"](), 24
+    intrinsics = case.camera.intrinsics.copy()
+    intrinsics[int(side == "height"), 2] = thickness / 2
+    view = dataclasses.replace(case.camera, intrinsics=intrinsics, **{side: thickness})
+    assert_within_bars(case.inputs, view, case.background, settings=case.settings)
 
 
 # What each gives

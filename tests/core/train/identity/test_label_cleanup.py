@@ -247,9 +247,9 @@ def test_a_run_cleans_its_labels_says_how_many_and_can_be_told_not_to(tiny, tmp_
     # The encodings follow the masks' edges by themselves: the maps of ids stay what they were, bit by bit.
     for name in ("identities", "classifier.weight", "classifier.bias", "gaussians.means"):
         assert torch.equal(states["on"][name], states["off"][name])
-    baked = bake.bake(made["on"])
+    baked = bake.bake(tiny_datasets.as_trained(made["on"]))
     assert baked.provenance["label_hygiene"] == counts
-    assert "label_hygiene" not in bake.bake(made["off"]).provenance
+    assert "label_hygiene" not in bake.bake(tiny_datasets.as_trained(made["off"])).provenance
 
 
 def test_the_table_of_objects_says_what_was_changed():
