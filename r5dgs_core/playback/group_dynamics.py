@@ -17,6 +17,7 @@ from ..scene.scene import MotionGroup, Scene
 from . import visibility
 from .modes import SOURCES
 
+FARTHEST = 1e30  # largest predicted displacement per axis; float32 can hold it
 HORIZON = 1 / 3  # fraction of the observed span past t_max over which "kabsch" follows the members
 _FUTURES = 6  # number of times within the horizon
 _ROUNDS = 6  # reweighting rounds
@@ -93,7 +94,7 @@ class GroupMotion:
         quats, displacements = self._future.poses(t - self._t_max)
         for g, leader, matrix in self._followers:
             displacements[g] = matrix @ displacements[leader]
-        return quats, displacements
+        return quats, displacements.clip(-FARTHEST, FARTHEST)
 
     def _observed(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         times = self._times

@@ -123,6 +123,7 @@ class OwnMotion:
             turns, moves = np.hstack([turns, still]), np.hstack([moves, 0 * still[1:]])
         moves += self._means
         moves -= origin[:, None]
+        moves.clip(-group_dynamics.FARTHEST, group_dynamics.FARTHEST, out=moves)
         turns = turns.astype(np.float32)
         return moves, quaternion_columns.multiply(turns, self._quats), turns
 
@@ -159,7 +160,7 @@ class Literal:
         """Rotations [G, 4] and displacements [G, 3] of the representatives."""
         quats, displacements = rotations.identity(self._count), np.zeros((self._count, 3))
         displacements[self._moving], quats[self._moving] = self._path.at(tau)
-        return quats, displacements
+        return quats, displacements.clip(-group_dynamics.FARTHEST, group_dynamics.FARTHEST)
 
     def means(self, poser: Poser, quats: np.ndarray, displacements: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """Centres relative to an origin, for the result of `at`. [N, 3] float32"""

@@ -5,7 +5,7 @@ import pytest
 
 from r5dgs_core.motion import key_reduction, models, rotations
 from r5dgs_core.playback import scene_player
-from r5dgs_core.scene import row_runs
+from r5dgs_core.scene import cameras, row_runs, validation
 from tests.support.scenes import T_MAX, make_scene
 
 AFTER = np.nextafter(T_MAX, 1.0)
@@ -146,6 +146,16 @@ def test_scenes_without_gaussians_objects_or_motion_play():
     base = make_scene()
     single = base.with_arrays(track_times=base.tracks.times[-1:], track_poses=base.tracks.poses[:, -1:])
     np.testing.assert_array_equal(scene_player.frame(single, 0.0).means, base.gaussians.means)
+
+
+@pytest.mark.parametrize("t", [1e12, 1e15])
+def test_the_largest_acceleration_that_a_file_may_hold_plays_to_finite_centres(scene, t):
+    model = models.MotionModel(kind="ballistic_spin", acceleration=np.full(3, cameras.FARTHEST))
+    groups = tuple(dataclasses.replace(group, model=model) if group.role == "body" else group for group in scene.groups)
+    fast = dataclasses.replace(scene, groups=groups, frames_per_unit=1e-12)
+    validation.check(fast, "scene")
+    frame = scene_player.Player(fast).frame(t)
+    assert np.isfinite(frame.means).all() and np.isfinite(frame.group_displacements).all()
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e4])
