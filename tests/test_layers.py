@@ -115,6 +115,7 @@ LATE_IMPORTS = {
     # A scene at rest loads neither tracks nor networks.
     "bake.bake": {"train.representations.residual"},
     "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
+    "train.representations.tracks": {"train.representations.field"},
     "train.run": {"train.object_discovery", "train.residual_trial"},
 }
 # The same of the add-on: OpenImageIO is optional there.

@@ -22,7 +22,7 @@ from ..data.dataset import Dataset
 from ..motion import rotations
 from ..raster import rasterize_splats
 from . import motion_clusters
-from .representations import gating, representation
+from .representations import gating
 from .representations.field import FieldRepresentation
 from .representations.fused_posing import Splats
 from .train_views import TrainView, spread
@@ -61,7 +61,7 @@ def find(
     progress = progress or (lambda event: None)
     progress({"event": "prepare", "text": "no masks: looking for moving objects"})
     trainer = Trainer(dataset, _short(config, max(view.t for view in dataset.train)))
-    if trainer.motion.name == representation.STILL:
+    if not trainer.motion.moves:
         return None
     while not trainer.done:
         trainer.step()

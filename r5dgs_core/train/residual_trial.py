@@ -54,7 +54,7 @@ def decide(trainer: Trainer, progress: Progress) -> None:
     """Try residuals on all bodies, then restore the state before the trial with the residuals that help.
 
     Args:
-        trainer: A run of tracks with several observed times.
+        trainer: A run whose representation takes residuals, with several observed times.
         progress: Called with events during the trial.
     """
     before = trainer.state()
@@ -97,7 +97,7 @@ def _try(trainer: Trainer, progress: Progress) -> tuple[ResidualField, np.ndarra
     state = trainer.state()
     trainer.restore(dataclasses.replace(state, tensors=state.tensors | residual.tensors_of(field)))
     steps = trial_steps(config)
-    trainer.queue = [used[k % len(used)] for k in range(steps)]
+    trainer.curriculum.queue = [used[k % len(used)] for k in range(steps)]
     try:
         for step in range(1, steps + 1):
             trainer.step()
@@ -150,5 +150,5 @@ def _gains(trainer: Trainer, field: ResidualField, held: Sequence[int]) -> np.nd
 def _squares(trainer: Trainer, field: ResidualField, index: int, truth: Tensor) -> np.ndarray:
     """Return the squared error of each pixel with ``field`` in place of the trial's field. [H, W] float64"""
     view = trainer.views[index]
-    trainer.motion.residuals = field  # type: ignore[reportAttributeAccessIssue]: `tracks` alone is tried
+    trainer.motion.residuals = field
     return ((trainer.render(view.camera, view.t) - truth) ** 2).sum(-1).numpy().astype(np.float64)

@@ -24,7 +24,7 @@ from ..render import warm_up
 from ..time_left import Phase, Timed
 from . import checkpoint, checkpoint_content, interrupt, learning_curves, probe
 from .identity import identity_training, label_cleanup, packed_masks
-from .representations import registry, representation
+from .representations import registry
 from .representations.fused_posing import Splats
 from .train_views import TrainView
 from .trainer import Trainer
@@ -186,7 +186,7 @@ def _plan(trainer: Trainer, progress: Timed) -> None:
 
 def decision_step(trainer: Trainer) -> int | None:
     """Return the step after which residuals are tried; None if never, as with a single observed time."""
-    if trainer.motion.name != representation.TRACKS or len(trainer.times) < 2:
+    if not trainer.motion.takes_residuals or len(trainer.times) < 2:
         return None
     from . import residual_trial  # static scenes do not need it
 
@@ -338,7 +338,7 @@ def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed
         if trainer.config.identity.hygiene and len(classes) > 1:
             # After the encodings, which follow the edges of the masks; cleaned labels follow motion, too.
             extra |= _cleaned(trainer, votes, extra["labels"])
-    elif trainer.motion.name == representation.FIELD and training_needs.sorting(trainer.dataset, trainer.config):
+    elif trainer.motion.sorts_by_motion and training_needs.sorting(trainer.dataset, trainer.config):
         from . import object_discovery
 
         progress({"event": "prepare", "text": "no masks: sorting moving Gaussians into parts"})

@@ -25,12 +25,13 @@ from ..raster import RasterStats, rasterize_splats
 from ..scene import sh_color
 from ..scene.cameras import Camera
 from . import background as backgrounds
-from . import losses, normalization, train_views
+from . import curriculum, losses, normalization, train_views
+from . import optimizer as optimizers
 from .checkpoint import Checkpoint
 from .densification import densifier, gradient
 from .identity import identity_training, packed_masks
 from .initialization import initialize, plane_sweep, sky, thinning
-from .representations import fused_posing, registry, representation, static
+from .representations import fused_posing, registry, static
 
 log = logging.getLogger(__name__)
 
@@ -38,9 +39,6 @@ TARGET_BYTES = 1 << 30
 EYES = 256  # largest number of cameras in tests of visibility
 HOLD_EVERY = 100  # steps between updates of the held Gaussians
 HELD = "held"  # name of a tensor of the state: mask of the Gaussians whose centres are frozen
-GEOMETRY = ("means", "translations", "rotvecs", "light", "slope", "residual")
-NETWORKS = ("field", "trd")
-APPEARANCE = ("log_scales", "sh", "sh_rest", "opacity_logits", "background")
 
 
 class Trainer:
@@ -65,67 +63,76 @@ class Trainer:
         self.dataset = dataset
         self.config = config = training_needs.resolve(config)
         self.normalization = normalization.from_cameras([v.camera for v in dataset.train])
-        behind = train_views.behind(dataset, config)
-        self.views = train_views.load(dataset, self.normalization, behind)
-        rng = np.random.default_rng(config.train.seed)
+        self.behind = train_views.behind(dataset, config)
+        self.views = train_views.load(dataset, self.normalization, self.behind)
         self.found = None if found is None else packed_masks.pack(found)
         shown = self.views if found is None else train_views.with_masks(self.views, found)
         still = static.applies(self.views, config)
         if still:
             self.config = config = config.replace(**{"train.shading": False, "train.shadows": False})
-        start = initialize.start(shown, config, behind is None, rng, self._cloud(), still)
-        if len(start.gaussians) == 0:
-            raise DatasetError(
-                f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "
-                "or visible to only one camera. Remedy: add masks or cameras"
-            )
-        missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
-        if missing and len(start.object_ids) > 1 and found is None:
-            named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
-            log.warning("no training mask shows object %s: left out. Remedy: check the ids in objects.json", named)
-        self.behind = behind
-        most = config.densify.max_gaussians
-        if most:
-            start = dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng))
+        start = self._start(shown, still)
         self.gaussians: Gaussians = start.gaussians
         self.motion = registry.make(start, config, still)
         self.times = start.tracks.times
         self.object_ids = start.object_ids
         self.places = start.places
         self.first_time = start.first_time
-        if behind is not None:
-            self.background = backgrounds.fixed(behind)
-        else:
-            degree = 0 if config.needs.sky_gradient == "off" else sky.DEGREE
-            self.background = backgrounds.learned(start.sky if start.sky is not None else self._mean_color(), degree)
+        self.background = self._background(start.sky)
         self.generator = torch.Generator().manual_seed(config.train.seed)
         classes = {int(object_id): row for row, object_id in enumerate(self.object_ids)}
         self.identity = identity_training.joint(self.views, classes, config)
         if self.identity is not None:
             self.identity.begin(self.gaussians)
+        self.rates = optimizers.Rates(config, {} if self.identity is None else self.identity.rates)
         self.iteration = 0
-        self.entered = (self.first_time, self.first_time)
-        self.queue: list[int] = []
         self.running_loss = math.nan
-        self._view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
-        sizes = [v.camera.width * v.camera.height for v in self.views]
-        focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
+        view_times = np.array([train_views.nearest_knot(self.times, v.t) for v in self.views])
+        self.curriculum = curriculum.Curriculum(config, view_times, len(self.times), self.first_time)
         self.eyes = [group[0].camera for group in plane_sweep.by_camera(self.views, EYES)]
         self.held = torch.zeros(0, dtype=torch.bool)
-        self.cap = most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes))))
         self.optimizer = self._make_optimizer()
-        conditions = densifier.Conditions(
-            cap=self.cap,
-            iterations=config.train.iterations,
+        self.growth = gradient.make(config, self._conditions(), len(self.gaussians))
+        self._targets: dict[int, Tensor] = {}
+
+    def _start(self, views: Sequence[train_views.TrainView], still: bool) -> initialize.Start:
+        """Return the initial state. Raises DatasetError if no Gaussian can be placed."""
+        config, dataset = self.config, self.dataset
+        rng = np.random.default_rng(config.train.seed)
+        start = initialize.start(views, config, self.behind is None, rng, self._cloud(), still)
+        if len(start.gaussians) == 0:
+            raise DatasetError(
+                f"{dataset.root}: no Gaussian can be placed: no mask shows an object, and the background is all sky "
+                "or visible to only one camera. Remedy: add masks or cameras"
+            )
+        missing = sorted(set(dataset.object_names) - {int(i) for i in start.object_ids} - {0, -1})
+        if missing and len(start.object_ids) > 1 and self.found is None:
+            named = ", ".join(f"{i} ({dataset.object_names[i]})" for i in missing)
+            log.warning("no training mask shows object %s: left out. Remedy: check the ids in objects.json", named)
+        most = config.densify.max_gaussians
+        return dataclasses.replace(start, gaussians=thinning.thin(start.gaussians, most, rng)) if most else start
+
+    def _background(self, found: np.ndarray | None) -> backgrounds.Background:
+        """Return the fixed background of the images, or one that is learned from the sky that was found."""
+        if self.behind is not None:
+            return backgrounds.fixed(self.behind)
+        degree = 0 if self.config.needs.sky_gradient == "off" else sky.DEGREE
+        return backgrounds.learned(found if found is not None else self._mean_color(), degree)
+
+    def _conditions(self) -> densifier.Conditions:
+        """Return what the densification needs to know about the run."""
+        sizes = [v.camera.width * v.camera.height for v in self.views]
+        most = self.config.densify.max_gaussians
+        focal = float(np.median([v.camera.intrinsics[0, 0] for v in self.views]))
+        return densifier.Conditions(
+            cap=most or max(len(self.gaussians), int(min(60000, 0.75 * np.median(sizes)))),
+            iterations=self.config.train.iterations,
             pixel_size=normalization.TARGET_DISTANCE / focal,
             image_width=float(np.median([v.camera.width for v in self.views])),
             extent=densifier.extent_of(self.eyes),
             eyes=self.eyes,
             generator=self.generator,
-            white=behind is not None and bool((behind == 1).all()),
+            white=self.behind is not None and bool((self.behind == 1).all()),
         )
-        self.growth = gradient.make(config, conditions, len(self.gaussians))
-        self._targets: dict[int, Tensor] = {}
 
     def _cloud(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return points (normalised coordinates) and colours of the data set's reconstruction; None if it has none."""
@@ -139,18 +146,17 @@ class Trainer:
         color = np.median([np.median(v.image.reshape(-1, 3), axis=0) for v in self.views], axis=0) / 255
         return sh_color.rgb_to_dc(color)[None]
 
-    def _make_optimizer(self) -> torch.optim.Adam:
+    @property
+    def params(self) -> dict[str, Tensor]:
+        """All parameters by name, with those that are not trained."""
+        return {**self.gaussians.params, **self._others()}
+
+    def _others(self) -> dict[str, Tensor]:
         classifier = {} if self.identity is None else self.identity.params
-        groups = [
-            {"params": [p], "lr": self._base_rate(name), "name": name, "eps": 1e-15}
-            for name, p in self.gaussians.params.items()
-        ]
-        groups += [
-            {"params": [p], "lr": self._base_rate(name), "name": name, "eps": 1e-8}
-            for name, p in {**self.motion.params, **self.background.params, **classifier}.items()
-            if p.requires_grad
-        ]
-        return torch.optim.Adam(groups, fused=True)
+        return {**self.motion.params, **self.background.params, **classifier}
+
+    def _make_optimizer(self) -> torch.optim.Adam:
+        return optimizers.make(self.gaussians.params, self._others(), self.rates)
 
     @property
     def done(self) -> bool:
@@ -165,19 +171,24 @@ class Trainer:
         """
         if self.iteration == 0:
             self.motion.begin(self.gaussians, self.generator)
-        self._leave_tracks()
-        self._grow_times()
-        index = self._draw()
+        motion = self.motion.before_step(self.gaussians, self.iteration, self.generator)
+        if motion is not self.motion:
+            self.motion = motion
+            self.optimizer = self._make_optimizer()
+        for knot, towards, entered in self.curriculum.grow(self.iteration):
+            self.motion.enter(knot, towards, entered)
+        index = self.curriculum.draw(self.iteration, self.generator)
         view = self.views[index]
+        place = f"step {self.iteration}, view {view.name}"
         for group in self.optimizer.param_groups:
-            group["lr"] = self._rate(group["name"])
+            group["lr"] = self.rates.at(group["name"], self.iteration)
         stats = RasterStats()
         try:
             image, features, splats = self._draw_all(view, stats)
         except ValueError as error:
-            self._check_finite(0.0, view.name)
+            optimizers.check_finite(self.params, 0.0, place)
             raise TrainingError(
-                f"step {self.iteration}, view {view.name}: cannot be drawn: {error}; the last checkpoint is kept. "
+                f"{place}: cannot be drawn: {error}; the last checkpoint is kept. "
                 "Remedy: lower the learning rates (--set rates.NAME=VALUE) or look at that view's camera"
             ) from error
         loss = losses.photometric(image, self._target(index), self.config.losses.ssim)
@@ -191,10 +202,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         value = float(loss.detach())
-        # Sums are cheap and become non-finite if any gradient is; the parameter is searched for only then.
-        sums = [p.grad.sum() for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
-        if not math.isfinite(value + float(torch.stack(sums).sum())):
-            self._check_finite(value, view.name)
+        if not (math.isfinite(value) and optimizers.has_finite_gradients(self.optimizer)):
+            optimizers.check_finite(self.params, value, place)
         self._hide_harmonics()
         self._hold_places()
         self.optimizer.step()
@@ -256,16 +265,6 @@ class Trainer:
             return self.identity.labels(self.gaussians)
         return torch.from_numpy(self.motion.group_classes(self.motion.tensors()))[self.gaussians.motion_ids]
 
-    def _leave_tracks(self) -> None:
-        """Switch from tracks to a field once the run has passed ``field.tracks_share``."""
-        if self.config.train.representation != representation.FIELD or self.motion.name != representation.TRACKS:
-            return
-        if self.iteration >= self.config.field.tracks_share * self.config.train.iterations:
-            self.motion = registry.leave_tracks(
-                self.motion, self.gaussians, self.first_time, self.config, self.generator
-            )
-            self.optimizer = self._make_optimizer()
-
     def _target(self, index: int) -> Tensor:
         """Return a view's image in [0, 1]. Cached if all views fit into `TARGET_BYTES`, else converted on each call."""
         if index in self._targets:
@@ -275,68 +274,6 @@ class Trainer:
             self._targets[index] = target
         return target
 
-    def _base_rate(self, name: str) -> float:
-        """Initial learning rate of a parameter, by the part of its name before the first dot."""
-        group = name.partition(".")[0]
-        if self.identity is not None and group in self.identity.rates:
-            return self.identity.rates[group]
-        return getattr(self.config.rates, group)
-
-    def _rate(self, name: str) -> float:
-        rates = self.config.rates
-        base = self._base_rate(name)
-        name = name.partition(".")[0]
-        if name == "shading" and not self.config.train.shading:
-            return 0.0
-        progress = self.iteration / self.config.train.iterations
-        begin = self.config.residual.start if name == "residual" else rates.decay_from  # residuals start late
-        if progress <= begin or name not in GEOMETRY + APPEARANCE + NETWORKS:
-            return base
-        decay = rates.decay_networks if name in NETWORKS else rates.decay
-        factor = decay ** ((progress - begin) / (1 - begin))
-        return base * (max(factor, rates.decay_floor_appearance) if name in APPEARANCE else factor)
-
-    def _curriculum(self) -> tuple[int, int]:
-        """Return the number of steps on the first time alone, and the step at which all times have entered."""
-        return self.config.curriculum.steps(self.config.train.iterations)
-
-    def _grow_times(self) -> None:
-        first, full = self._curriculum()
-        count = len(self.times)
-        reach = max(self.first_time, count - 1 - self.first_time)
-        if self.iteration < first or reach == 0:
-            return
-        stages = self.config.curriculum.stages
-        if self.iteration >= full:
-            stage = reach
-        elif stages > 1:
-            entered = 1 + (self.iteration - first) * (stages - 1) // max(1, full - first)
-            stage = math.ceil(reach * entered / stages)
-        else:
-            stage = 1 + (self.iteration - first) * reach // max(1, full - first)
-        stage = min(stage, reach)
-        while self.entered[0] > max(0, self.first_time - stage):
-            self.motion.enter(self.entered[0] - 1, +1, self.entered)
-            self.entered = (self.entered[0] - 1, self.entered[1])
-        while self.entered[1] < min(count - 1, self.first_time + stage):
-            self.motion.enter(self.entered[1] + 1, -1, self.entered)
-            self.entered = (self.entered[0], self.entered[1] + 1)
-
-    def _draw(self) -> int:
-        _, full = self._curriculum()
-        if self.iteration >= full:
-            if not self.queue:
-                self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()
-            return self.queue.pop()
-        low, high = self.entered
-        inside = (self._view_times >= low) & (self._view_times <= high)
-        newest = (self._view_times == low) | (self._view_times == high)
-        chance, pick = torch.rand(2, generator=self.generator).tolist()
-        pool = np.flatnonzero(newest if chance < self.config.curriculum.newest and newest.any() else inside)
-        if len(pool) == 0:
-            pool = np.arange(len(self.views))
-        return int(pool[min(int(pick * len(pool)), len(pool) - 1)])
-
     def _hide_harmonics(self) -> None:
         """Keep untrained degrees of the harmonics at zero by zeroing their gradients, and so Adam's moments."""
         every, rest = self.config.train.sh_every, self.gaussians.params["sh_rest"]
@@ -345,27 +282,11 @@ class Trainer:
 
     def _maintain(self) -> None:
         self.motion.after_step(self.gaussians, self.iteration, self.generator)
-        self.growth.after_step(self.gaussians, self.optimizer, self.iteration, self._rate("means"))
+        self.growth.after_step(self.gaussians, self.optimizer, self.iteration, self.rates.at("means", self.iteration))
         if len(self.gaussians) == 0:
             raise TrainingError(
                 f"step {self.iteration}: every Gaussian has become too faint or too wide and was removed; the last "
                 "checkpoint is kept. Remedy: lower the learning rates (rates.*) or densify.prune_opacity"
-            )
-
-    def _check_finite(self, value: float, view: str) -> None:
-        """Raise `TrainingError` if the loss, a parameter or a gradient is not finite."""
-        named = {**self.gaussians.params, **self.motion.params, **self.background.params}
-        named |= {} if self.identity is None else self.identity.params
-        bad = [n for n, p in named.items() if not bool(torch.isfinite(p).all())]
-        bad += [f"gradient of {n}" for n, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
-        if bad or not math.isfinite(value):
-            sizes = {n: float(p.detach().abs().nan_to_num(0, 0).max()) for n, p in named.items() if p.numel() > 0}
-            largest = max(sizes, key=sizes.__getitem__)
-            more = f" and {len(bad) - 4} more" if len(bad) > 4 else ""
-            raise TrainingError(
-                f"step {self.iteration}, view {view}: {', '.join(bad[:4]) or 'loss'}{more} is not finite (largest "
-                f"finite value: {sizes[largest]:.3g}, of {largest}); the last checkpoint is kept. "
-                "Remedy: lower the learning rates (--set rates.means=5e-4) or look at that image and its camera"
             )
 
     def state(self) -> Checkpoint:
@@ -383,17 +304,15 @@ class Trainer:
         if len(self.held) == len(self.gaussians):
             tensors[HELD] = self.held
         tensors |= self.growth.tensors()
-        for group in self.optimizer.param_groups:
-            moments = self.optimizer.state.get(group["params"][0], {})
-            tensors |= {f"adam.{group['name']}.{k}": v for k, v in moments.items()}
+        tensors |= optimizers.tensors(self.optimizer)
         x, y, z = (float(v) for v in self.dataset.origin + self.normalization.origin)
         return Checkpoint(
             tensors={n: t.detach().clone() for n, t in tensors.items()},
             representation=self.motion.name,
             iteration=self.iteration,
-            entered=self.entered,
+            entered=self.curriculum.entered,
             first_time=self.first_time,
-            queue=tuple(self.queue),
+            queue=tuple(self.curriculum.queue),
             running_loss=self.running_loss,
             origin=(x, y, z),
             scale=float(self.normalization.scale),
@@ -402,11 +321,10 @@ class Trainer:
 
     def restore(self, state: Checkpoint) -> None:
         """Restore a `state` of a trainer with the same data set and configuration."""
-        self.motion = registry.for_state(self.motion, state.representation, self.first_time, self.config)
         tensors = {name: tensor.clone() for name, tensor in state.tensors.items()}  # training modifies them in place
         g = {n.removeprefix("gaussians."): t for n, t in tensors.items() if n.startswith("gaussians.")}
         self.gaussians = Gaussians({n: t for n, t in g.items() if n != "motion_ids"}, g["motion_ids"])
-        self.motion.restore(tensors)
+        self.motion = self.motion.restored(state.representation, tensors)
         if self.identity is not None:
             self.identity.restore(tensors, self.gaussians)
         self.background = backgrounds.Background(tensors["background"], self.background.learned)
@@ -422,17 +340,9 @@ class Trainer:
         self.growth.restore(tensors)
         self.held = tensors.get(HELD, torch.zeros(0, dtype=torch.bool))
         self.optimizer = self._make_optimizer()
-        for group in self.optimizer.param_groups:
-            prefix = f"adam.{group['name']}."
-            moments = {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-            if moments:
-                parameter = group["params"][0]
-                if any(tensor.ndim and tensor.shape != parameter.shape for tensor in moments.values()):
-                    expected = list(parameter.shape)
-                    raise CheckpointError(f"the checkpoint's '{prefix}*': expected tensors of shape {expected}")
-                self.optimizer.state[parameter] = moments
+        optimizers.restore(self.optimizer, tensors)
         self.iteration = state.iteration
-        self.entered = state.entered
+        self.curriculum.entered = state.entered
         self.first_time = state.first_time
-        self.queue = list(state.queue)
+        self.curriculum.queue = list(state.queue)
         self.running_loss = state.running_loss

@@ -35,6 +35,7 @@ from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import field_fitting, field_to_groups, fused_posing, gating, rigidity, shading
 from .field_motion import Clock, Motion
+from .representation import FIELD, Representation
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ class Moved:
     log_scales: Tensor
 
 
-class FieldRepresentation:
+class FieldRepresentation(Representation):
     """Gaussians moved one by one by `Motion`, with shading that depends on their rotations.
 
     Args:
@@ -69,7 +70,7 @@ class FieldRepresentation:
         config: The run's configuration.
     """
 
-    name = "field"
+    name, sorts_by_motion = FIELD, True
 
     def __init__(self, tracks: Tracks, first: int, config: Config):
         self.times = tracks.times
@@ -197,9 +198,6 @@ class FieldRepresentation:
             anchors = rigidity.anchors(moved.before, labels()[moved.rows], opacities)
             terms.append(losses.rigid * rigidity.rigidity(moved.before, moved.before + moved.offsets, anchors))
         return sum(terms[1:], terms[0]) if terms else None
-
-    def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """Do nothing: a field covers all times already."""
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Freeze Gaussians at rest once, if movers are measured, and periodically fit the TRD to the current motion."""

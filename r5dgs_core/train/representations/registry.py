@@ -6,12 +6,10 @@ Each is imported only when it is used; a static scene loads neither tracks nor n
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ...config.config import Config
 from ...errors import CheckpointError
-from ...model.gaussians import Gaussians
 from ..initialization import initialize
 from ..observed_motion import ObservedMotion
 from . import static
@@ -37,45 +35,6 @@ def make(start: initialize.Start, config: Config, still: bool = False) -> Repres
     tracks = tracks_representation.first_tracks(start.tracks)
     field.bring_together(start.gaussians, tracks, start.first_time)
     return field.FieldRepresentation(tracks, start.first_time, config)
-
-
-def leave_tracks(
-    motion: Representation, gaussians: Gaussians, first: int, config: Config, draw: torch.Generator
-) -> Representation:
-    """Return the field that continues from trained tracks, see `field.from_tracks`."""
-    from . import field
-    from .tracks import TracksRepresentation
-
-    assert isinstance(motion, TracksRepresentation)
-    return field.from_tracks(motion.tracks, motion.light, gaussians, first, config, draw)
-
-
-def for_state(motion: Representation, name: str, first: int, config: Config) -> Representation:
-    """Return the representation that continues from a checkpoint of the representation ``name``.
-
-    Args:
-        motion: The run's initial representation.
-        name: Representation of the checkpoint.
-        first: Knot at which the Gaussians of a field are canonical.
-        config: The run's configuration.
-
-    Returns:
-        ``motion``, or a field if the run of the checkpoint has already switched from tracks to a field.
-
-    Raises:
-        CheckpointError: The checkpoint has another representation than the configuration.
-    """
-    if config.train.representation == name == FIELD and motion.name == TRACKS:
-        from . import field
-        from .tracks import TracksRepresentation
-
-        assert isinstance(motion, TracksRepresentation)
-        return field.FieldRepresentation(motion.tracks, first, config)
-    if name != motion.name:
-        raise CheckpointError(
-            f"the checkpoint was trained with representation '{name}', the configuration asks for '{motion.name}'"
-        )
-    return motion
 
 
 def observed_motion(

@@ -1,21 +1,22 @@
-"""Interface of motion representations, which move the Gaussians in the observed time.
+"""Base class of motion representations, which move the Gaussians in the observed time.
 
-The trainer uses only `Representation`: splats at a time, parameters, a penalty, maintenance after each step, and named
-tensors for the checkpoint. `tracks` moves Gaussians by one SE(3) track per object, `field` by a deformation field, and
-`still` not at all. `registry` creates them by name.
+The trainer uses only `Representation`, and never asks which one it has. `tracks` moves Gaussians by one SE(3) track per
+object, `field` by a deformation field, and `still` not at all. `registry` creates them by name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...config.config import Config
+from ...errors import CheckpointError
 from ...model.gaussians import Gaussians
+from ...model.residual_field import ResidualField
 from ...scene.cameras import Camera
 from ..observed_motion import ObservedMotion
 from . import fused_posing
@@ -23,23 +24,34 @@ from . import fused_posing
 TRACKS, FIELD, STILL = "tracks", "field", "still"
 
 
-class Representation(Protocol):
-    """Observed motion of N Gaussians, in training coordinates.
+class Representation:
+    """Observed motion of N Gaussians, in training coordinates. Hooks that a subclass does not need do nothing.
 
     Attributes:
         name: Name in checkpoints: "tracks", "field" or "still".
+        moves: False if nothing ever moves.
+        takes_residuals: True if bodies may have `residuals`, which are tried during training.
+        sorts_by_motion: True if Gaussians move one by one, so that objects can be found by their motion.
+        residuals: Residual motion of non-rigid bodies, or None.
     """
 
-    name: str
+    name: ClassVar[str]
+    moves: ClassVar[bool] = True
+    takes_residuals: ClassVar[bool] = False
+    sorts_by_motion: ClassVar[bool] = False
+    residuals: ResidualField | None = None
 
     @property
     def params(self) -> dict[str, Tensor]:
         """Parameters for the optimizer; the name before the first dot selects the learning rate."""
-        ...
+        return {}
 
     def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
         """Prepare before the first step."""
-        ...
+
+    def before_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> Representation:
+        """Return the representation of the step ``iteration``: this one, or another one that continues from it."""
+        return self
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -55,7 +67,7 @@ class Representation(Protocol):
         Returns:
             Splats in training coordinates.
         """
-        ...
+        raise NotImplementedError
 
     def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
         """Return a term for the loss of the current step (the last call of `splats`), or None.
@@ -65,28 +77,39 @@ class Representation(Protocol):
             iteration: The step.
             labels: Returns the class of each Gaussian. [N]
         """
-        ...
+        return None
 
     def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
         """Initialise ``knot`` from its neighbours in direction ``towards`` (+1 or -1), as it enters training."""
-        ...
 
     def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
         """Maintain the state after ``iteration`` steps; ``draw`` is the random generator of the training."""
-        ...
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the complete state, by name."""
-        ...
+        raise NotImplementedError
+
+    def restored(self, name: str, tensors: dict[str, Tensor]) -> Representation:
+        """Return the representation ``name`` with a checkpoint's state: this one, or one that `before_step` gives.
+
+        Raises:
+            CheckpointError: The checkpoint has another representation than the configuration.
+        """
+        if name != self.name:
+            raise CheckpointError(
+                f"the checkpoint was trained with representation '{name}', the configuration asks for '{self.name}'"
+            )
+        self.restore(tensors)
+        return self
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the state from `tensors`."""
-        ...
+        raise NotImplementedError
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
         """Return the default class of each group's Gaussians without masks, from a checkpoint's `tensors`. [G]"""
-        ...
+        raise NotImplementedError
 
     @staticmethod
     def observed_motion(
@@ -101,4 +124,4 @@ class Representation(Protocol):
             labels: Class of each Gaussian. [N]
             config: The run's configuration.
         """
-        ...
+        raise NotImplementedError

@@ -5,7 +5,7 @@ It is chosen if no camera's image changes from one time to another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from ..initialization import initialize, plane_sweep
 from ..observed_motion import GroupTrack, ObservedMotion
 from ..train_views import TrainView
 from . import fused_posing
+from .representation import STILL, Representation
 
 BLOCK = 4  # side of the averaged blocks, px
 CHANGE = 3.0  # smallest significant change of a block, levels of 255
@@ -29,27 +30,23 @@ NOISE = 8.0  # the same in standard deviations of the change over all blocks
 NOTHING = 0.3  # lower limit of the noise of 8-bit images, levels of 255
 
 
-class StillRepresentation:
+class StillRepresentation(Representation):
     """Gaussians that never move.
 
     Args:
         start: Initial state of training.
     """
 
-    name = "still"
-    params: dict[str, Tensor] = {}
+    name, moves = STILL, False
 
     def __init__(self, start: initialize.Start):
         self.centers = torch.from_numpy(start.tracks.centers.astype(np.float32))
         self.time = float(start.tracks.times[-1])
 
-    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """Do nothing."""
-
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
     ) -> fused_posing.Splats:
-        """See `representation.Representation.splats`; the result is the same at all times."""
+        """See `Representation.splats`; the result is the same at all times."""
         params = gaussians.params
         if params["sh_rest"].shape[1] == 0:
             colors = sh_color.dc_to_rgb(params["sh"][:, 0])
@@ -69,16 +66,6 @@ class StillRepresentation:
             torch.zeros_like(self.centers),
         )
 
-    def penalty(self, gaussians: Gaussians, iteration: int, labels: Callable[[], Tensor]) -> Tensor | None:
-        """Return None."""
-        return None
-
-    def enter(self, knot: int, towards: int, entered: tuple[int, int]) -> None:
-        """Do nothing: there is only one knot."""
-
-    def after_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> None:
-        """Do nothing."""
-
     def tensors(self) -> dict[str, Tensor]:
         """Return the centres of the objects and the last observed time."""
         return {"still.centers": self.centers, "still.time": torch.tensor(self.time, dtype=torch.float64)}
@@ -89,14 +76,14 @@ class StillRepresentation:
 
     @staticmethod
     def group_classes(tensors: dict[str, Tensor]) -> np.ndarray:
-        """See `representation.Representation.group_classes`."""
+        """See `Representation.group_classes`."""
         return np.arange(len(tensors["still.centers"]))
 
     @staticmethod
     def observed_motion(
         tensors: dict[str, Tensor], object_ids: np.ndarray, observed: np.ndarray, labels: np.ndarray, config: Config
     ) -> ObservedMotion:
-        """See `representation.Representation.observed_motion`: one knot, at which every group is at rest."""
+        """See `Representation.observed_motion`: one knot, at which every group is at rest."""
         centers = tensors["still.centers"].numpy().astype(np.float64)
         rest, nowhere = rotations.identity(1), np.zeros((1, 3))
         groups = [GroupTrack(0, "pinned", centers[0], rest, nowhere, np.ones(1, bool))]

@@ -12,7 +12,6 @@ from torch import Tensor
 from ...config.config import Config
 from ...model import track_state
 from ...model.gaussians import Gaussians
-from ...model.residual_field import ResidualField
 from ...model.tracks import Tracks
 from ...motion import rotations
 from ...raster import shade
@@ -22,12 +21,13 @@ from ..initialization import initialize
 from ..observed_motion import GroupTrack, ObservedMotion
 from ..train_views import nearest_knot
 from . import fused_posing, residual
+from .representation import FIELD, TRACKS, Representation
 
 ROUGHNESS_EVERY = 4  # steps between evaluations of the roughness; its weight is multiplied by this
 REBASE_EVERY = 100  # steps
 
 
-class TracksRepresentation:
+class TracksRepresentation(Representation):
     """One SE(3) track per object, with shading that turns in fixed light and shadows that follow their caster.
 
     Args:
@@ -35,7 +35,7 @@ class TracksRepresentation:
         config: The run's configuration.
     """
 
-    name = "tracks"
+    name, takes_residuals = TRACKS, True
 
     def __init__(self, start: initialize.Start, config: Config):
         self.tracks = first_tracks(start.tracks)
@@ -45,8 +45,8 @@ class TracksRepresentation:
         self._stiffness = tuple(
             torch.from_numpy(a).float() for a in (start.evidence.shift_stiffness, start.evidence.turn_stiffness)
         )
+        self._first = start.first_time
         self._entered = (start.first_time, start.first_time)
-        self.residuals: ResidualField | None = None
         self._gains: Tensor | None = None  # gain of the residuals per body, dB, after the trial
         self._config = config
 
@@ -56,8 +56,15 @@ class TracksRepresentation:
         residuals = {} if self.residuals is None else {"residual": self.residuals.values}
         return {**self.tracks.params, "light": self.light, **residuals}
 
-    def begin(self, gaussians: Gaussians, draw: torch.Generator) -> None:
-        """Do nothing: the tracks are initialised from the masks."""
+    def before_step(self, gaussians: Gaussians, iteration: int, draw: torch.Generator) -> Representation:
+        """Return a field that continues from the tracks after ``field.tracks_share`` of a run that trains a field."""
+        config = self._config
+        share = config.field.tracks_share * config.train.iterations
+        if config.train.representation != FIELD or iteration < share:
+            return self
+        from . import field
+
+        return field.from_tracks(self.tracks, self.light, gaussians, self._first, config, draw)
 
     def splats(
         self, gaussians: Gaussians, camera: Camera, t: float, draw: torch.Generator | None = None
@@ -161,6 +168,14 @@ class TracksRepresentation:
         if self._gains is not None:
             named["residual.gains"] = self._gains
         return named if self.residuals is None else named | residual.tensors_of(self.residuals)
+
+    def restored(self, name: str, tensors: dict[str, Tensor]) -> Representation:
+        """See `Representation.restored`; the run of the checkpoint may have gone on to a field already."""
+        if not self._config.train.representation == name == FIELD:
+            return super().restored(name, tensors)
+        from . import field
+
+        return field.FieldRepresentation(self.tracks, self._first, self._config).restored(name, tensors)
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the state from `tensors`."""

@@ -96,11 +96,11 @@ def test_a_new_trainer_goes_on_to_the_same_bits(tiny, unbroken, broken_at):
     folder, reference = unbroken
     trainer = make(tiny)
     trainer.restore(checkpoint.load(folder / str(broken_at)))
-    entered = trainer.entered
+    entered = trainer.curriculum.entered
     while not trainer.done:
         trainer.step()
     assert_same_state(trainer.state(), reference.state())
-    assert broken_at > 18 or trainer.entered != entered  # a time entered after the break
+    assert broken_at > 18 or trainer.curriculum.entered != entered  # a time entered after the break
 
 
 def test_a_state_stays_what_it_was_while_training_goes_on(tiny, unbroken):
@@ -138,12 +138,12 @@ def test_a_parameter_that_is_not_finite_is_a_training_error(tiny):
 
 def test_times_enter_from_the_first_one_outwards_until_all_are_in(tiny):
     trainer = make(tiny)
-    seen = [trainer.entered]
+    seen = [trainer.curriculum.entered]
     while not trainer.done:
         trainer.step()
-        low, high = trainer.entered
+        low, high = trainer.curriculum.entered
         assert low <= seen[-1][0] and high >= seen[-1][1]
-        seen.append(trainer.entered)
+        seen.append(trainer.curriculum.entered)
     assert seen[0][0] == seen[0][1] == trainer.first_time
     assert seen[-1] == (0, 5) and len(set(seen)) > 2
 
