@@ -41,6 +41,7 @@ ALLOWED = {
     "playback": {"motion", "scene", "color"},
     "formats": {"motion", "scene", "playback"},
     "editing": {"motion", "scene", "color", "playback"},
+    "protocol": {"scene", "search", "playback"},
     "model": {"motion", "playback"},
     "render": {"motion", "scene", "raster", "playback"},
     "importing": {"motion", "scene", "data", "formats", "model"},
@@ -48,7 +49,7 @@ ALLOWED = {
     "language": {"scene", "data", "search", "playback", "render"},
     "train": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "model", "render"},
     "masks": {"data", "language"},
-    "worker": {"scene", "raster", "search", "playback", "editing", "render", "language"},
+    "worker": {"scene", "raster", "playback", "editing", "protocol", "render", "language"},
     "bake": {"motion", "motion_fit", "scene", "data", "config", "playback", "render", "train"},
     "check": {"motion", "terminal", "scene", "data", "formats", "config", "train"},
     "stability": {"motion", "motion_fit", "scene", "data", "raster", "config", "playback", "render", "train"},
@@ -96,7 +97,7 @@ ALLOWED = {
 LATE_MODULES = {
     *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.export", "cli.info", "cli.masks"),
     *("cli.objects", "cli.language", "check", "check.run", "cli.demo", "stability.training"),
-    *("worker.server", "worker.requests"),
+    *("worker.server", "worker.warming"),
 }
 # Further modules of the core, and what each may import inside functions.
 LATE_IMPORTS = {
@@ -138,7 +139,7 @@ ADDON_ALLOWED = {
     "panels": {"ui", "scene", "color", "worker", "engine", "language", "motion"},
     "capture": {"ui", "export"},
 }
-LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "user_settings"}
+LIGHT = GROUND | {"motion", "scene", "color", "formats", "playback", "editing", "search", "protocol", "user_settings"}
 BLENDER = {"bpy", "bmesh", "mathutils", "gpu", "bl_ui", "bpy_extras", "addon_utils", "imbuf", "aud"}
 HEAVY = {
     *("torch", "numba", "scipy", "OpenImageIO", "trimesh", "matplotlib", "rich", "gsplat", "transformers"),
@@ -424,7 +425,7 @@ IMPORT_LIGHT_TIER = """
 sys.path.insert(0, root)
 import r5dgs_core.errors, r5dgs_core.strict_json, r5dgs_core.user_settings
 seen = []
-for name in ("motion", "scene", "color", "formats", "playback", "editing", "search"):
+for name in ("motion", "scene", "color", "formats", "playback", "editing", "search", "protocol"):
     package = importlib.import_module(f"r5dgs_core.{name}")
     for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(info.name)

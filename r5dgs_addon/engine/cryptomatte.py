@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core.formats import cryptomatte
+from ...r5dgs_core.protocol import messages
 from . import render_request
 
 LAYER = "CryptoObject"
@@ -32,7 +33,7 @@ def request(seen: render_request.Shown, passes: int) -> dict[str, Any]:
     """Request arguments for coverage: name index of each instance (-1 for hold-outs) and number of ranks."""
     names = names_of(seen)
     groups = [-1 if one.holdout else names.index(one.object.name) for one in seen.instances]
-    return {"groups": groups, "ranks": RANKS * passes}
+    return messages.Coverage(groups, RANKS * passes).to_json()
 
 
 def pixels(arrays: dict[str, np.ndarray], seen: render_request.Shown, number: int) -> np.ndarray:

@@ -114,7 +114,7 @@ def empty(camera: cameras.Camera, ranks: int) -> dict[str, np.ndarray]:
     }
 
 
-def index_of(instance: visible_clouds.Instance) -> int:
+def index_of(instance: visible_clouds.VisibleCloud) -> int:
     """Object index of a point cloud: the user's *Pass Index* if set, otherwise its object id."""
     makers = [instance.object] if instance.parent is None else [instance.parent, instance.object]
     indices = [maker.pass_index for maker in makers if maker.pass_index]

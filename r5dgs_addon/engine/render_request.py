@@ -15,6 +15,8 @@ import bpy
 import numpy as np
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.playback.instance import Sky
+from ...r5dgs_core.protocol.messages import RenderRequest
 from ...r5dgs_core.scene import cameras
 from ..scene import trust
 from ..worker import jobs
@@ -38,7 +40,7 @@ class Shown:
     view: view_cameras.View
     scenes: tuple[bpy.types.Collection, ...]
     worlds: tuple[np.ndarray, ...]
-    instances: tuple[visible_clouds.Instance, ...]
+    instances: tuple[visible_clouds.VisibleCloud, ...]
 
     @property
     def camera(self) -> cameras.Camera:
@@ -95,18 +97,20 @@ def render(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> tuple[d
 
 def steps(seen: Shown, want: tuple[str, ...] = (), sky: bool = True) -> list[tuple[str, str, dict[str, Any]]]:
     """Worker requests of an image, for `jobs.start`. The job returns the same as `render`."""
-    picture = {
-        "camera": seen.view.request(),
-        "instances": [instance.request() for instance in seen.instances],
-        "sky": {"scene": 0, "matrix": seen.worlds[0].tolist()} if sky and seen.scenes else None,
-        "near": seen.view.near,
-        "distance": seen.view.distance,
-        "want": [*want, *(["holdout"] if any(one.holdout for one in seen.instances) else [])],
-    }
+    held = any(one.holdout for one in seen.instances)
+    picture = RenderRequest(
+        seen.camera,
+        seen.instances,
+        tuple(None if one.edit is None else one.edit.key for one in seen.instances),
+        sky=Sky(0, seen.worlds[0]) if sky and seen.scenes else None,
+        near=seen.view.near,
+        distance=seen.view.distance,
+        want=(*want, "holdout") if held else want,
+    )
     paths = [str(scene_path(collection)) for collection in seen.scenes]
     edits = tuple(dict.fromkeys(one.edit for one in seen.instances if one.edit is not None))
     edited = [("handing over edited points", "points", {"points": edits})] if edits else []
-    return [("loading the scenes", "load", {"paths": paths}), *edited, ("rendering", "render", picture)]
+    return [("loading the scenes", "load", {"paths": paths}), *edited, ("rendering", "render", picture.to_json())]
 
 
 def scene_path(collection: bpy.types.Collection) -> Path:

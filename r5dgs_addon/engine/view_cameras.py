@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import bpy
 import numpy as np
@@ -26,15 +25,6 @@ class View:
     camera: cameras.Camera
     distance: float = 0.0
     near: float | None = None
-
-    def request(self) -> dict[str, Any]:
-        """Camera in the format of the worker request."""
-        return {
-            "width": self.camera.width,
-            "height": self.camera.height,
-            "intrinsics": self.camera.intrinsics.tolist(),
-            "T_cam_world": self.camera.T_cam_world.tolist(),
-        }
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from gpu_extras.presets import draw_texture_2d
 
 from ...r5dgs_core import errors
 from ...r5dgs_core.color import view_inverse
+from ...r5dgs_core.protocol import messages
 from ...r5dgs_core.scene import cameras
 from ..color import display_to_linear
 from ..scene import render_settings
@@ -71,8 +72,8 @@ class Wish:
         if smaller == FULL:
             return self.steps
         size = (max(self.camera.width // smaller, 1), max(self.camera.height // smaller, 1))
-        view = view_cameras.View(cameras.resize(self.camera, *size))
-        return [*before, (doing, command, {**arguments, "camera": view.request()})]
+        camera = messages.camera_to_json(cameras.resize(self.camera, *size))
+        return [*before, (doing, command, {**arguments, "camera": camera})]
 
 
 class Port:

@@ -7,70 +7,40 @@ world, in which its light direction is fixed, follows its root. A collection ins
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import bpy
 import numpy as np
 
+from ...r5dgs_core.playback.instance import Instance
 from ..scene import evaluated_points, loaded_scenes, point_clouds, timeline
 
 FLAT = 1e-6  # minimum ratio of smallest to largest scale
 
 
-@dataclass(frozen=True)
-class Instance:
-    """Visible point cloud, or an instance of one.
+@dataclass(frozen=True, kw_only=True)
+class VisibleCloud(Instance):
+    """Visible point cloud, or an instance of one, in Blender's world; residuals are applied if Exact Mode is on.
 
     Attributes:
-        scene: Index of its loaded scene.
-        start: First row in the scene file, before any edit.
-        count: Number of points.
-        matrix: Transform from bind state to Blender's world. [4, 4]
-        world: Transform from the scene's world to Blender's. [4, 4]
-        tint: Factors of red, green and blue.
-        t: Scene time at which residuals are evaluated if Exact Mode is on, otherwise None.
         object: Point cloud object, or the instanced one.
         collection: Loaded scene.
         parent: Instancer, or None.
         edit: Edited points, or None if they are those of the scene file.
-        holdout: True if it is a hold-out.
         seen: True if cameras see it: neither ray visibility nor an indirect-only collection hides it.
     """
 
-    scene: int
-    start: int
-    count: int
-    matrix: np.ndarray
     world: np.ndarray
     tint: tuple[float, float, float]
     object: bpy.types.Object
     collection: bpy.types.Collection
     parent: bpy.types.Object | None = None
-    t: float | None = None
     edit: evaluated_points.Edit | None = None
-    holdout: bool = False
     seen: bool = True
-
-    def request(self) -> dict[str, Any]:
-        """Entry of the worker request."""
-        entry: dict[str, Any] = {
-            "scene": self.scene,
-            "matrix": self.matrix.tolist(),
-            "world": self.world.tolist(),
-        }
-        entry |= {"start": self.start, "count": self.count} if self.edit is None else {"points": self.edit.key}
-        if self.tint != (1.0, 1.0, 1.0):
-            entry["tint"] = list(self.tint)
-        if self.t is not None:
-            entry["t"] = self.t
-        if self.holdout:
-            entry["holdout"] = True
-        return entry
 
 
 def instances(
     depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | None = None
-) -> tuple[tuple[bpy.types.Collection, ...], tuple[Instance, ...]]:
+) -> tuple[tuple[bpy.types.Collection, ...], tuple[VisibleCloud, ...]]:
     """Loaded scenes in the view layer and their visible point clouds.
 
     Args:
@@ -103,9 +73,23 @@ def instances(
         t = None if edit is not None and edit.bent else t
         if not count:
             continue
-        camera = is_held_out(obj, parent, depsgraph), _is_seen(obj, parent, depsgraph)
-        start = obj.r5dgs.start
-        found.append(Instance(number, start, count, matrix, world, tint, obj, collection, parent, t, edit, *camera))
+        found.append(
+            VisibleCloud(
+                obj.r5dgs.start,
+                count,
+                matrix,
+                number,
+                world=world,
+                tint=tint,
+                t=t,
+                holdout=is_held_out(obj, parent, depsgraph),
+                object=obj,
+                collection=collection,
+                parent=parent,
+                edit=edit,
+                seen=_is_seen(obj, parent, depsgraph),
+            )
+        )
     return tuple(scenes), tuple(found)
 
 
@@ -127,7 +111,7 @@ def flat(matrices: list[np.ndarray]) -> np.ndarray:
     return scales[:, 2] <= FLAT * scales[:, 0]
 
 
-def points(found: tuple[Instance, ...]) -> Callable[[], np.ndarray]:
+def points(found: tuple[VisibleCloud, ...]) -> Callable[[], np.ndarray]:
     """Return a function that computes the bounding box corners of visible point clouds. [P, 3] float64
 
     It reads every point, so it is called only for parallel projections. Blender's own bounding boxes may be outdated.

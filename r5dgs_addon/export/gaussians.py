@@ -135,7 +135,7 @@ def splats_of(
 
 
 def _placed(
-    scene: Scene, one: visible_clouds.Instance, matrix: np.ndarray, turn: np.ndarray, sources: Sources
+    scene: Scene, one: visible_clouds.VisibleCloud, matrix: np.ndarray, turn: np.ndarray, sources: Sources
 ) -> Splats:
     """Gaussians of a visible point cloud, read from its scene file. matrix, turn [4, 4]"""
     start, count, bending = one.start, one.count, None

@@ -26,6 +26,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from ...r5dgs_core import errors
+from ...r5dgs_core.protocol import answers
 from .. import find_python, preferences
 from ..process_group import ProcessGroup
 
@@ -224,14 +225,9 @@ class Worker:
             if "event" in header:
                 self._hear(header)
                 continue
-            arrays = {}
-            for entry in header.get("arrays", ()):
-                dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-                size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-                blob = stream.read(size)
-                if len(blob) != size:
-                    return
-                arrays[entry["name"]] = np.frombuffer(blob, dtype).reshape(shape)
+            arrays = answers.read_arrays(stream, header)
+            if arrays is None:
+                return
             self._answers.put((header, arrays))
 
     def _hear(self, event: dict[str, Any]) -> None:

@@ -11,33 +11,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
+from ..playback.instance import Instance, Sky
 from ..raster import backends, rasterize
 from ..raster.backend import StaticLayer
 from ..raster.settings import RasterSettings, RenderOutput
 from ..scene.cameras import Camera
 from ..scene.scene import NEAR_PLANE, Scene
 from . import coverage, posed_scene, scene_renderer
-from .scene_renderer import Instance
 
+OWN_SKY = Sky()  # of the first scene
 WORTH_A_LAYER = 0.7  # largest share of moving Gaussians; above it, the static layer costs more than it saves
-
-
-@dataclass(frozen=True)
-class Sky:
-    """Scene whose sky is the background.
-
-    Attributes:
-        scene: Index of the scene.
-        matrix: Map from that scene's world to the world of the picture; its translation has no effect. [4, 4]
-    """
-
-    scene: int = 0
-    matrix: np.ndarray = field(default_factory=lambda: np.eye(4))
 
 
 class Stage:
@@ -66,7 +53,7 @@ class Stage:
         instances: Sequence[Instance],
         camera: Camera,
         *,
-        sky: Sky | None = Sky(),
+        sky: Sky | None = OWN_SKY,
         near: float | None = None,
         distance: float = 0.0,
     ) -> RenderOutput:

@@ -12,36 +12,11 @@ import numpy as np
 
 from ..motion import quaternion_columns, rotations
 from ..playback import affine_transform, posing, scene_player
+from ..playback.instance import Instance
 from ..playback.residuals import Residuals
 from ..scene.scene import Scene
 
 MANY = 16  # shortest run of equal instances whose rows are gathered
-
-
-@dataclass(frozen=True)
-class Instance:
-    """A transformed range of a scene's Gaussians.
-
-    Attributes:
-        start: First row.
-        count: Number of rows.
-        matrix: Affine map from the bind state to the world of the picture. [4, 4]
-        scene: Index of the scene.
-        world: Map from the scene's own world, which its light is fixed to, to the world of the picture; None for the
-            identity. [4, 4]
-        tint: Factors >= 0 on display-referred red, green and blue; None for 1.
-        t: Scene time at which residuals are applied, before the matrix; None to leave them out.
-        holdout: True if the Gaussians cut a hole into the picture instead of being visible.
-    """
-
-    start: int
-    count: int
-    matrix: np.ndarray
-    scene: int = 0
-    world: np.ndarray | None = None
-    tint: tuple[float, float, float] | None = None
-    t: float | None = None
-    holdout: bool = False
 
 
 @dataclass(frozen=True)

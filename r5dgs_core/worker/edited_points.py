@@ -6,19 +6,17 @@ import base64
 import binascii
 import dataclasses
 import operator
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .. import errors
 from ..editing import point_edits
 from ..editing.point_edits import Place, PointEdit
+from ..playback.instance import Instance
+from ..protocol import fields
+from ..protocol.messages import RenderRequest
 from ..scene.scene import Scene
-from . import requests as asked
-
-if TYPE_CHECKING:
-    from ..render import scene_renderer
 
 Places = dict[tuple[int, str], Place]  # by scene number and edit key
 _WIDTHS = {"means": 3, "quats": 4, "scales": 3, "base": 4}  # columns of each array; "sh" has any multiple of 3
@@ -41,7 +39,7 @@ class EditedPoints:
         Raises:
             ConfigError: A key is neither kept nor new, or an edit cannot be decoded.
         """
-        keys, new = asked.need(request, "keep", list), asked.need(request, "new", dict)
+        keys, new = fields.need(request, "keep", list), fields.need(request, "new", dict)
         decoded = {key: _edit_of(value) for key, value in new.items()}
         missing = [key for key in keys if not isinstance(key, str) or key not in decoded and key not in self._edits]
         if missing:
@@ -80,23 +78,22 @@ class EditedPoints:
         return self._extended
 
 
-def wanted(entries: Sequence[Any], numbers: list[int]) -> list[tuple[int, str]]:
-    """Return scene number and key of each edit in the entries of ``instances``, without duplicates."""
-    edited = [entry for entry in entries if isinstance(entry, dict) and entry.get("points") is not None]
-    found = [(asked.number_of(entry, numbers), entry["points"]) for entry in edited]
-    for _, key in found:
-        if not isinstance(key, str):
-            raise errors.ConfigError(f"worker: the 'points' of an instance have to be a key, found {key!r}")
-    return list(dict.fromkeys(found))
+def wanted(request: RenderRequest) -> list[tuple[int, str]]:
+    """Return scene number and key of each edit of a picture, without duplicates."""
+    entries = zip(request.instances, request.edits, strict=True)
+    return list(dict.fromkeys((one.scene, key) for one, key in entries if key is not None))
 
 
-def instance_of(entry: dict[str, Any], numbers: list[int], places: Places) -> scene_renderer.Instance:
-    """Convert an entry of ``instances``, with either ``start`` and ``count`` or the key of an edit as ``points``."""
-    if not isinstance(entry, dict) or entry.get("points") is None:
-        return asked.instance_of(entry, numbers)
-    place = places[asked.number_of(entry, numbers), entry["points"]]
-    found = asked.instance_of({**entry, "start": place.start, "count": place.count}, numbers)
-    return dataclasses.replace(found, matrix=found.matrix @ place.matrix)
+def placed(request: RenderRequest, places: Places) -> list[Instance]:
+    """Return the instances of a picture, with the rows of edited ones."""
+    return [
+        one if key is None else _at(one, places[one.scene, key])
+        for one, key in zip(request.instances, request.edits, strict=True)
+    ]
+
+
+def _at(instance: Instance, place: Place) -> Instance:
+    return dataclasses.replace(instance, start=place.start, count=place.count, matrix=instance.matrix @ place.matrix)
 
 
 def _edit_of(value: Any) -> PointEdit:

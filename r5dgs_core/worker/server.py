@@ -23,7 +23,6 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import sys
@@ -32,7 +31,7 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -40,62 +39,17 @@ from .. import __version__, errors
 from ..language import query
 from ..language.encoders import encoder_base, registry
 from ..playback import scene_player
+from ..playback.instance import Instance
+from ..protocol import answers as wire
+from ..protocol import fields, messages
 from ..scene import quality, scene_file
-from ..scene.cameras import Camera
 from ..scene.scene import Scene
 from . import edited_points
-from . import requests as asked
+from .warming import Warming
 
-if TYPE_CHECKING:
-    from ..render import scene_renderer
-
-PROTOCOL = 4
 NEEDED = ("torch", "numba")
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
-
-
-class Warming:
-    """Background thread that loads or compiles the rasterizer's kernels.
-
-    Args:
-        tell: Called from that thread with an event when compilation starts, and when it is done or has failed.
-    """
-
-    def __init__(self, tell: Callable[[dict[str, Any]], None]):
-        self._tell = tell
-        self._thread: threading.Thread | None = None
-
-    def start(self) -> None:
-        """Start the thread, unless it was started before."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="r5dgs warm-up", daemon=True)
-            self._thread.start()
-
-    def wait(self) -> None:
-        """Block until the thread has finished; return at once if it was not started."""
-        if self._thread is not None:
-            self._thread.join()
-
-    @property
-    def busy(self) -> bool:
-        """True if the thread is running."""
-        return self._thread is not None and self._thread.is_alive()
-
-    def _run(self) -> None:
-        try:
-            from ..raster import compilation
-            from ..render import warm_up
-        except (ImportError, errors.ConfigError):  # the next render request reports it
-            return
-        try:
-            with compilation.telling(lambda text: self._tell({"event": "compiling", "text": text})):
-                over = {"event": "ready", "seconds": round(warm_up.warm_up(gradients=False), 2)}
-        except Exception as error:  # the next render request meets it again; the traceback goes to the log
-            traceback.print_exc()
-            over = {"event": "failed", "text": f"{type(error).__name__}: {error}"}
-        if compilation.compiled():  # every "compiling" event is followed by "ready" or "failed"
-            self._tell(over)
 
 
 class Server:
@@ -139,16 +93,17 @@ class Server:
         Raises:
             R5dgsError: The request is invalid or cannot be fulfilled.
         """
-        return self._commands[asked.command_of(request)](request)
+        return self._commands[fields.command_of(request)](request)
 
     def _hello(self, _: dict[str, Any]) -> Answer:
         missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-        return {"protocol": PROTOCOL, "python": platform.python_version(), "missing": missing, "pid": os.getpid()}, {}
+        python, pid = platform.python_version(), os.getpid()
+        return {"protocol": messages.VERSION, "python": python, "missing": missing, "pid": pid}, {}
 
     def _load(self, request: dict[str, Any]) -> Answer:
         """Load the scene files ``paths`` in this order; keeps those already loaded and drops all others."""
-        paths = asked.need(request, "paths", list)
-        named = [asked.stamp_of(path) for path in paths]
+        paths = fields.need(request, "paths", list)
+        named = [fields.stamp_of(path) for path in paths]
         stamps = list(dict.fromkeys(named))  # read a repeated file once
         if stamps != list(self._scenes):
             known, self._scenes, self._numbers, self._stage, self._players = self._scenes, {}, [], None, {}
@@ -177,116 +132,85 @@ class Server:
         return {}, {}
 
     def _render(self, request: dict[str, Any]) -> Answer:
-        """Rasterize the loaded scenes, as instances or by playback.
-
-        Fields of the request:
-            camera: ``width height intrinsics T_cam_world``, OpenCV axes, in the world of the picture.
-            instances: List of ``scene start count matrix world tint t holdout``. Each entry is a range of Gaussians of
-                a scene. ``matrix`` [4, 4] maps their bind state to the world of the picture; ``world`` [4, 4] maps the
-                scene's own world, which turns the view-dependent color (default: ``matrix``); ``tint`` scales the
-                color; ``t`` is the scene time at which residuals are evaluated. ``points`` replaces ``start count`` and
-                names an edit of a ``points`` request. An instance with ``holdout`` is black and appears in no array but
-                ``holdout``, its share of each pixel.
-            t: Scene time for playback of ``scene`` in its own world, instead of ``instances``.
-            sky: Null for black, or ``scene matrix``; with ``t``, the sky of that scene by default.
-            near: Nearest depth to render; the near plane of each scene by default.
-            distance: Offset from the camera at which depth starts.
-            want: Any of ``depth alpha owners holdout``; with ``t``, ``ids`` instead of ``owners holdout``. ``owners``
-                and ``ids`` are the instance or object with the largest share of each pixel, -1 for none.
-            coverage: ``groups`` (a number per instance, -1 for none) and ``ranks``. Adds the arrays ``coverage_groups``
-                and ``coverage``: the groups with the largest share of each pixel.
-        """
+        """Rasterize the loaded scenes, as instances or by playback; the fields are those of `RenderRequest`."""
         scenes = self._loaded()
-        camera = asked.camera_of(asked.need(request, "camera", dict))
-        moved = "instances" in request
-        want = asked.wanted(request, ("alpha", "depth", *(("owners", "holdout") if moved else ("ids",))))
-        near, coverage = asked.near_of(request), asked.coverage_of(request)
-        t = 0.0 if moved else asked.time_of(request)
-        asked.check_size(camera, 0, 0 if coverage is None else coverage[1])
+        wanted = messages.RenderRequest.from_json(request, self._numbers)
+        ranks = 0 if wanted.coverage is None else wanted.coverage.ranks
+        fields.check_size(wanted.camera, 0, ranks)
         scene_render = self._rasterizer()
         started = time.perf_counter()
         instances = []
-        if moved:
-            entries = asked.need(request, "instances", list)
-            scenes, places = self._points.extend(scenes, edited_points.wanted(entries, self._numbers))
-            instances = [edited_points.instance_of(entry, self._numbers, places) for entry in entries]
-            asked.check_rows(instances, [len(scene.gaussians.means) for scene in scenes])
-            shown = sum(instance.count for instance in instances)
-            asked.check_size(camera, shown, 0 if coverage is None else coverage[1])
+        if wanted.t is None:
+            scenes, places = self._points.extend(scenes, edited_points.wanted(wanted))
+            instances = edited_points.placed(wanted, places)
+            fields.check_rows(instances, [len(scene.gaussians.means) for scene in scenes])
+            fields.check_size(wanted.camera, sum(instance.count for instance in instances), ranks)
+        covered = {}
         try:
-            if moved:
-                output, ms_motion, count = self._instances(request, instances, scenes, camera, near)
+            if wanted.t is None:
+                output, ms_motion, count = self._draw(wanted, instances, scenes)
             else:
-                output, ms_motion, count = self._playback(request, t, scenes, camera, near)
-            covered = {} if coverage is None else self._coverage(*coverage, instances, camera, near)
+                output, ms_motion, count = self._play(wanted, wanted.t, scenes[wanted.scene])
+            if wanted.coverage is not None:
+                covered = self._coverage(wanted, wanted.coverage, instances)
         except (ValueError, OverflowError, FloatingPointError) as error:  # Gaussians out of the numeric range
             raise errors.ConfigError(f"worker: this picture cannot be drawn: {error}") from error
         ms_raster = 1e3 * (time.perf_counter() - started) - ms_motion
         arrays = {"color": scene_render.to_numpy(output.color, np.float32)}
-        for name in want:
+        for name in wanted.want:
             value = output.ids if name in ("ids", "owners") else getattr(output, name)
             value = 0 * output.alpha if value is None else value  # no hold-outs
             arrays[name] = scene_render.to_numpy(value, np.int32 if value is output.ids else np.float32)
         arrays |= covered
-        result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(request)}
+        result = {"ms_motion": ms_motion, "ms_raster": ms_raster, "gaussians": count, "scenes": self._known(wanted)}
         return result, arrays
 
     def _coverage(
-        self,
-        groups: list[int],
-        ranks: int,
-        instances: list[scene_renderer.Instance],
-        camera: Camera,
-        near: float | None,
+        self, wanted: messages.RenderRequest, coverage: messages.Coverage, instances: list[Instance]
     ) -> dict[str, np.ndarray]:
         """Return the groups of instances that share each pixel, and their shares."""
-        assert self._stage is not None  # created by `_instances`
-        found, shares = self._stage.coverage(instances, groups, camera, ranks=ranks, near=near)
+        assert self._stage is not None  # created by `_draw`
+        found, shares = self._stage.coverage(
+            instances, coverage.groups, wanted.camera, ranks=coverage.ranks, near=wanted.near
+        )
         return {"coverage_groups": found, "coverage": shares}
 
-    def _known(self, request: dict[str, Any]) -> list[dict[str, Any]]:
+    def _known(self, wanted: messages.RenderRequest) -> list[dict[str, Any]]:
         """Return the known error of each scene and the number of its Gaussians with unapplied residuals."""
-        shown = request.get("instances", ())
-        bent = {self._numbers[entry.get("scene", 0)] for entry in shown if entry.get("t") is not None}
+        bent = {one.scene for one in wanted.instances if one.t is not None}
+        playing = wanted.t is not None
         return [
-            {"name": scene.name, "error": known.text(), "unbent": 0 if "t" in request or k in bent else known.bending}
+            {"name": scene.name, "error": known.text(), "unbent": 0 if playing or k in bent else known.bending}
             for k, (scene, known) in enumerate(zip(self._scenes.values(), self._errors, strict=True))
         ]
 
-    def _instances(
-        self,
-        request: dict[str, Any],
-        instances: list[scene_renderer.Instance],
-        scenes: list[Scene],
-        camera: Camera,
-        near: float | None,
-    ):
+    def _draw(self, wanted: messages.RenderRequest, instances: list[Instance], scenes: list[Scene]):
+        """Render instances; returns the output, milliseconds of motion, and the number of Gaussians."""
         from ..render import incremental_renderer
 
-        behind = asked.sky_of(request, self._numbers)
-        sky = None if behind is None else incremental_renderer.Sky(*behind)
         if self._stage is None or self._staged is not scenes:
             self._stage, self._staged = incremental_renderer.Stage(scenes), scenes
-        output = self._stage.render(instances, camera, sky=sky, near=near, distance=asked.distance_of(request))
+        output = self._stage.render(
+            instances, wanted.camera, sky=wanted.sky, near=wanted.near, distance=wanted.distance
+        )
         return output, self._stage.ms_motion, sum(instance.count for instance in instances)
 
-    def _playback(self, request: dict[str, Any], t: float, scenes: list[Scene], camera: Camera, near: float | None):
+    def _play(self, wanted: messages.RenderRequest, t: float, scene: Scene):
+        """Render a scene at a time; returns as `_draw`."""
         from ..raster import RasterSettings
         from ..render import scene_renderer
 
         started = time.perf_counter()
-        number = asked.number_of(request, self._numbers)
-        scene = scenes[number]
-        if number not in self._players:
-            self._players[number] = scene_player.Player(scene)
-        pose = scene_renderer.pose_frame(scene, self._players[number].frame(t, camera.center))
+        if wanted.scene not in self._players:
+            self._players[wanted.scene] = scene_player.Player(scene)
+        pose = scene_renderer.pose_frame(scene, self._players[wanted.scene].frame(t, wanted.camera.center))
         ms_motion = 1e3 * (time.perf_counter() - started)
         output = scene_renderer.render_frame(
             scene,
             pose,
-            camera,
-            background="scene" if request.get("sky", {}) is not None else None,
-            settings=RasterSettings(near_plane=scene.near_plane if near is None else near),
+            wanted.camera,
+            background=None if wanted.sky is None else "scene",
+            settings=RasterSettings(near_plane=scene.near_plane if wanted.near is None else wanted.near),
         )
         return output, ms_motion, len(pose.means)
 
@@ -315,15 +239,15 @@ class Server:
         ``encoder``: folder of the encoder that made the scene's lookup table, or "text", for words that the scene does
         not store; null for none.
         """
-        scene = self._loaded()[asked.number_of(request, self._numbers)]
-        text = asked.need(request, "text", str)
+        scene = self._loaded()[fields.number_of(request, self._numbers)]
+        text = fields.need(request, "text", str)
         encoder = None if request.get("encoder") is None else self._opened(request)
         found = query.find(scene, text, encoder)
         return {"matches": [dataclasses.asdict(match) for match in found]}, {}
 
     def _embed(self, request: dict[str, Any]) -> Answer:
         """Return embeddings of the phrases ``texts`` by ``encoder`` (see `_query`), and the identity of the encoder."""
-        texts = asked.texts_of(request)
+        texts = fields.texts_of(request)
         encoder = self._opened(request)
         card = encoder.card
         known = {"kind": card.kind, "name": card.name, "digest": card.digest, "dimension": card.dimension}
@@ -331,7 +255,7 @@ class Server:
 
     def _opened(self, request: dict[str, Any]) -> encoder_base.Encoder:
         """Return the requested encoder; the last one stays open."""
-        where = asked.path_of(request.get("encoder"), "encoder")
+        where = fields.path_of(request.get("encoder"), "encoder")
         if self._encoder is None or self._encoder[0] != where:
             self._encoder = None  # free its memory before the next one is opened
             self._encoder = where, registry.open_encoder(where)
@@ -343,21 +267,16 @@ class Server:
         return list(self._scenes.values())
 
     def _rasterizer(self):
-        """Return `render.scene_renderer` after its kernels are loaded."""
+        """Return `render.scene_renderer`, whose import needs torch and numba, after its kernels are loaded."""
         if self._warming is not None:
             self._warming.wait()
-        return _rasterizer()
-
-
-def _rasterizer():
-    """Return `render.scene_renderer`, whose import needs torch and numba."""
-    try:
-        from ..render import scene_renderer
-    except ImportError as error:
-        raise errors.BackendError(
-            f"worker: {sys.executable} lacks '{error.name}'; install the core there ('pip install r5dgs')"
-        ) from error
-    return scene_renderer
+        try:
+            from ..render import scene_renderer
+        except ImportError as error:
+            raise errors.BackendError(
+                f"worker: {sys.executable} lacks '{error.name}'; install the core there ('pip install r5dgs')"
+            ) from error
+        return scene_renderer
 
 
 def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
@@ -375,7 +294,7 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
 
     def send(header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
         with lock:
-            _send(answers, header, arrays or {})
+            wire.write(answers, header, arrays or {})
 
     def tell(event: dict[str, Any]) -> None:
         with contextlib.suppress(OSError, ValueError):  # the client has closed the stream
@@ -386,14 +305,14 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
     while True:
         number = None
         try:
-            line = asked.read_line(requests)
+            line = fields.read_line(requests)
             if not line:
                 break
             if not line.strip():
                 continue
-            request = asked.parse(line)
-            number = asked.id_of(request)
-            if asked.command_of(request) == "shutdown":
+            request = fields.parse(line)
+            number = fields.id_of(request)
+            if fields.command_of(request) == "shutdown":
                 send({"id": number, "ok": True, "result": {}})
                 break
             result, arrays = server.answer(request)
@@ -411,14 +330,6 @@ def serve(requests: BinaryIO, answers: BinaryIO, *, warm: bool = False) -> bool:
 
 def _failure(number: Any, kind: str, message: str) -> dict[str, Any]:
     return {"id": number, "ok": False, "error": {"kind": kind, "message": message}}
-
-
-def _send(answers: BinaryIO, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    entries = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in arrays.items()]
-    answers.write(json.dumps({**header, "arrays": entries}).encode() + b"\n")
-    for array in arrays.values():
-        answers.write(np.ascontiguousarray(array).tobytes())
-    answers.flush()
 
 
 def main() -> None:

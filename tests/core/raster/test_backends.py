@@ -45,7 +45,7 @@ def test_a_scene_is_rendered_with_its_colours_and_sky():
     empty = drawn.alpha.numpy() == 0
     np.testing.assert_allclose(drawn.color.numpy()[empty], behind[empty], atol=1e-6)
     assert drawn.ids is not None and solid.ids is not None
-    assert set(np.unique(drawn.ids)) <= set(scene.object_ids) | {-1}
+    assert set(np.unique(drawn.ids)) <= set(scene.gaussians.object_ids) | {-1}
 
 
 def test_weights_of_segments_follow_from_its_gradients():

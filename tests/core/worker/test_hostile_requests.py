@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from r5dgs_core import errors
+from r5dgs_core.protocol import fields
 from r5dgs_core.scene import scene_file
-from r5dgs_core.worker import requests, server
+from r5dgs_core.worker import server
 from tests.core.worker.test_server import CAMERA_JSON, ROWS, load, parse, talk
 from tests.support import scenes
 
@@ -147,7 +148,7 @@ def path(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def little_memory(monkeypatch):
     """A machine with so much free memory that no honest request of these tests is refused."""
-    monkeypatch.setattr(requests, "free_memory", lambda: 1 << 30)
+    monkeypatch.setattr(fields, "free_memory", lambda: 1 << 30)
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -167,7 +168,7 @@ def test_there_are_more_than_the_trials_had():
 
 
 def test_a_giant_line_is_skipped_without_being_kept(path, monkeypatch):
-    monkeypatch.setattr(requests, "MOST_LINE", 4 << 20)
+    monkeypatch.setattr(fields, "MOST_LINE", 4 << 20)
     most = []
 
     class Stream(io.BytesIO):
@@ -208,7 +209,7 @@ def test_a_fault_of_the_worker_itself_is_an_error_of_ours_too(monkeypatch, capsy
 
 def test_the_free_memory_is_that_of_the_machine(monkeypatch):
     monkeypatch.undo()
-    assert 1 << 20 < requests.free_memory() < 1 << 50
+    assert 1 << 20 < fields.free_memory() < 1 << 50
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no pipes with paths")

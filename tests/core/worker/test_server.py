@@ -15,6 +15,7 @@ from r5dgs_core import errors
 from r5dgs_core.language import build_table
 from r5dgs_core.language.encoders import encoder_base, registry
 from r5dgs_core.playback import scene_player
+from r5dgs_core.protocol import messages
 from r5dgs_core.raster import compilation
 from r5dgs_core.render import incremental_renderer, scene_renderer, warm_up
 from r5dgs_core.scene import scene_file
@@ -66,7 +67,7 @@ def load(path):
 
 def test_hello_says_what_is_missing_and_which_protocol():
     (header, _), *_ = talk({"command": "hello"})
-    assert header["ok"] and header["result"]["protocol"] == worker_server.PROTOCOL and header["result"]["missing"] == []
+    assert header["ok"] and header["result"]["protocol"] == messages.VERSION and header["result"]["missing"] == []
 
 
 def test_a_rendered_time_is_the_cores_picture(path):

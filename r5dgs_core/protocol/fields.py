@@ -8,17 +8,15 @@ import reprlib
 import stat
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeGuard
+from typing import Any, BinaryIO, TypeGuard
 
 import numpy as np
 
 from .. import errors, strict_json
+from ..playback.instance import Instance, Sky
 from ..scene import cameras
 from ..scene.cameras import Camera
 from ..search import prompts
-
-if TYPE_CHECKING:
-    from ..render import scene_renderer
 
 MOST_LINE = 512 << 20  # bytes per request; edited points are large
 MOST_ENTRIES = 100_000  # per list
@@ -127,7 +125,7 @@ def stamp_of(path: Any) -> tuple[str, int, int]:
     return path, status.st_mtime_ns, status.st_size
 
 
-def number_of(value: dict[str, Any], numbers: list[int]) -> int:
+def number_of(value: dict[str, Any], numbers: Sequence[int]) -> int:
     """Return the number of a loaded scene, from its position among the paths; the first by default."""
     number = value.get("scene", 0)
     if not _is_whole(number) or not 0 <= number < len(numbers):
@@ -166,11 +164,11 @@ def camera_of(value: dict[str, Any]) -> Camera:
     return camera
 
 
-def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_renderer.Instance:
-    """Convert an entry of ``instances``."""
-    from ..render import scene_renderer  # late: it needs torch
-
+def instance_of(value: Any, numbers: Sequence[int]) -> Instance:
+    """Convert an entry of ``instances``; the rows of an edited one are 0 to 0, see `edit_of`."""
     start, count = (value.get(name) for name in ("start", "count")) if isinstance(value, dict) else (None, None)
+    if isinstance(value, dict) and value.get("points") is not None:
+        start = count = 0
     if not (_is_whole(start) and _is_whole(count) and start >= 0 and count >= 0):
         raise errors.ConfigError(f"worker: an instance needs start, count and matrix, found {_short(value)}")
     _refuse_others(value, _INSTANCE_FIELDS, "an instance")
@@ -184,10 +182,18 @@ def instance_of(value: dict[str, Any], numbers: list[int]) -> scene_renderer.Ins
     holdout = value.get("holdout", False)
     if not isinstance(holdout, bool):
         raise errors.ConfigError(f"worker: 'holdout' of an instance has to be true or false, found {_short(holdout)}")
-    return scene_renderer.Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t, holdout)
+    return Instance(start, count, matrix, number_of(value, numbers), world, _tint_of(value), t, holdout)
 
 
-def check_rows(instances: Sequence[scene_renderer.Instance], lengths: Sequence[int]) -> None:
+def edit_of(value: dict[str, Any]) -> str | None:
+    """Return the key of the point edit of an entry of ``instances``, or None."""
+    key = value.get("points")
+    if key is not None and not isinstance(key, str):
+        raise errors.ConfigError(f"worker: the 'points' of an instance have to be a key, found {_short(key)}")
+    return key
+
+
+def check_rows(instances: Sequence[Instance], lengths: Sequence[int]) -> None:
     """Raise ConfigError for instances with rows beyond the end of their scene.
 
     Args:
@@ -232,15 +238,15 @@ def free_memory() -> int:
         return _ASSUMED_MEMORY
 
 
-def sky_of(request: dict[str, Any], numbers: list[int]) -> tuple[int, np.ndarray] | None:
-    """Return scene and matrix of the sky behind instances; None for black."""
+def sky_of(request: dict[str, Any], numbers: Sequence[int]) -> Sky | None:
+    """Return the sky behind instances; None for black."""
     sky = request.get("sky")
     if sky is None:
         return None
     if not isinstance(sky, dict):
         raise errors.ConfigError(f"worker: 'sky' has to be null or scene and matrix, found {_short(sky)}")
     _refuse_others(sky, ("scene", "matrix"), "'sky'")
-    return number_of(sky, numbers), matrix_of(sky.get("matrix"), 4, "the matrix of the sky")
+    return Sky(number_of(sky, numbers), matrix_of(sky.get("matrix"), 4, "the matrix of the sky"))
 
 
 def _tint_of(value: dict[str, Any]) -> tuple[float, float, float] | None:
