@@ -114,7 +114,7 @@ LATE_IMPORTS = {
     "language.encoders.clip_encoder": {"data.images"},
     "language.encoders.open_clip_encoder": {"data.images"},
     # A scene at rest loads neither tracks nor networks.
-    "bake.bake": {"train.representations.residual"},
+    "bake.point_motion": {"train.representations.residual"},
     "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
     "train.representations.tracks": {"train.representations.field"},
     "train.run": {"train.object_discovery", "train.residual_trial"},

@@ -12,18 +12,24 @@ clustered both ways).
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..config.config import Config
 from ..data import dataset as datasets
+from ..errors import DatasetError
 from ..motion import rotations
 from ..playback import scene_player
 from ..render import scene_renderer
 from ..scene.scene import Scene
+from ..train import train_views
 from ..train.train_views import spread
+
+log = logging.getLogger(__name__)
 
 PIXELS = 700_000  # total of the sampled views
 FEWEST, MOST = 20, 40  # limits of the number of sampled views
@@ -172,6 +178,24 @@ def _support(scores: np.ndarray, information: np.ndarray, pixels: int, changed: 
         math.sqrt(total / (3 * max(pixels, 1))),
         min(1.0, total / changed) if changed > 0 else 1.0,
     )
+
+
+def gather(scene: Scene, dataset: datasets.Dataset, config: Config) -> ImageEvidence | None:
+    """Return the evidence of the training images on a scene's motion; None if nothing moves or an image is missing.
+
+    A missing image is logged as a warning.
+    """
+    if not np.any(scene.tracks.poses[..., 1:] != 0):
+        return None
+    try:
+        return ImageEvidence(scene, sample(dataset.train), train_views.behind(dataset, config))
+    except DatasetError as error:
+        log.warning(
+            "the motion is simplified without the training images, so only motion below fixed thresholds is dropped: "
+            "%s. Remedy: give the data set with --data",
+            error,
+        )
+        return None
 
 
 def painter(scene: Scene) -> Callable[[datasets.View], np.ndarray]:

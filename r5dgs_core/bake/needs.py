@@ -6,15 +6,16 @@ training (`training_needs.resolve`) and in baking (`decide`, `simplify_motion`).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from ..config.sections import NeedsSection
 from ..motion import rotations
-from ..scene.scene import MotionGroup
+from ..scene.scene import Classifier, MotionGroup
 from ..train.observed_motion import Moves
+from .draft import Context, Draft, Need
 
 STILL_QUAT = rotations.identity()
 STILL = 0.0025  # displacement in diameters of the group below which it is at rest, if the images are missing
@@ -33,24 +34,47 @@ def _turn(poses: np.ndarray) -> float:
     return float(rotations.angle_between(poses[:, :4], STILL_QUAT).max())
 
 
-def is_on(table: Sequence[dict[str, Any]], name: str) -> bool:
-    """True if the row ``name`` of the table is "on"."""
-    return next(row["decision"] == "on" for row in table if row["name"] == name)
+def apply(draft: Draft, context: Context) -> Draft:
+    """Write the needs table, drop shading that is not needed, and add the identities if they are."""
+    cloud, scene = draft.bound.cloud, draft.scene
+    table = decide(
+        scene.groups,
+        scene.tracks.poses,
+        motion_ids=cloud.motion_ids,
+        shading=cloud.shading,
+        light=draft.observed.light,
+        sky_bases=len(scene.background_sh),
+        bases=cloud.sh.shape[1],
+        classified=cloud.identities is not None,
+        residuals=draft.bent,
+        moves=draft.observed.motion.moves,
+        wanted=context.wanted,
+    )
+    on = {need.name: need.on for need in table}
+    scene = dataclasses.replace(scene, needs=(*(need.row() for need in table), *draft.parts))
+    if not on["shading"]:
+        scene = dataclasses.replace(scene, shading=None)
+    if cloud.identities is not None and on["classifier"]:
+        weight, bias = (context.tensors[f"classifier.{name}"].numpy() for name in ("weight", "bias"))
+        scene = scene.with_arrays(identities=cloud.identities[draft.order].astype(np.float16))
+        scene = dataclasses.replace(scene, classifier=Classifier(weight, bias))
+    return dataclasses.replace(draft, scene=scene)
 
 
 def decide(
     groups: Sequence[MotionGroup],
     track_poses: Sequence[np.ndarray] | np.ndarray,
+    *,
     motion_ids: np.ndarray,
     shading: np.ndarray,
     light: np.ndarray,
-    background_sh: np.ndarray,
+    sky_bases: int,
     bases: int,
     classified: bool,
-    wanted: NeedsSection | None = None,
-    residuals: tuple[float, float, bool, str] = (0.0, 0.0, False, "none was tried"),
+    residuals: Need,
     moves: Moves | None = None,
-) -> tuple[dict[str, Any], ...]:
+    wanted: NeedsSection | None = None,
+) -> tuple[Need, ...]:
     """Return the needs table of a baked scene.
 
     Args:
@@ -59,16 +83,15 @@ def decide(
         motion_ids: Group of each Gaussian. [N]
         shading: Shading vectors in the bind state. [N, 3]
         light: Light direction. [3]
-        background_sh: Sky coefficients that were kept. [Kb, 3]
+        sky_bases: Spherical harmonics bases of the sky that were kept.
         bases: Spherical harmonics bases of the colours.
         classified: True if identities and their classifier were trained.
-        wanted: User's override of each row; None measures all.
-        residuals: Value and threshold of the row "residuals", True if the scene has residuals, and the reason.
+        residuals: The row "residuals".
         moves: Gaussians that were moved to another group; None if regrouping did not run.
+        wanted: User's override of each row; None measures all.
 
     Returns:
-        Rows with name, value, threshold, decision ("on" or "off") and reason, which names the user's overrides. A
-        feature that the run has not learned stays "off".
+        The rows. The reason names the user's overrides. A feature that the run has not learned stays off.
     """
     wanted = wanted or NeedsSection()
     bodies = [g for g in groups if g.role == "body"]
@@ -77,26 +100,23 @@ def decide(
     moving = sum(bool(np.any(track_poses[g.id][:, 1:] != 0)) for g in bodies)
     change = float(np.abs(shading[motion_ids > 0]).max(initial=0.0) * np.linalg.norm(light) * largest_turn)
     shadow_members = int(sum((motion_ids == g.id).sum() for g in groups if g.role == "shadow"))
-    sky, moved_over = len(background_sh), 0 if moves is None else moves.moved
-    moved, turned = f"{moving} of {len(bodies)} objects move or turn", "largest turn in the observed time, rad"
+    moved_over = 0 if moves is None else moves.moved
     lit = bool(np.any(shading) and np.any(light))
+    moved, turned = f"{moving} of {len(bodies)} objects move or turn", "largest turn in the observed time, rad"
     followers = "Gaussians that follow a caster on its support"
-    # Name, value, threshold, True if needed, True if the run has learned it, meaning of the value.
-    rows = [
-        ("tracks", largest_travel, 0.0, moving > 0, len(bodies) > 0, moved),
-        ("rotation", largest_turn, 0.0, largest_turn > 0, len(bodies) > 0, turned),
-        ("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, lit, "largest change of colour"),
-        ("shadows", shadow_members, 1, shadow_members > 0, shadow_members > 0, followers),
-        ("view_dependent_colour", bases, 2, bases > 1, bases > 1, "spherical harmonics bases"),
-        ("sky_gradient", sky, 2, sky > 1, sky > 1, "spherical harmonics bases of the sky"),
-        ("classifier", len(bodies), 1, classified, classified, "objects with masks"),
-        ("residuals", residuals[0], residuals[1], residuals[2], residuals[2], residuals[3]),
-        ("regrouping", moved_over, 1, moved_over > 0, moved_over > 0, _said(moves)),
-    ]
-    return tuple(
-        _row(name, value, threshold, on, there, reason, getattr(wanted, name))
-        for name, value, threshold, on, there, reason in rows
+    view_bases, sky = bases > 1, sky_bases > 1
+    rows = (
+        Need("tracks", largest_travel, 0.0, moving > 0, moved, bool(bodies)),
+        Need("rotation", largest_turn, 0.0, largest_turn > 0, turned, bool(bodies)),
+        Need("shading", change, SHADING_LEVEL, change > SHADING_LEVEL, "largest change of colour", lit),
+        Need("shadows", shadow_members, 1, shadow_members > 0, followers, shadow_members > 0),
+        Need("view_dependent_colour", bases, 2, view_bases, "spherical harmonics bases", view_bases),
+        Need("sky_gradient", sky_bases, 2, sky, "spherical harmonics bases of the sky", sky),
+        Need("classifier", len(bodies), 1, classified, "objects with masks", classified),
+        residuals,
+        Need("regrouping", moved_over, 1, moved_over > 0, _said(moves), moved_over > 0),
     )
+    return tuple(need.overridden(getattr(wanted, need.name)) for need in rows)
 
 
 def _said(moves: Moves | None) -> str:
@@ -108,23 +128,3 @@ def _said(moves: Moves | None) -> str:
         f"shadow, {moves.to_rest} to rest"
     )
     return said + (f"; {moves.resting_shadows} shadows rest" if moves.resting_shadows else "")
-
-
-def _row(name: str, value: float, threshold: float, on: bool, there: bool, reason: str, wanted: str) -> dict[str, Any]:
-    """Return a row of the table with the user's override applied."""
-    if wanted != "auto":
-        on = wanted == "on" and there
-        missing = wanted == "on" and not there
-        reason = f"set {wanted} by you{', but this run has none' if missing else ''}; {reason}"
-    return row(name, value, threshold, on, reason)
-
-
-def row(name: str, value: float, threshold: float, on: bool, reason: str) -> dict[str, Any]:
-    """Return a row of the table."""
-    return {
-        "name": name,
-        "value": float(value),
-        "threshold": float(threshold),
-        "decision": "on" if on else "off",
-        "reason": reason,
-    }

@@ -15,9 +15,34 @@ from ..motion import rotations
 from ..scene.scene import Dynamics, MotionGroup, Residuals
 from ..train.normalization import Normalization
 from ..train.observed_motion import PointMotion
+from ..train.representations import representation
+from .draft import Context, Draft, Need
 
 AT_ONCE = 8192  # Gaussians per block; bounds memory
 VISIBLE = 1e-4  # smallest residual that is stored: offset / scene size, angle in rad, or change of log scale
+
+
+def apply(draft: Draft, context: Context) -> Draft:
+    """Add the motion of single Gaussians to the scene, and measure if it is needed."""
+    scene, bound, points = draft.scene, draft.bound, draft.observed.motion.points
+    bends, own = None, None
+    if points is not None and context.wanted.tracks != "off":
+        extent = float(np.ptp(np.quantile(bound.cloud.means, [0.01, 0.99], axis=0), axis=0).max())
+        # Relative to the trained poses, so that motion that the user switched off does not return as residuals.
+        bends, own = members(
+            points, context.norm, bound.cloud.motion_ids, bound.trained, bound.pivots, draft.order, extent
+        )
+    bent = draft.bent
+    if context.state.representation != representation.STILL:
+        from ..train.representations import residual
+
+        found = residual.need(context.tensors, context.dataset.object_names, context.config, bends is not None)
+        bent = Need("residuals", *found, learned=found[2])
+    if not bent.on or context.wanted.residuals == "off":
+        bends = None
+    groups = scene.groups if bends is None else departures(scene.groups, scene.gaussians.motion_ids, bends)
+    scene = dataclasses.replace(scene, groups=tuple(groups), residuals=bends, dynamics=own)
+    return dataclasses.replace(draft, scene=scene, bent=bent)
 
 
 def members(

@@ -11,13 +11,13 @@ fixed place or by a straight line. Each of these is done if and only if
 A part that only the colours of the images need, such as a turn by which shading imitates a shadow, is kept in the
 observed time, but the motion past t_max is fitted without it.
 
-Notation: G groups, S poses. Poses are relative to the bind state that the scene was given with until `_rebound`.
+Notation: G groups, S poses. Until `bind_state.rebind`, poses are relative to the bind state that the scene was given
+with.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,13 +29,10 @@ from ..config.sections import NeedsSection
 from ..motion import free_top, rotations
 from ..motion_fit import model_selection, shared_gravity
 from ..playback import visibility
-from ..scene import sh_color
 from ..scene.scene import Scene
-from ..train.representations import shading
-from . import falling_bodies, needs, track_checks
+from . import bind_state, falling_bodies, image_evidence, needs, track_checks
+from .draft import Context, Draft, Need
 from .image_evidence import ImageEvidence
-
-log = logging.getLogger(__name__)
 
 LEVEL = 0.01  # probability with which noise alone passes for motion
 LOSS = 0.03  # largest loss of PSNR on the training views by all simplifications together, dB
@@ -92,6 +89,14 @@ class Simplified:
     rows: tuple[dict[str, Any], ...]
 
 
+def apply(draft: Draft, context: Context) -> Draft:
+    """Simplify the motion of the scene by the evidence of the training images."""
+    observed = np.stack([group.observed for group in draft.observed.motion.groups])
+    evidence = image_evidence.gather(draft.scene, context.dataset, context.config)
+    found = simplify(draft.scene, observed, evidence, context.wanted)
+    return dataclasses.replace(draft, scene=found.scene, trained=draft.scene, parts=found.rows)
+
+
 def simplify(
     scene: Scene, observed: np.ndarray, evidence: ImageEvidence | None, wanted: NeedsSection | None = None
 ) -> Simplified:
@@ -112,7 +117,7 @@ def simplify(
     bodies = [g for g in scene.groups if g.role == "body" and np.any(scene.tracks.poses[g.id, :, 1:] != 0)]
     parts = [part for g in bodies for part in _parts(scene, g.id, observed[g.id], evidence, wanted)]
     dropped, losses = _unseen(scene, [part for part in parts if part.noise], evidence)
-    bound = _rebound(scene, _with_parts(scene, dropped))
+    bound = bind_state.rebind(scene, _with_parts(scene, dropped))
     rows: list[dict[str, Any]] = []
     fits: dict[int, tuple[shared_gravity.Track, model_selection.Fit]] = {}
     for g in bodies:
@@ -242,57 +247,6 @@ def _followed(scene: Scene, poses: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _rebound(scene: Scene, poses: np.ndarray) -> Scene:
-    """Return the scene with other poses [G, S, 7], in the bind state of each group's last pose."""
-    if np.array_equal(poses, scene.tracks.poses):
-        return scene
-    arrays = {name: array.copy() for name, array in scene.arrays().items() if name in _BOUND}
-    if "shading" in arrays:
-        arrays.setdefault("shading_rest", np.ones(len(scene.gaussians.means), np.float32))
-    groups, poses = list(scene.groups), poses.copy()
-    for g in scene.groups:
-        track = poses[g.id]
-        q, d = track[-1, :4].copy(), track[-1, 4:].copy()
-        if (track[:, :4] == q).all():
-            track[:, :4] = rotations.identity()
-        else:
-            track[:, :4] = rotations.normalize(rotations.multiply(track[:, :4], rotations.conjugate(q)))
-        track[:, 4:] -= d
-        track[-1, :4] = rotations.identity()
-        if np.any(q[1:] != 0) or np.any(d != 0):
-            _bind(scene, arrays, np.flatnonzero(scene.gaussians.motion_ids == g.id), g.pivot, q, d)
-            groups[g.id] = dataclasses.replace(g, pivot=g.pivot + d)
-    if scene.shading is not None and scene.shading.rest is None and (arrays["shading_rest"] == 1).all():
-        del arrays["shading_rest"]
-    return dataclasses.replace(scene.with_arrays(track_poses=poses, **arrays), groups=tuple(groups))
-
-
-_BOUND = ("means", "quats", "sh", "shading", "shading_rest", "residual_offsets", "residual_quats")
-
-
-def _bind(
-    scene: Scene, arrays: dict[str, np.ndarray], rows: np.ndarray, pivot: np.ndarray, q: np.ndarray, d: np.ndarray
-) -> None:
-    """Move Gaussians to another bind state, in place: a rotation q [4] about the pivot [3] and a shift d [3]."""
-    means = arrays["means"][rows].astype(np.float64)
-    arrays["means"][rows] = pivot + rotations.rotate(q, means - pivot) + d
-    if not np.any(q[1:] != 0):
-        return
-    arrays["quats"][rows] = rotations.normalize(rotations.multiply(q, arrays["quats"][rows].astype(np.float64)))
-    sh = sh_color.rotate(arrays["sh"][rows].astype(np.float64), q)
-    if scene.shading is not None:
-        vectors, rest = (arrays[name][rows].astype(np.float64) for name in ("shading", "shading_rest"))
-        sh, arrays["shading"][rows], arrays["shading_rest"][rows] = shading.rebind(
-            sh, vectors, rest, q, scene.shading.light
-        )
-    arrays["sh"][rows] = sh
-    if scene.residuals is not None:
-        own = np.isin(scene.residuals.rows, rows)
-        arrays["residual_offsets"][own] = rotations.rotate(q, arrays["residual_offsets"][own].astype(np.float64))
-        turns = rotations.multiply(q, arrays["residual_quats"][own].astype(np.float64))
-        arrays["residual_quats"][own] = rotations.normalize(rotations.multiply(turns, rotations.conjugate(q)))
-
-
 def _future(poses: np.ndarray, parts: Sequence[_Part]) -> np.ndarray:
     """Return the poses for the fit past t_max: without noise, even if the images need it, relative to t_max. [S, 7]"""
     result = poses.copy()
@@ -354,4 +308,4 @@ def _row(part: _Part, dropped: bool, loss: float | None, said: str, travel: floa
     text = f"{_SPREADS[part.name]}: {why}"
     if part.name == "motion":
         text += f"; goes {travel:.3g} diameters; past t_max: {said}"
-    return needs.row(part.name, part.value, threshold, not dropped, text)
+    return Need(part.name, part.value, threshold, not dropped, text).row()

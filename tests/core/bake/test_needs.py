@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from r5dgs_core.bake import bake, needs
+from r5dgs_core.bake.draft import Need
 from r5dgs_core.config import config, training_needs
 from r5dgs_core.data import dataset as datasets
 from r5dgs_core.errors import ConfigError
@@ -44,10 +45,20 @@ def table(
         groups.append(MotionGroup(bodies + 1, 1, "shadow", 0, np.zeros(3), MotionModel(), 1, np.eye(3)))
     ids = np.array([0] * 5 + [1] * 5 * (bodies > 0) + [bodies + 1] * 5 * shadow)
     gradients = np.full((len(ids), 3), shading)
-    light, behind, given = np.array([0, 0, 1.0]), np.zeros((sky, 3)), config.NeedsSection(**(wanted or {}))
-    bending = (float(bent), 0.5, bent > 0, "gain")
-    rows = needs.decide(groups, poses, ids, gradients, light, behind, bases, classified, given, bending, moves)
-    return {row["name"]: row for row in rows}
+    found = needs.decide(
+        groups,
+        poses,
+        motion_ids=ids,
+        shading=gradients,
+        light=np.array([0, 0, 1.0]),
+        sky_bases=sky,
+        bases=bases,
+        classified=classified,
+        residuals=Need("residuals", float(bent), 0.5, bent > 0, "gain", bent > 0),
+        moves=moves,
+        wanted=config.NeedsSection(**(wanted or {})),
+    )
+    return {need.name: need.row() for need in found}
 
 
 def decisions(**given):

@@ -1,0 +1,187 @@
+"""Data that the stages of baking pass on: the context of a run, and a draft of its scene.
+
+A stage is a module with ``apply(draft, context) -> draft``. It leaves the arrays of its arguments unchanged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ..config.config import Config
+from ..config.sections import NeedsSection
+from ..data.dataset import Dataset
+from ..scene.scene import MotionGroup, Scene
+from ..train import checkpoint
+from ..train.identity import packed_masks
+from ..train.normalization import Normalization
+from ..train.observed_motion import ObservedMotion
+
+
+@dataclass(frozen=True)
+class Context:
+    """A run and its data set.
+
+    Attributes:
+        run: The run folder.
+        state: Its last checkpoint.
+        dataset: The data set, without names if the objects were discovered.
+        norm: Training coordinates to world coordinates.
+    """
+
+    run: checkpoint.Run
+    state: checkpoint.Checkpoint
+    dataset: Dataset
+    norm: Normalization
+
+    @property
+    def config(self) -> Config:
+        return self.run.config
+
+    @property
+    def wanted(self) -> NeedsSection:
+        """The user's overrides of the needs table."""
+        return self.run.config.needs
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        return self.state.tensors
+
+    @property
+    def discovered(self) -> bool:
+        """True if training found the objects; their ids are not those of the data set."""
+        return is_discovered(self.state)
+
+
+def is_discovered(state: checkpoint.Checkpoint) -> bool:
+    """Return True if the objects of a checkpoint were found by training."""
+    return packed_masks.NAME in state.tensors or packed_masks.LABELS in state.tensors
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Gaussians of a run in world coordinates, in the order of training.
+
+    Attributes:
+        means: [N, 3] float64
+        quats: Unit wxyz. [N, 4] float64
+        log_scales: [N, 3]
+        opacity_logits: [N]
+        sh: [N, K, 3] float64
+        shading: [N, 3] float64
+        rest: Factor of the colour at rest. [N] float64
+        motion_ids: [N] int32
+        object_ids: [N] int32
+        identities: [N, 16] or None
+    """
+
+    means: np.ndarray
+    quats: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    shading: np.ndarray
+    rest: np.ndarray
+    motion_ids: np.ndarray
+    object_ids: np.ndarray
+    identities: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Content of a checkpoint without what the user switched off.
+
+    Attributes:
+        cloud: The Gaussians in the canonical state.
+        motion: Observed motion of all Gaussians.
+        light: Direction of the light, unit. [3]
+    """
+
+    cloud: Cloud
+    motion: ObservedMotion
+    light: np.ndarray
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Gaussians and motion groups in the bind state.
+
+    Attributes:
+        cloud: The Gaussians.
+        groups: The scene's groups, with static models; rows of representatives are in the order of training.
+        trained: Trained poses relative to the bind state. [G, S, 7]
+        pivots: Pivots of these poses. [G, 3]
+        played: The same poses without the parts that the user switched off. [G, S, 7]
+    """
+
+    cloud: Cloud
+    groups: tuple[MotionGroup, ...]
+    trained: np.ndarray
+    pivots: np.ndarray
+    played: np.ndarray
+
+
+@dataclass(frozen=True)
+class Need:
+    """One row of the needs table.
+
+    Attributes:
+        name: Feature of the scene.
+        value: Measured value.
+        threshold: Value from which the scene needs the feature.
+        on: True if the scene has the feature.
+        reason: Meaning of the value.
+        learned: True if the run has learned the feature.
+    """
+
+    name: str
+    value: float
+    threshold: float
+    on: bool
+    reason: str
+    learned: bool = True
+
+    def overridden(self, wanted: str) -> Need:
+        """Return the row with the user's override "on" or "off" applied; "auto" keeps it."""
+        if wanted == "auto":
+            return self
+        on = wanted == "on" and self.learned
+        missing = wanted == "on" and not self.learned
+        reason = f"set {wanted} by you{', but this run has none' if missing else ''}; {self.reason}"
+        return replace(self, on=on, reason=reason)
+
+    def row(self) -> dict[str, Any]:
+        """Return the row as it is stored in a scene."""
+        return {
+            "name": self.name,
+            "value": float(self.value),
+            "threshold": float(self.threshold),
+            "decision": "on" if self.on else "off",
+            "reason": self.reason,
+        }
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A scene that is being baked.
+
+    Attributes:
+        scene: The scene so far.
+        observed: What was read from the checkpoint.
+        bound: The same in the bind state.
+        order: Training row of each row of the scene. [N]
+        bent: The row "residuals" of the needs table; `point_motion` measures it.
+        trained: The scene before its motion was simplified.
+        parts: Rows of the needs table for parts of single bodies' motion.
+    """
+
+    scene: Scene
+    observed: Observed
+    bound: Bound
+    order: np.ndarray
+    bent: Need
+    trained: Scene | None = None
+    parts: tuple[dict[str, Any], ...] = ()

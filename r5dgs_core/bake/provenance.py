@@ -1,0 +1,57 @@
+"""Last stage of baking: the record of how a scene was made, and its PSNR on the training views."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from ..errors import DatasetError
+from ..playback import residuals
+from ..train import checkpoint_content, probe, train_views
+from ..train.identity import label_cleanup
+from . import image_evidence
+from .draft import Context, Draft
+
+
+def apply(draft: Draft, context: Context) -> Draft:
+    """Write the provenance of the scene."""
+    state, moves = context.state, draft.observed.motion.moves
+    record: dict[str, Any] = {
+        "config": context.config.to_dict(),
+        "dataset_digest": context.run.digest,
+        "versions": context.run.versions,
+        "discovered": context.discovered,
+        "train": {
+            "seconds": state.seconds,
+            "iterations": state.iteration,
+            "gaussians": len(draft.order),
+            "finished": state.finished,
+        },
+        **_on_training_views(draft, context),
+    }
+    cleaned = label_cleanup.changes_of(context.tensors)
+    if cleaned is not None:
+        record["label_hygiene"] = cleaned
+    if moves is not None:
+        unexplained = len(residuals.unexplained(draft.scene))
+        record["regrouping"] = dataclasses.asdict(moves) | {"unexplained": unexplained}
+    return dataclasses.replace(draft, scene=dataclasses.replace(draft.scene, provenance=record))
+
+
+def _on_training_views(draft: Draft, context: Context) -> dict[str, Any]:
+    """Return the PSNR of the checkpoint and of the scene on the training views, for the provenance.
+
+    A checkpoint of an unfinished or older run does not store its PSNR; the scene with the trained motion is measured
+    instead. The result is empty if an image is missing.
+    """
+    dataset, tensors = context.dataset, context.tensors
+    behind = train_views.behind(dataset, context.config)
+    try:
+        baked = probe.training_psnr(dataset, behind, image_evidence.painter(draft.scene))
+        if checkpoint_content.TRAIN_PSNR in tensors:
+            before = float(tensors[checkpoint_content.TRAIN_PSNR])
+        else:
+            before = probe.training_psnr(dataset, behind, image_evidence.painter(draft.trained or draft.scene))
+    except DatasetError:  # `simplify_motion` has logged it
+        return {}
+    return {"training_views": {"checkpoint_psnr": before, "baked_psnr": baked}}
