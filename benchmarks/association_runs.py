@@ -25,7 +25,7 @@ from r5dgs_core.bake import bake
 from r5dgs_core.cli import associate
 from r5dgs_core.config import config
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.data import mask_notes, masks
+from r5dgs_core.data import mask_notes, masks, view_masks
 from r5dgs_core.evaluation import evaluate
 from r5dgs_core.masks import videos
 from r5dgs_core.train import run
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> None:
         (plain / view.name).parent.mkdir(parents=True, exist_ok=True)
         (plain / f"{view.name}.png").write_bytes((spoilt / f"{view.name}.png").read_bytes())
     options = {"iterations": args.iterations, "seed": args.seed}
-    train(data, datasets.NO_MASKS, out / "without", **options)
+    train(data, view_masks.NO_MASKS, out / "without", **options)
     associate.run_associate(out / "without", data, masks=spoilt, out=associated)
     rows = {
         "true masks": {"masks": 1.0, **train(data, datasets.MASKS, out / "true", **options)},

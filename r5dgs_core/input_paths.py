@@ -12,25 +12,6 @@ from . import errors
 
 SCENE_SUFFIX = ".r5dgs"
 RUN_FILE = "run.json"
-CAMERAS_FILE = "transforms_train.json"
-
-
-def check_dataset(root: Path) -> None:
-    """Raise `DatasetError` if a path is not a folder with cameras in a known layout."""
-    if not _holds(root.is_dir):
-        raise errors.DatasetError(f"{root}: expected a data set folder, found {_found(root)}")
-    if not _holds((root / CAMERAS_FILE).exists) and reconstruction(root) is None:
-        lone = (root / "transforms.json").exists()
-        remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
-        raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
-
-
-def reconstruction(root: Path) -> Path | None:
-    """Return the folder of the COLMAP reconstruction in a data set, or None if it has none."""
-    for candidate in (root / "sparse" / "0", root / "sparse"):
-        if any((candidate / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
-            return candidate
-    return None
 
 
 def check_run(folder: Path) -> None:

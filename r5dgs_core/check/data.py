@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data import colmap, dataset, images, masks
+from ..data import dataset, images, masks
 from ..data.dataset import Dataset, View
+from ..data.layouts import camera_files, colmap
 from ..findings import Collector, Finding, coded
 from ..terminal import printable
 from .codes import CODES
@@ -62,7 +63,7 @@ def _check_splits(found: Dataset, collect: Collector) -> None:
         if len(names) > 1:
             collect.add("D40", f"{path}: expected in one split, found in {' and '.join(sorted(names))}")
     folder = found.root / colmap.IMAGES
-    if not (found.root / dataset.input_paths.CAMERAS_FILE).exists():
+    if not camera_files.detect(found.root):
         present = {path for path in folder.rglob("*") if path.suffix.lower() in images.SUFFIXES}
         left_out = sorted(path.relative_to(folder).as_posix() for path in present - set(splits))
         if left_out:

@@ -49,7 +49,7 @@ def run_bench(
                 raise errors.UsageError(f"{option} {name}: expected some of {', '.join(known)}")
     configs.load(options["config_path"], options["overrides"], options["preset"])
     for scene in scenes:
-        input_paths.check_dataset(scene)
+        runs.check_dataset(scene)
     input_paths.check_output_folder("--out", out)
     from ..bench import benchmark, cases
 

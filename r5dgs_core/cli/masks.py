@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .. import errors, input_paths, user_settings
+from .. import errors, user_settings
+from . import runs
 
 if TYPE_CHECKING:
     from ..masks.make_masks import Made
@@ -60,13 +61,13 @@ def run_masks(
     if backend == "sam2" and model is None:
         model = _user_model()
     _check(backend, model, source, device, unknown, {"key_frames": key_frames, **tuned})
-    input_paths.check_dataset(data)
+    runs.check_dataset(data)
     from ..data import dataset as datasets
-    from ..data import mask_notes
+    from ..data import mask_notes, view_masks
     from ..masks import make_masks
     from ..progress import make
 
-    dataset = datasets.read(data, datasets.NO_MASKS, min_registered=0.0)
+    dataset = datasets.read(data, view_masks.NO_MASKS, min_registered=0.0)
     folder = dataset.root / datasets.MASKS if out is None else Path(out)
     views = dataset.train
     if backend == "sam2":

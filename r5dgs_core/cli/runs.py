@@ -35,7 +35,7 @@ def run_train(
     from ..progress import make
 
     settings = training_settings(out, config_path, overrides, preset=preset, resume=resume)
-    input_paths.check_dataset(data)
+    check_dataset(data)
     from ..train import run
 
     use_threads(threads)
@@ -58,6 +58,13 @@ def training_settings(
             "--seed and --max-gaussians"
         )
     return configs.load(config_path, tuple(overrides), preset)
+
+
+def check_dataset(root: Path) -> None:
+    """Raise `DatasetError` if a path is not a data set folder in a known layout."""
+    from ..data.layouts import registry
+
+    registry.check(root)
 
 
 def use_threads(count: int | None) -> None:
@@ -84,7 +91,7 @@ def run_bake(
     configs.require_needs(overrides)
     input_paths.check_run(run_folder)
     if data is not None:
-        input_paths.check_dataset(data)
+        check_dataset(data)
 
     from ..bake import bake
     from ..evaluation import evaluation_table, scene_summary
@@ -116,7 +123,7 @@ def run_import(run_folder: Path, out: Path, *, progress_kind: str = "none", **op
     input_paths.check_scene_output(out)
     input_paths.check_foreign_run(run_folder)
     if options.get("data") is not None:
-        input_paths.check_dataset(options["data"])
+        check_dataset(options["data"])
     from ..importing import importer
     from ..progress import make
     from ..scene import scene_file
@@ -253,7 +260,7 @@ def check_target(target: Path, data: Path | None) -> None:
     """Raise R5dgsError if the target is neither a run folder nor a file, or if ``data`` is not a data set."""
     input_paths.check_target(target)
     if data is not None:
-        input_paths.check_dataset(data)
+        check_dataset(data)
 
 
 def check_mode(mode: str, scene: Scene | None = None, place: object = "") -> None:

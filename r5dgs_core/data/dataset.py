@@ -1,13 +1,12 @@
 """Data sets on disk: views with camera, time and mask, object names, and true poses if known.
 
 Layout: ``transforms_{train,val,test}.json`` (`transforms`), images beside them, ``object_mask/<view name>.png``
-(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time). Images with
-a COLMAP reconstruction instead of camera files give the same result (`colmap`).
+(`masks`), ``objects.json`` (names of the ids), ``ground_truth.json`` (pose of every object at every time). `layouts`
+has the other layouts of images and cameras, which give the same result.
 """
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import logging
 from dataclasses import dataclass, field, replace
@@ -16,43 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from .. import errors, findings, input_paths
+from .. import errors, findings
 from ..scene import cameras
-from . import colmap, images, mask_notes, masks, transforms
+from . import images, masks, transforms, view_masks
 from . import origin as origins
 from .annotations import OBJECTS, GroundTruth, read_ground_truth, read_objects
+from .layouts import registry
+from .layouts.camera_files import CAMERAS_FILE
+from .layouts.colmap import MIN_REGISTERED
+from .layouts.raw_dataset import RawDataset
+from .view_masks import MASKS
+from .views import SPLITS, View, make_views
 
-SPLITS = ("train", "val", "test")
-MASKS, NO_MASKS = "object_mask", "none"
 FRAMES_PER_UNIT = 60.0
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class View:
-    """One image of a data set.
-
-    Attributes:
-        name: Path of the image in the data set without suffix, "train/r_0000".
-        camera: Its camera, OpenCV axes; ``camera.name`` is shared by the views of one camera.
-        t: Scene time.
-        split: "train", "val" or "test".
-        image_path: The image file.
-        mask_path: The object id image, or None.
-        mask_colors: Object id of each packed colour, if masks are coded by colour.
-        mask_unknown: Value of unknown pixels in the mask file.
-        mask_video: Video within which the mask's ids are valid; "" if they are valid in the whole scene.
-    """
-
-    name: str
-    camera: cameras.Camera
-    t: float
-    split: str
-    image_path: Path
-    mask_path: Path | None
-    mask_colors: dict[int, int] | None = None
-    mask_unknown: int = masks.UNKNOWN
-    mask_video: str = ""
 
 
 @dataclass(frozen=True)
@@ -159,7 +135,7 @@ class Dataset:
 def read(
     root: Path,
     train_masks: str = MASKS,
-    min_registered: float = colmap.MIN_REGISTERED,
+    min_registered: float = MIN_REGISTERED,
     guard: findings.Guard = findings.STRICT,
 ) -> Dataset:
     """Read and check a data set; images and masks are inspected but not loaded.
@@ -180,57 +156,17 @@ def read(
     """
     root = Path(root)
     with findings.coded("D01"):
-        input_paths.check_dataset(root)
-    reconstruction = None
-    if not (root / input_paths.CAMERAS_FILE).exists():
-        reconstruction = colmap.read(root, min_registered, guard)
-    entries: dict[str, list[transforms.Entry]] = {}
-    header: dict[str, Any] = {}
+        layout = registry.find(root)
+    raw = layout.read(root, min_registered, guard)
+    if not raw.entries["train"]:
+        raise errors.DatasetError(f"{root / CAMERAS_FILE}: expected at least one frame, found none", code="D24")
     hasher = hashlib.sha256()
-    for split in SPLITS:
-        path = root / f"transforms_{split}.json"
-        entries[split] = []
-        if path.exists():
-            with guard():
-                entries[split], top = transforms.read(path, guard)
-                header = {**top, **header}
-            hasher.update(path.read_bytes())
-    if reconstruction is not None:
-        entries, header = reconstruction.entries, reconstruction.header
-        for path in reconstruction.files:
-            hasher.update(path.read_bytes())
-    if not entries["train"]:
-        raise errors.DatasetError(
-            f"{root / 'transforms_train.json'}: expected at least one frame, found none", code="D24"
-        )
-
-    origin = origins.find(np.stack([e.matrix[:3, 3] for split in SPLITS for e in entries[split]]), str(root))
-    if origin.any():
-        entries = {split: [entry.moved(-origin) for entry in entries[split]] for split in SPLITS}
-        _log.info("the cameras stand far from the world's origin: positions are measured from %s", origin.tolist())
-    rounding = float(np.spacing(np.abs(origin).max()))
-    camera_names = _CameraNames([entry for split in SPLITS for entry in entries[split]], rounding)
-    image_root = root if reconstruction is None else root / colmap.IMAGES
-    folders = {"train": _mask_folder(root, train_masks), "val": root / MASKS, "test": root / MASKS}
-    views = {
-        split: _make_views(folders[split], image_root, split, entries[split], camera_names, guard) for split in SPLITS
-    }
-    named = folders["train"] if folders["train"] != folders["val"] else None
-    if named is not None and all(view.mask_path is None for view in views["train"]):
-        raise errors.DatasetError(
-            f"{named}: expected masks such as {views['train'][0].name}.png, found none. Remedy: import masks of "
-            "another layout with 'r5dgs masks --from', or train without masks: --masks none",
-            code="D17",
-        )
-    for folder in dict.fromkeys(folders.values()):
-        alike = {split: views[split] for split in SPLITS if folders[split] == folder}
-        with guard(), findings.coded("D17"):
-            alike = _attach_mask_colors(alike)
-        with guard(), findings.coded("D22"):
-            alike = _attach_notes(alike, folder, hasher)
-        views |= alike
-    every = [view for split in SPLITS for view in views[split]]
-    for view in every:
+    for path in raw.files:
+        hasher.update(path.read_bytes())
+    raw, origin = _near_origin(raw, root)
+    folders = {split: view_masks.folder_of(root, train_masks if split == "train" else MASKS) for split in SPLITS}
+    views = view_masks.attach(make_views(raw, folders, origin, guard), folders, hasher, guard)
+    for view in (view for split in SPLITS for view in views[split]):
         for file in (view.image_path, view.mask_path):
             if file is not None:
                 hasher.update(_fingerprint(root, file))
@@ -240,14 +176,8 @@ def read(
     aliases: dict[int, tuple[str, ...]] = {}
     with guard(), findings.coded("D20"):
         names, aliases = read_objects(mask_folder if mask_folder is not None and own_ids else root)
-    convention = header.get("world_convention", "blender")
     with guard():
-        if not isinstance(convention, str) or convention not in cameras.WORLD_TO_BLENDER:
-            raise errors.DatasetError(
-                f"{root / 'transforms_train.json'}: 'world_convention' must be one of "
-                f"{', '.join(cameras.WORLD_TO_BLENDER)}, found {convention!r:.60}",
-                code="D23",
-            )
+        _check_convention(root, raw.header)
     ground_truth = None
     with guard(), findings.coded("D21"):
         if not own_ids:  # poses use the ids of the data set's own masks
@@ -258,26 +188,45 @@ def read(
             names.setdefault(object_id, name)
     frames_per_unit = FRAMES_PER_UNIT
     with guard():
-        frames_per_unit = _frames_per_unit(root, header, [e for split in SPLITS for e in entries[split]])
+        frames_per_unit = _frames_per_unit(root, raw.header, [e for split in SPLITS for e in raw.entries[split]])
     return Dataset(
         root=root,
         name=root.resolve().name,
-        train=views["train"],
-        val=views["val"],
-        test=views["test"],
+        **views,
         object_names=names,
         object_aliases=aliases,
         ground_truth=ground_truth,
-        world_convention=convention,
+        world_convention=raw.header.get("world_convention", "blender"),
         frames_per_unit=frames_per_unit,
         has_alpha=_has_alpha(views["train"]),
         digest=hasher.hexdigest(),
-        points=None if reconstruction is None or reconstruction.points is None else reconstruction.points - origin,
-        point_colors=None if reconstruction is None else reconstruction.colors,
+        points=raw.points,
+        point_colors=raw.colors,
         mask_folder=mask_folder,
         own_ids=own_ids,
         origin=origin,
     )
+
+
+def _near_origin(raw: RawDataset, root: Path) -> tuple[RawDataset, np.ndarray]:
+    """Measure positions from an origin near the cameras if they are far from the world's; returns that origin [3]."""
+    origin = origins.find(np.stack([e.matrix[:3, 3] for split in SPLITS for e in raw.entries[split]]), str(root))
+    points = None if raw.points is None else raw.points - origin
+    if not origin.any():
+        return replace(raw, points=points), origin
+    _log.info("the cameras stand far from the world's origin: positions are measured from %s", origin.tolist())
+    entries = {split: [entry.moved(-origin) for entry in raw.entries[split]] for split in SPLITS}
+    return replace(raw, entries=entries, points=points), origin
+
+
+def _check_convention(root: Path, header: dict[str, Any]) -> None:
+    convention = header.get("world_convention", "blender")
+    if not isinstance(convention, str) or convention not in cameras.WORLD_TO_BLENDER:
+        raise errors.DatasetError(
+            f"{root / CAMERAS_FILE}: 'world_convention' must be one of {', '.join(cameras.WORLD_TO_BLENDER)}, found "
+            f"{convention!r:.60}",
+            code="D23",
+        )
 
 
 def load_rgba(view: View) -> np.ndarray:
@@ -306,133 +255,6 @@ def load_mask(view: View) -> np.ndarray | None:
         return None
     ids = masks.read(view.mask_path, view.mask_colors, view.mask_unknown)
     return masks.resize(ids, view.camera.width, view.camera.height, str(view.mask_path))
-
-
-class _CameraNames:
-    """Names for distinct cameras: that of the file, or cam0, cam1, ...; poses of a moving camera get @1, @2, ...
-
-    Cameras are equal if they agree to 1e-6 of the image width, of a radian, and of the distance between cameras, so
-    neither the unit nor the origin of the world matters.
-
-    Args:
-        entries: All views of the data set; generated names differ from theirs.
-        rounding: Error of the cameras' positions, world units.
-    """
-
-    def __init__(self, entries: list[transforms.Entry], rounding: float) -> None:
-        centers = np.array([entry.matrix[:3, 3] for entry in entries], np.float64)
-        middle = np.median(centers, axis=0)
-        apart = float(np.median(np.linalg.norm(centers - middle, axis=1)))
-        self.step = max(1e-6 * apart, 1e-9 * float(np.linalg.norm(middle)), 4 * rounding, 1e-300)
-        self.taken = {entry.camera for entry in entries if entry.camera}
-        self.by_key: dict[tuple, str] = {}
-        self.uses: dict[str, int] = {}
-
-    def name(self, given: str, camera: cameras.Camera) -> str:
-        lens, turn = camera.intrinsics.ravel() / camera.width, camera.T_cam_world[:3, :3].ravel()
-        numbers = np.round(np.concatenate([lens / 1e-6, turn / 1e-6, camera.center / self.step]))
-        key = (given, camera.width, camera.height, (numbers + 0.0).tobytes())  # turns -0.0 into 0.0
-        if key not in self.by_key:
-            count = self.uses.get(given, 0)
-            name = given
-            while not given or count:
-                name = f"{given}@{count}" if given else f"cam{count}"
-                if name not in self.taken:
-                    break
-                count += 1
-            self.uses[given] = count + 1
-            self.taken.add(name)
-            self.by_key[key] = name
-        return self.by_key[key]
-
-
-def _mask_folder(root: Path, name: str) -> Path | None:
-    """Folder of the training views' masks, or None. The data set's own folder is always returned under the same path,
-    because its colour-coded masks are numbered together with those of the other splits."""
-    if name == NO_MASKS:
-        return None
-    folder = root / name  # an absolute path replaces the root
-    if folder.resolve() == (root / MASKS).resolve():
-        return root / MASKS
-    if name != MASKS and not folder.is_dir():
-        raise errors.DatasetError(
-            f"{folder}: no such folder of masks; give another with --masks, or 'none'", code="D17"
-        )
-    return folder
-
-
-def _make_views(
-    mask_folder: Path | None,
-    image_root: Path,
-    split: str,
-    entries: list[transforms.Entry],
-    names: _CameraNames,
-    guard: findings.Guard,
-) -> tuple[View, ...]:
-    views: dict[str, View] = {}
-    for entry in entries:
-        with guard():
-            name = transforms.view_name(entry.file_path)
-            if name in views:
-                raise errors.DatasetError(
-                    f"{entry.place}: the image is listed twice; each frame needs its own", code="D13"
-                )
-            image_path = _find_image(image_root, entry)
-            width, height, _ = images.size(image_path)
-            matrix = cameras.opengl_to_cam_world(entry.matrix)
-            camera = cameras.Camera(width, height, transforms.intrinsics(entry, width, height), matrix)
-            try:
-                cameras.check(camera)
-            except ValueError as error:
-                raise errors.DatasetError(f"{entry.place}: {error}") from error
-            camera = replace(camera, name=names.name(entry.camera, camera))
-            mask_path = None if mask_folder is None else mask_folder / f"{name}.png"
-            if mask_path is not None and not mask_path.is_file():
-                mask_path = None
-            views[name] = View(name, camera, entry.t, split, image_path, mask_path)
-    return tuple(views.values())
-
-
-def _find_image(root: Path, entry: transforms.Entry) -> Path:
-    path = root / entry.file_path.replace("\\", "/")
-    candidates = [path] if path.suffix.lower() in images.SUFFIXES else []
-    candidates += [path.with_name(path.name + suffix) for suffix in images.SUFFIXES]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    present = [path] if path.is_file() else sorted(path.parent.glob(f"{glob.escape(path.name)}.*"))
-    if present:
-        raise images.unreadable_kind(present[0], entry.place)
-    raise errors.DatasetError(f"{entry.place}: the image is missing, expected {candidates[0]}", code="D10")
-
-
-def _attach_mask_colors(views: dict[str, tuple[View, ...]]) -> dict[str, tuple[View, ...]]:
-    """Number the colours of all masks of the splits together, if masks are coded by colour."""
-    paths = [view.mask_path for some in views.values() for view in some if view.mask_path is not None]
-    colors = masks.color_table(paths)
-    if not colors:
-        return views
-    _log.info("masks are coded by colour: %d colours numbered by value, black is 0", len(colors) - 1)
-    return {split: tuple(replace(view, mask_colors=colors) for view in some) for split, some in views.items()}
-
-
-def _attach_notes(views: dict[str, tuple[View, ...]], folder: Path | None, hasher: Any) -> dict[str, tuple[View, ...]]:
-    """Apply the mask folder's ``masks.json`` to the views (`mask_notes`)."""
-    if folder is None or not (folder / mask_notes.FILE).exists():
-        return views
-    notes = mask_notes.read(folder)
-    if not notes.finished:
-        _log.warning("%s: masks are missing; run the command that makes them again", folder)
-    videos = notes.video_of()
-    lone = "" if notes.numbering == mask_notes.SCENE else "other masks"
-
-    def told(view: View) -> View:
-        if view.mask_path is None:
-            return view
-        return replace(view, mask_unknown=notes.unknown, mask_video=videos.get(view.name, lone))
-
-    hasher.update(f"{notes.numbering} {notes.unknown}".encode() * len(views))  # once per split
-    return {split: tuple(map(told, some)) for split, some in views.items()}
 
 
 def _frames_per_unit(root: Path, header: dict[str, Any], entries: list[transforms.Entry]) -> float:

@@ -19,7 +19,8 @@ import torch._dynamo  # noqa: F401  the first picture imports it, which takes lo
 
 from r5dgs_core import errors
 from r5dgs_core.config import config
-from r5dgs_core.data import colmap, dataset, images, mask_notes, masks
+from r5dgs_core.data import dataset, images, mask_notes, masks
+from r5dgs_core.data.layouts import colmap
 from r5dgs_core.formats import ply
 from r5dgs_core.importing import importer, weights
 from r5dgs_core.language.encoders import encoder_base

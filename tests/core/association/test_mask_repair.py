@@ -13,7 +13,7 @@ from r5dgs_core.association import associate, mask_repair, render_segments
 from r5dgs_core.cli import associate as cli_associate
 from r5dgs_core.cli import main
 from r5dgs_core.data import dataset as datasets
-from r5dgs_core.data import mask_notes, masks
+from r5dgs_core.data import mask_notes, masks, view_masks
 from r5dgs_core.scene import scene_file
 from tests.support import tiny_datasets
 
@@ -142,7 +142,7 @@ def test_a_scene_file_alone_is_not_enough(tmp_path):
 
 def test_no_masks_at_all_is_an_error(baked, tiny):
     with pytest.raises(errors.DatasetError, match="expected masks of training views, found none. Remedy: r5dgs masks"):
-        mask_repair.repair(baked, datasets.read(tiny.root, datasets.NO_MASKS))
+        mask_repair.repair(baked, datasets.read(tiny.root, view_masks.NO_MASKS))
 
 
 def split_into_videos(root, folder):

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import strategies as st
 
 from r5dgs_core import errors
-from r5dgs_core.data import dataset, images
+from r5dgs_core.data import dataset, images, view_masks
 from r5dgs_core.scene import cameras
 
 WIDTH, HEIGHT = 12, 8
@@ -435,7 +435,7 @@ def test_training_masks_may_come_from_another_folder(flat, tmp_path_factory):
     folder = tmp_path_factory.mktemp("masks")
     name = dataset.read(flat).train[0].name
     images.write_png(folder / f"{name}.png", np.full((HEIGHT, WIDTH), 7, np.uint8))
-    own, other, without = dataset.read(flat), dataset.read(flat, str(folder)), dataset.read(flat, dataset.NO_MASKS)
+    own, other, without = dataset.read(flat), dataset.read(flat, str(folder)), dataset.read(flat, view_masks.NO_MASKS)
     assert (dataset.load_mask(other.train[0]) == 7).all()
     assert [view.mask_path for view in other.train[1:]] == [None] * (len(own.train) - 1)
     assert all(view.mask_path is None for view in without.train)

@@ -20,37 +20,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from .. import errors, findings, input_paths, strict_json
-from ..scene import cameras
-from . import colmap_model, images, transforms
-from .colmap_model import Registered
-from .transforms import Entry
+from ... import errors, findings, strict_json
+from ...scene import cameras
+from .. import colmap_model, images, transforms
+from ..colmap_model import Registered
+from ..transforms import Entry
+from .raw_dataset import RawDataset
 
 MIN_REGISTERED = 0.5  # smallest share of registered images; fewer mean a failed reconstruction
 HELD_OUT = 8  # every eighth camera is held out, as in 3D Gaussian Splatting
 IMAGES = "images"
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Found:
-    """Result of `read`.
-
-    Attributes:
-        entries: Frames of each split; file paths are relative to the folder ``images``.
-        header: Keys as at the top of a camera file.
-        points: Points of the reconstruction, world. [P, 3] float64 or None
-        colors: Their colours, sRGB in [0, 1]. [P, 3] float32 or None
-        files: The files that were read.
-    """
-
-    entries: dict[str, list[Entry]]
-    header: dict[str, Any]
-    points: np.ndarray | None
-    colors: np.ndarray | None
-    files: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -63,7 +43,20 @@ class _Frame:
     t: float = 0.0
 
 
-def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Guard = findings.STRICT) -> Found:
+def detect(root: Path) -> bool:
+    """Return True if the folder has a COLMAP reconstruction."""
+    return reconstruction(root) is not None
+
+
+def reconstruction(root: Path) -> Path | None:
+    """Return the folder of the COLMAP reconstruction in a data set, or None if it has none."""
+    for candidate in (root / "sparse" / "0", root / "sparse"):
+        if any((candidate / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+            return candidate
+    return None
+
+
+def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Guard = findings.STRICT) -> RawDataset:
     """Read cameras, times and points of a data set.
 
     If there are at least eight cameras, every eighth (by name, from the first) is held out, within the times that the
@@ -79,7 +72,7 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
     Raises:
         DatasetError: A file is missing or damaged, too few images are registered, or a lens is distorted.
     """
-    sparse = input_paths.reconstruction(root)
+    sparse = reconstruction(root)
     if sparse is None:
         raise errors.DatasetError(f"{root / 'sparse' / '0'}: expected a COLMAP reconstruction, found none", code="D14")
     if not (root / IMAGES).is_dir():
@@ -106,7 +99,7 @@ def read(root: Path, min_registered: float = MIN_REGISTERED, guard: findings.Gua
         for split, part in splits.items()
     }
     files = (*model.files, path) if path.exists() else model.files
-    return Found(entries, header, model.points, model.colors, files)
+    return RawDataset(entries, header, root / IMAGES, files, model.points, model.colors)
 
 
 def _read_times(path: Path) -> tuple[dict[str, float], dict[str, float]]:

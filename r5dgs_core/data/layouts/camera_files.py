@@ -1,0 +1,41 @@
+"""Layout with camera files ``transforms_{train,val,test}.json`` (`transforms`) and images beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ... import findings
+from .. import transforms
+from .raw_dataset import RawDataset
+
+CAMERAS_FILE = "transforms_train.json"
+
+
+def detect(root: Path) -> bool:
+    """Return True if the folder has a camera file of training views."""
+    return (root / CAMERAS_FILE).exists()
+
+
+def read(root: Path, min_registered: float = 0.0, guard: findings.Guard = findings.STRICT) -> RawDataset:
+    """Read the camera files. A split without a file is empty, and keys of earlier splits win.
+
+    Args:
+        root: Folder of the data set.
+        min_registered: Not used.
+        guard: Entered around each file and each frame.
+
+    Raises:
+        DatasetError: A file is damaged.
+    """
+    entries: dict[str, list[transforms.Entry]] = {"train": [], "val": [], "test": []}
+    header: dict[str, Any] = {}
+    files = []
+    for split in entries:
+        path = root / f"transforms_{split}.json"
+        if path.exists():
+            with guard():
+                entries[split], top = transforms.read(path, guard)
+                header = {**top, **header}
+            files.append(path)
+    return RawDataset(entries, header, root, tuple(files))

@@ -1,0 +1,40 @@
+"""The known layouts, and the one that a folder has."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+from ... import errors
+from .camera_files import CAMERAS_FILE
+
+MODULES = ["camera_files", "colmap"]  # modules of this folder; the first that detects its files reads the folder
+
+
+def find(root: Path) -> ModuleType:
+    """Return the module of a data set's layout: ``detect(root) -> bool`` and ``read(root, min_registered, guard)``.
+
+    Raises:
+        DatasetError: The path is not a folder, or has no known layout.
+        OSError: The folder cannot be read.
+    """
+    if not root.is_dir():
+        raise errors.DatasetError(
+            f"{root}: expected a data set folder, found {'a file' if root.exists() else 'nothing'}"
+        )
+    for name in MODULES:
+        module = importlib.import_module(f".{name}", __package__)
+        if module.detect(root):
+            return module
+    lone = (root / "transforms.json").exists()
+    remedy = "split transforms.json into transforms_train/val/test.json" if lone else "is it the right folder?"
+    raise errors.DatasetError(f"{root / CAMERAS_FILE}: the file is missing; {remedy}")
+
+
+def check(root: Path) -> None:
+    """Raise `DatasetError` if a path is not a folder in a known layout; `find` reports missing permissions later."""
+    try:
+        find(root)
+    except OSError:
+        return

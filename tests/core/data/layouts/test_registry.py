@@ -1,0 +1,43 @@
+"""The layouts of data sets, and one that the developer's page adds."""
+
+import numpy as np
+import pytest
+
+from r5dgs_core import errors
+from r5dgs_core.data import dataset, images
+from r5dgs_core.data.layouts import registry
+from tests.support import extending_page
+
+
+def write_table(root, rows):
+    (root / "images").mkdir(parents=True)
+    (root / "cameras.csv").write_text("".join(f"{row}\n" for row in rows))
+    for number in range(3):
+        images.write_png(root / "images" / f"{number}.png", np.full((8, 12, 3), number / 3, np.float32))
+
+
+@pytest.fixture
+def table_layout(monkeypatch):
+    extending_page.load("Data set layout", "r5dgs_core.data.layouts.table", monkeypatch)
+    monkeypatch.setattr(registry, "MODULES", [*registry.MODULES, "table"])
+
+
+def test_the_developers_page_adds_a_layout(table_layout, tmp_path):
+    write_table(tmp_path / "data", [f"{number}.png,{number / 2},10,{number},0,4" for number in range(3)])
+    registry.check(tmp_path / "data")
+    found = dataset.read(tmp_path / "data")
+    assert [view.t for view in found.train] == [0, 0.5, 1] and found.val == ()
+    np.testing.assert_allclose(found.train[2].camera.center, [2, 0, 4])
+    assert found.train[1].camera.intrinsics[0, 0] == 10 and found.train[1].image_path.name == "1.png"
+
+
+def test_a_damaged_row_of_that_layout_is_named(table_layout, tmp_path):
+    write_table(tmp_path / "data", ["0.png,0,10,0,0"])
+    with pytest.raises(errors.DatasetError, match="line 1"):
+        dataset.read(tmp_path / "data")
+
+
+def test_a_folder_without_a_known_layout_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(errors.DatasetError, match=str(path)):
+            registry.check(path)
