@@ -67,6 +67,7 @@ ALLOWED = {
         "evaluation",
         "bench",
     },
+    "api": {"motion", "scene", "data", "config", "playback", "render", "evaluation", "train", "bake"},
     "cli": {
         "terminal",
         "user_settings",
@@ -92,9 +93,10 @@ ALLOWED = {
         "error_vs_time",
     },
 }
-# Modules that may import modules of the project inside functions: the command line, which starts fast, and the worker,
-# which answers before torch is there and if it is missing.
+# Modules that may import modules of the project inside functions: the command line and the public functions, which
+# start fast, and the worker, which answers before torch is there and if it is missing.
 LATE_MODULES = {
+    "api",
     *("cli.main", "cli.runs", "cli.associate", "cli.bench", "cli.export", "cli.info", "cli.masks"),
     *("cli.objects", "cli.language", "check", "check.run", "cli.demo", "stability.training"),
     *("worker.server", "worker.warming"),

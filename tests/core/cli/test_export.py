@@ -30,12 +30,12 @@ def test_ply_holds_the_gaussians_of_a_time(path, scene, tmp_path):
         frame, found = scene_player.frame(scene, t), ply.read(out)
         np.testing.assert_array_equal(found.means, frame.means)
         np.testing.assert_allclose(found.quats, frame.quats, atol=1e-6)
-        np.testing.assert_array_equal(found.object_ids, scene.object_ids)
+        np.testing.assert_array_equal(found.object_ids, scene.gaussians.object_ids)
 
 
 def test_without_a_time_it_is_that_of_t_max(path, scene, tmp_path):
     assert export(path, "--to", "ply", "--out", tmp_path / "a.ply") == 0
-    np.testing.assert_array_equal(ply.read(tmp_path / "a.ply").means, scene.means)
+    np.testing.assert_array_equal(ply.read(tmp_path / "a.ply").means, scene.gaussians.means)
 
 
 def test_each_frame_of_a_range_is_a_file(path, scene, tmp_path, capsys):

@@ -1,0 +1,62 @@
+"""The public functions: the code of docs/reference/python.md runs, and importing the package loads nothing."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import r5dgs_core
+from r5dgs_core.playback import scene_player
+from r5dgs_core.scene import scene_file
+from tests.support import tiny_datasets
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "python.md").read_text()
+PLAY, TRAIN = re.findall(r"^```python\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def test_the_page_plays_a_scene(scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene_file.write(scene, tmp_path / "demo.r5dgs", exact=True)
+    names: dict = {}
+    exec(PLAY, names)
+    camera, image = scene.cameras[0], names["image"]
+    assert image.shape == (camera.height, camera.width, 3) and image.min() >= 0 and 0.2 < image.max() <= 1
+
+
+def test_the_page_trains_and_evaluates_a_scene(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny.root, tmp_path / "my_images")
+    few = [*tiny_datasets.SETTINGS, "train.iterations=5", "identity.iterations=2"]
+    assert '["train.iterations=3000"]' in TRAIN
+    names: dict = {}
+    exec(TRAIN.replace('["train.iterations=3000"]', repr(few)), names)
+    assert r5dgs_core.load("scene.r5dgs").objects == names["scene"].objects
+    assert names["result"]["splits"]["test"]["rigid"]["images"] == 4
+
+
+def test_poses_move_the_gaussians_of_their_objects(scene):
+    t = scene.t_max + 0.2
+    found, means = r5dgs_core.poses(scene, t), scene_player.frame(scene, t).means
+    assert list(found) == [item.name for item in scene.objects if item.id > 0]
+    for item in scene.objects:
+        if item.id > 0:
+            rows = slice(item.start, item.start + item.count)
+            matrix = found[item.name]
+            expected = scene.gaussians.means[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+            np.testing.assert_allclose(means[rows], expected, atol=1e-5)
+
+
+def test_every_public_name_is_on_the_page_and_others_are_refused():
+    for name in r5dgs_core.__all__:
+        assert callable(getattr(r5dgs_core, name)) and f"| `{name}(" in PAGE
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = r5dgs_core.nonsense
+
+
+def test_the_package_is_imported_without_numpy():
+    code = "import sys, r5dgs_core; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
