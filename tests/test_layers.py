@@ -119,6 +119,7 @@ LATE_IMPORTS = {
     "bake.point_motion": {"train.representations.residual"},
     "train.representations.registry": {"train.representations.field", "train.representations.tracks"},
     "train.representations.tracks": {"train.representations.field"},
+    "train.finish": {"train.object_discovery"},
     "train.run": {"train.object_discovery", "train.residual_trial"},
 }
 # The same of the add-on: OpenImageIO is optional there.

@@ -40,6 +40,18 @@ def check_splats(means, quats, scales, opacities, channels, camera, background, 
         _check_values(name, tensor.detach(), *_RANGES.get(name, (-math.inf, math.inf, "")))
 
 
+def check_appearance(means: Any, camera: Camera, colors: Any, features: Any, background: Any) -> None:
+    """Raise ValueError or TypeError for the first invalid input of `rasterizer.rasterize` that is not a splat's."""
+    check_tensor("means", means)
+    cameras.check(camera)
+    if colors is not None:
+        check_companion("colors", colors, means, (len(means), 3))
+    if features is not None:
+        check_companion("features", features, means, (len(means), "F"))
+    if background is not None:
+        check_background(background, means, camera, 3)
+
+
 # Bounds of inputs with a limited range, and the remedy.
 _RANGES: dict[str, tuple[float, float, str]] = {
     "scales": (0.0, math.inf, "pass exp(log_scales)"),

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from ..scene import cameras
 from ..scene.cameras import Camera
 from . import backends, checks, shade
 from .settings import RasterSettings, RasterStats, RenderOutput, SplatImage
@@ -97,14 +96,7 @@ def rasterize(
         TypeError, ValueError, BackendError: As for `rasterize_splats`; messages name the inputs of this function.
     """
     means = gaussians.means
-    checks.check_tensor("means", means)
-    cameras.check(camera)
-    if colors is not None:
-        checks.check_companion("colors", colors, means, (len(means), 3))
-    if features is not None:
-        checks.check_companion("features", features, means, (len(means), "F"))
-    if background is not None:
-        checks.check_background(background, means, camera, 3)
+    checks.check_appearance(means, camera, colors, features, background)
     object_ids = getattr(gaussians, "object_ids", None) if ids else None
     try:
         channels = seen_colors(gaussians, camera, backend=backend) if colors is None else colors

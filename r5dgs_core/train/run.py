@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import logging
 import shlex
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import torch
 
-from .. import atomic_files, folder_lock
+from .. import folder_lock
 from ..config import training_needs
 from ..config.config import Config
 from ..data import dataset as datasets
 from ..errors import CheckpointError, Interrupted, TrainingError
 from ..render import warm_up
 from ..time_left import Phase, Timed
-from . import checkpoint, checkpoint_content, interrupt, learning_curves, probe
-from .identity import identity_training, label_cleanup, packed_masks
-from .representations import registry
-from .representations.fused_posing import Splats
-from .train_views import TrainView
+from . import checkpoint, checkpoint_content, finish, interrupt, learning_curves, probe, step_log
+from .identity import packed_masks
 from .trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -108,20 +104,7 @@ def _train(
         if not overwrite:
             checkpoint.refuse_to_lose(folder)  # another process may have created a run meanwhile
     go_on = go_on or shlex.join(["r5dgs", "train", str(Path(dataset.root).resolve()), "--out", str(folder), "--resume"])
-    state, replaces = None, False
-    if resume:
-        run = checkpoint.open_run(folder)
-        state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
-        if run.digest != dataset.digest and state is None:  # no step has used the other data yet
-            run = checkpoint.create_run(folder, dataset, run.config)
-        if run.digest != dataset.digest:
-            raise CheckpointError(
-                f"{folder}: was trained on other data than {dataset_root} now holds; "
-                "restore the data set or train into another folder"
-            )
-    else:
-        replaces = checkpoint.newest_file(folder) is not None
-        run = (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config)
+    run, state, replaces = _open(folder, dataset, dataset_root, config, resume)
     iterations = run.config.train.iterations
     done = 0 if state is None else state.iteration
     progress({"event": "start", "iterations": iterations, "from": done, "dataset": str(dataset_root)})
@@ -143,15 +126,34 @@ def _train(
     if state is not None:
         trainer.restore(state)
         began -= state.seconds
-    _clean_up(folder, trainer.iteration)
+    step_log.clean_up(folder / checkpoint.LOG_FILE, trainer.iteration)
     pictures = learning_curves.Curves(run.folder)
     _plan(trainer, progress)
     _optimise(trainer, run, began, go_on, progress, probe, pictures)
     with interrupt.at_once(f"stopped after the last step, before the labels; go on with: {go_on}"):
-        _finish(trainer, run, began, progress)
+        _save(trainer, run, began, finished=True, extra=finish.outcome(trainer, progress))
         pictures.update(finished=True)
     progress({"event": "trained", "gaussians": len(trainer.gaussians)})
     return run
+
+
+def _open(
+    folder: Path, dataset: datasets.Dataset, dataset_root: Path, config: Config, resume: bool
+) -> tuple[checkpoint.Run, checkpoint.Checkpoint | None, bool]:
+    """Return the run, its last state or None, and True if the files of an earlier run are still to be replaced."""
+    if not resume:
+        replaces = checkpoint.newest_file(folder) is not None
+        return (checkpoint.plan_run if replaces else checkpoint.create_run)(folder, dataset, config), None, replaces
+    run = checkpoint.open_run(folder)
+    state = None if checkpoint.newest_file(folder) is None else checkpoint.load(folder, mend=True)
+    if run.digest != dataset.digest and state is None:  # no step has used the other data yet
+        run = checkpoint.create_run(folder, dataset, run.config)
+    if run.digest != dataset.digest:
+        raise CheckpointError(
+            f"{folder}: was trained on other data than {dataset_root} now holds; "
+            "restore the data set or train into another folder"
+        )
+    return run, state, False
 
 
 def _found_masks(
@@ -181,7 +183,7 @@ def _plan(trainer: Trainer, progress: Timed) -> None:
         from . import residual_trial
 
         estimate.add(Phase(residual_trial.TRIAL, residual_trial.trial_steps(config), TRIAL_COST))
-    estimate.add(Phase("identity", _identity_steps(trainer)))
+    estimate.add(Phase("identity", finish.identity_steps(trainer)))
 
 
 def decision_step(trainer: Trainer) -> int | None:
@@ -222,9 +224,8 @@ def _optimise(
 ) -> None:
     """Take the remaining steps, and write the log and checkpoints."""
     section = trainer.config.train
-    path = run.folder / checkpoint.LOG_FILE
     decision = decision_step(trainer)
-    with interrupt.collected() as asked, _open_log(path) as stream:
+    with interrupt.collected() as asked, step_log.StepLog(run.folder / checkpoint.LOG_FILE) as steps:
         while not trainer.done:
             take_step(trainer, decision, progress)
             look = probe is not None and (trainer.done or trainer.iteration % section.probe_every == 0)
@@ -239,7 +240,7 @@ def _optimise(
                 event = progress.timed(event)
                 if look and probe is not None:
                     event["val_psnr"] = probe.psnr()
-                _append(path, stream, event)
+                steps.append(event)
                 progress(event)
             stop = bool(asked)
             if trainer.iteration % section.checkpoint_every == 0 or stop or trainer.done:
@@ -247,137 +248,6 @@ def _optimise(
                 pictures.update()
             if stop:
                 raise Interrupted(f"stopped at step {trainer.iteration}; go on with: {go_on}")
-
-
-def _identity_steps(trainer: Trainer) -> int:
-    """Return the number of steps for identity encodings after the run; each costs about as much as a training step."""
-    if trainer.config.identity.training != "after":
-        return 0
-    masked = any(view.mask is not None for view in trainer.views)
-    return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
-
-
-def _open_log(path: Path) -> TextIO:
-    try:
-        return open(path, "a", encoding="utf-8")
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written: {error}") from error
-
-
-def _append(path: Path, stream: TextIO, event: dict[str, Any]) -> None:
-    try:
-        stream.write(json.dumps(event) + "\n")
-        stream.flush()
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written: {error}; make room and go on with --resume") from error
-
-
-def _clean_up(folder: Path, iteration: int) -> None:
-    """Drop incomplete lines of the log, and lines of steps that will be taken again."""
-    path = folder / checkpoint.LOG_FILE
-    kept = []
-    try:
-        if not path.exists():
-            return
-        for line in path.read_bytes().splitlines():
-            event = _parse(line)
-            if event is None or event["iteration"] > iteration:
-                break
-            kept.append(line + b"\n")
-        atomic_files.write(path, b"".join(kept))
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written: {error}") from error
-
-
-def _parse(line: bytes) -> dict[str, Any] | None:
-    """Return the event of a line of the log; None if the line is incomplete."""
-    try:
-        event = json.loads(line)
-    except ValueError:
-        return None
-    return event if isinstance(event, dict) and isinstance(event.get("iteration"), int) else None
-
-
-def _finish(trainer: Trainer, run: checkpoint.Run, began: float, progress: Timed) -> None:
-    """Compute labels and identity encodings on the final geometry, and save the last checkpoint."""
-    classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
-    group_classes = trainer.motion.group_classes(trainer.motion.tensors())
-    fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
-    extra: dict[str, torch.Tensor] = {"labels": fallback}
-    if any(v.mask is not None for v in trainer.views):
-
-        @torch.no_grad()
-        def pose(view: TrainView) -> Splats:
-            return trainer.splats(view.camera, view.t)
-
-        progress({"event": "prepare", "text": "labels, by a vote of the masks"})
-        votes = identity_training.votes(trainer.views, pose, classes, len(fallback))
-        extra["labels"] = identity_training.elect(votes, fallback)
-        steps = _identity_steps(trainer)
-        if trainer.identity is not None:
-            extra |= trainer.identity.outcome(trainer.gaussians)
-        elif steps > 0:
-
-            def report(step: int, loss: float) -> None:
-                if step % trainer.config.train.log_every == 0 or step == steps:
-                    progress({"event": "identity", "iteration": step, "iterations": steps, "loss": loss})
-
-            # A separate generator, so that a run resumed here draws the same numbers.
-            draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
-            encodings, weight, bias = identity_training.train_encodings(
-                trainer.views,
-                pose,
-                classes,
-                extra["labels"],
-                trainer.config,
-                trainer.gaussians.means.detach(),
-                draws,
-                report,
-            )
-            extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
-        if trainer.config.identity.hygiene and len(classes) > 1:
-            # After the encodings, which follow the edges of the masks; cleaned labels follow motion, too.
-            extra |= _cleaned(trainer, votes, extra["labels"])
-    elif trainer.motion.sorts_by_motion and training_needs.sorting(trainer.dataset, trainer.config):
-        from . import object_discovery
-
-        progress({"event": "prepare", "text": "no masks: sorting moving Gaussians into parts"})
-        labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
-        count = int(labels.max())
-        progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
-        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), packed_masks.LABELS: labels}
-    with torch.no_grad():
-        shown = probe.training_psnr(
-            trainer.dataset,
-            trainer.behind,
-            lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
-        )
-    extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
-    _save(trainer, run, began, finished=True, extra=extra)
-
-
-def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the cleaned labels and the counts of changes, by their names in the checkpoint."""
-    given, ids = labels.numpy(), trainer.gaussians.motion_ids
-    params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
-    tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
-    motion = registry.observed_motion(
-        trainer.motion.name,
-        tensors | {"gaussians.motion_ids": ids},
-        trainer.object_ids,
-        trainer.places.measured,
-        given,
-        trainer.config,
-    )
-    gaussians = {name: tensor.numpy() for name, tensor in params.items()} | (motion.gaussians or {})
-    group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
-    points = label_cleanup.bound(motion.groups, group_ids, gaussians["means"])
-    going, moving = label_cleanup.companions(motion.groups, group_ids, points, trainer.object_ids)
-    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].astype(np.float64)))
-    found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, going, moving)
-    counts = dataclasses.astuple(changes)
-    log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)
-    return {"labels": torch.from_numpy(found), label_cleanup.CHANGES: torch.tensor(counts)}
 
 
 def _save(

@@ -1,0 +1,113 @@
+"""End of a run: labels and identity encodings on the final geometry."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..config import training_needs
+from . import checkpoint_content, probe
+from .identity import identity_training, label_cleanup, packed_masks
+from .representations import registry
+from .representations.fused_posing import Splats
+from .train_views import TrainView
+from .trainer import Trainer
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[dict[str, Any]], None]
+
+
+def identity_steps(trainer: Trainer) -> int:
+    """Return the number of steps for identity encodings after the run; each costs about as much as a training step."""
+    if trainer.config.identity.training != "after":
+        return 0
+    masked = any(view.mask is not None for view in trainer.views)
+    return trainer.config.identity.iterations if masked and len(trainer.object_ids) > 1 else 0
+
+
+def outcome(trainer: Trainer, progress: Progress) -> dict[str, torch.Tensor]:
+    """Return labels, identity encodings and the training views' PSNR on the final geometry, by checkpoint names."""
+    classes = {int(i): row for row, i in enumerate(trainer.object_ids)}
+    group_classes = trainer.motion.group_classes(trainer.motion.tensors())
+    fallback = torch.from_numpy(group_classes)[trainer.gaussians.motion_ids]
+    extra: dict[str, torch.Tensor] = {"labels": fallback}
+    if any(v.mask is not None for v in trainer.views):
+
+        @torch.no_grad()
+        def pose(view: TrainView) -> Splats:
+            return trainer.splats(view.camera, view.t)
+
+        progress({"event": "prepare", "text": "labels, by a vote of the masks"})
+        votes = identity_training.votes(trainer.views, pose, classes, len(fallback))
+        extra["labels"] = identity_training.elect(votes, fallback)
+        steps = identity_steps(trainer)
+        if trainer.identity is not None:
+            extra |= trainer.identity.outcome(trainer.gaussians)
+        elif steps > 0:
+
+            def report(step: int, loss: float) -> None:
+                if step % trainer.config.train.log_every == 0 or step == steps:
+                    progress({"event": "identity", "iteration": step, "iterations": steps, "loss": loss})
+
+            # A separate generator, so that a run resumed here draws the same numbers.
+            draws = torch.Generator().manual_seed(trainer.config.train.seed + 1)
+            encodings, weight, bias = identity_training.train_encodings(
+                trainer.views,
+                pose,
+                classes,
+                extra["labels"],
+                trainer.config,
+                trainer.gaussians.means.detach(),
+                draws,
+                report,
+            )
+            extra |= {"identities": encodings, "classifier.weight": weight, "classifier.bias": bias}
+        if trainer.config.identity.hygiene and len(classes) > 1:
+            # After the encodings, which follow the edges of the masks; cleaned labels follow motion, too.
+            extra |= _cleaned(trainer, votes, extra["labels"])
+    elif trainer.motion.sorts_by_motion and training_needs.sorting(trainer.dataset, trainer.config):
+        from . import object_discovery
+
+        progress({"event": "prepare", "text": "no masks: sorting moving Gaussians into parts"})
+        labels = torch.from_numpy(object_discovery.sort(trainer) + 1)
+        count = int(labels.max())
+        progress({"event": "prepare", "text": f"no masks: {count} moving part{'s' * (count != 1)} found"})
+        extra |= {"labels": labels, "object_ids": torch.arange(count + 1), packed_masks.LABELS: labels}
+    with torch.no_grad():
+        shown = probe.training_psnr(
+            trainer.dataset,
+            trainer.behind,
+            lambda view: trainer.render(trainer.normalization.camera(view.camera), view.t).numpy(),
+        )
+    extra[checkpoint_content.TRAIN_PSNR] = torch.tensor(shown, dtype=torch.float64)
+    return extra
+
+
+def _cleaned(trainer: Trainer, votes: torch.Tensor, labels: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return the cleaned labels and the counts of changes, by their names in the checkpoint."""
+    given, ids = labels.numpy(), trainer.gaussians.motion_ids
+    params = {name: tensor.detach() for name, tensor in trainer.gaussians.params.items()}
+    tensors = {f"gaussians.{name}": tensor for name, tensor in params.items()} | trainer.motion.tensors()
+    motion = registry.observed_motion(
+        trainer.motion.name,
+        tensors | {"gaussians.motion_ids": ids},
+        trainer.object_ids,
+        trainer.places.measured,
+        given,
+        trainer.config,
+    )
+    gaussians = {name: tensor.numpy() for name, tensor in params.items()} | (motion.gaussians or {})
+    group_ids = ids.numpy() if motion.motion_ids is None else motion.motion_ids
+    points = label_cleanup.bound(motion.groups, group_ids, gaussians["means"])
+    going, moving = label_cleanup.companions(motion.groups, group_ids, points, trainer.object_ids)
+    opacities = 1 / (1 + np.exp(-gaussians["opacity_logits"].astype(np.float64)))
+    found, changes = label_cleanup.clean(votes.numpy(), given, points, opacities, going, moving)
+    counts = dataclasses.astuple(changes)
+    log.info("labels: %d by neighbours, %d by motion, %d outliers changed of %d", *counts)
+    return {"labels": torch.from_numpy(found), label_cleanup.CHANGES: torch.tensor(counts)}

@@ -1,0 +1,68 @@
+"""Log of a run: one JSON object per logged step, in a file that a resumed run continues."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from .. import atomic_files
+from ..errors import CheckpointError
+
+
+class StepLog:
+    """The log, open for further events. A context manager.
+
+    Args:
+        path: The file; created if it is missing.
+
+    Raises:
+        CheckpointError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path):
+        self._path = path
+        try:
+            self._stream = open(path, "a", encoding="utf-8")  # noqa: SIM115  (closed by __exit__)
+        except OSError as error:
+            raise CheckpointError(f"{path}: cannot be written: {error}") from error
+
+    def __enter__(self) -> StepLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def append(self, event: dict[str, Any]) -> None:
+        """Write an event as a line. Raises CheckpointError if that fails."""
+        try:
+            self._stream.write(json.dumps(event) + "\n")
+            self._stream.flush()
+        except OSError as error:
+            place = f"{self._path}: cannot be written: {error}"
+            raise CheckpointError(f"{place}; make room and go on with --resume") from error
+
+
+def clean_up(path: Path, iteration: int) -> None:
+    """Drop incomplete lines of a log, and lines of steps after ``iteration``, which will be taken again."""
+    kept = []
+    try:
+        if not path.exists():
+            return
+        for line in path.read_bytes().splitlines():
+            event = _parse(line)
+            if event is None or event["iteration"] > iteration:
+                break
+            kept.append(line + b"\n")
+        atomic_files.write(path, b"".join(kept))
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written: {error}") from error
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    """Return the event of a line of the log; None if the line is incomplete."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) and isinstance(event.get("iteration"), int) else None
